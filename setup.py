@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packaging for colcon (ament_python) and for pip."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "sst_ros"
+NODES = ("simulator", "torque_player", "recorder")
+ROS_MESSAGES = ("std", "sensor", "geometry", "trajectory", "diagnostic")
+
+
+def files(pattern: str) -> list[str]:
+    """List the data files that match, relative to here as setuptools wants them."""
+    return sorted(str(path) for path in Path().glob(pattern))
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="ROS 2 simulator of the 3-RRP spherical star-triangle manipulator",
+    license="Apache-2.0",
+    maintainer="sst_ros founders",
+    maintainer_email="sst-ros@example.org",
+    python_requires=">=3.10",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", files("config/*.*")),
+        (f"share/{NAME}/config/scenes", files("config/scenes/*.yaml")),
+        (f"share/{NAME}/launch", files("launch/*.launch.py")),
+    ],
+    install_requires=["numpy>=1.21", "scipy>=1.8", "PyYAML>=5.4"],
+    extras_require={
+        "ros": [
+            "ros-kilted-rclpy[fastrtps]",
+            "ros-kilted-rmw-fastrtps-cpp",
+            *(f"ros-kilted-{kind}-msgs" for kind in ROS_MESSAGES),
+        ],
+        "record": ["rosbags>=0.11"],
+        "report": ["rosbags>=0.11", "matplotlib>=3.5"],
+        "test": [
+            "colcon-common-extensions",
+            "hypothesis",
+            "mpmath",
+            "mypy",
+            "pytest",
+            "pytest-timeout",
+            "ruff",
+            "types-PyYAML",
+        ],
+    },
+    entry_points={
+        "console_scripts": [f"{node} = {NAME}.nodes.{node}:main" for node in NODES],
+    },
+    zip_safe=True,
+)

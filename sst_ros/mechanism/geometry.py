@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The constant vectors of one manipulator, derived once from its scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sst_ros.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Base triangle and star; rows belong to legs. All arrays are read-only.
+
+    Attributes:
+        v: unit vectors O P_k in {B}, shape (3, 3).
+        w: actuator axes, Eq. 1, shape (3, 3).
+        e: axes t_k of the star's arcs in {E}, shape (3, 3); t_k = R e_k.
+        alpha: angles between the arcs [rad], shape (3,).
+        arc: lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape (3,).
+        beta_max: largest admissible beta_k [rad].
+
+    """
+
+    v: Array
+    w: Array
+    e: Array
+    alpha: Array
+    arc: Array
+    beta_max: float
+
+    @classmethod
+    def of(cls, scene: Scene) -> Geometry:
+        """Derive the geometry of a scene."""
+        return cls.build(
+            scene.base.v, np.radians(scene.star.alpha_deg), np.radians(scene.workspace.beta_max_deg)
+        )
+
+    @classmethod
+    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: float = np.pi / 2) -> Geometry:
+        """Derive the geometry from directions v, shape (3, 3), and angles alpha [rad], (3,).
+
+        The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has admissible
+        assemblies over a right-handed base triangle.
+        """
+        directions = np.array(v, dtype=float)
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        following = np.roll(directions, -1, axis=0)
+        normals = np.cross(directions, following)
+        sines = np.linalg.norm(normals, axis=1)
+        cosines = np.einsum("ij,ij->i", directions, following)
+        angles = np.array(alpha, dtype=float)
+        f = np.array([0.0, angles[0], angles[0] + angles[1]])
+        e = np.stack([-np.sin(f), np.cos(f), np.zeros(3)], axis=1)
+        arrays = (directions, normals / sines[:, None], e, angles, np.arctan2(sines, cosines))
+        for array in arrays:
+            array.setflags(write=False)
+        return cls(*arrays, float(beta_max))

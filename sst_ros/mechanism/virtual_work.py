@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's method, equation by equation: the readable form of the dynamics.
+
+Equation numbers are those of Akbarzadeh & Enferadi, J. Intell. Robot. Syst. 63 (2011) 25-49, with
+the signs that its printed text lost. Rows of (3, 3) arrays named after a leg's vector (r, t, w)
+belong to legs; matrices of Jacobians act on columns. Everything is in {B} unless it says
+otherwise. The simulation runs `kernel`, which the tests hold against this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sst_ros.errors import SingularConfiguration
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene import Scene
+
+SINGULAR = 1e-12
+"""Smallest abs(det J2) and abs(c_k) for which the velocity analysis is done."""
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """Geometry and inertias [kg m^2]; star in {E}, links (3, 3, 3) in {1k} and {2k}."""
+
+    geometry: Geometry
+    star: Array
+    actuated: Array
+    intermediate: Array
+
+    @classmethod
+    def of(cls, scene: Scene) -> Mechanism:
+        """Collect what the equations need from a scene."""
+        actuated = np.stack([link.inertia.matrix for link in scene.actuated_links])
+        intermediate = np.stack([link.inertia.matrix for link in scene.intermediate_links])
+        return cls(Geometry.of(scene), scene.star.inertia.matrix, actuated, intermediate)
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Everything that follows from gamma and the assembly R, Eqs. 1 to 23.
+
+    Attributes:
+        gamma: actuator angles [rad], shape (3,).
+        rotation: R of {E} in {B}, shape (3, 3).
+        r, t, w: unit vectors by leg, shape (3, 3).
+        c: c_k = (r_k x t_k) . w_k, diagonal of J1, Eq. 14, shape (3,).
+        j2: Eq. 13, shape (3, 3).
+        j: J = -J2^-1 J1, omega = J gamma_dot, Eq. 15.
+        a: mu_dot = a gamma_dot, Eq. 20, rows by leg.
+        b: beta_dot = b gamma_dot, Eq. 23, rows by leg.
+
+    """
+
+    gamma: Array
+    rotation: Array
+    r: Array
+    t: Array
+    w: Array
+    c: Array
+    j2: Array
+    j: Array
+    a: Array
+    b: Array
+
+
+@dataclass(frozen=True)
+class Bias:
+    """Velocity products, Eqs. 26 to 49; accelerations are these plus Jacobians times gamma_ddot.
+
+    Attributes:
+        omega: angular velocity of the star [rad/s], Eq. 15.
+        omega_dot: J2^-1 (M gamma_dot + n) with its sign, Eq. 40 [rad/s^2].
+        mu_ddot: f_k, Eq. 45 [rad/s^2].
+        beta_ddot: u_k, Eq. 49 [rad/s^2].
+
+    """
+
+    omega: Array
+    omega_dot: Array
+    mu_ddot: Array
+    beta_ddot: Array
+
+
+def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None) -> Posture:
+    """Velocity analysis, Eqs. 1 to 23, at the admissible assembly or at the given one.
+
+    Args:
+        geometry: base triangle and star.
+        gamma: actuator angles [rad], shape (3,).
+        rotation: R of an assembly at gamma; None takes the admissible one.
+
+    Raises:
+        AssemblyError: rotation is None and there is no unique admissible assembly.
+        SingularConfiguration: det J2 = 0 (parallel) or some c_k = 0 (serial).
+
+    """
+    angles = np.asarray(gamma, dtype=float)
+    if rotation is None:
+        rotation = kinematics.admissible(geometry, angles).rotation
+    r = kinematics.carriage_directions(geometry, angles)
+    t = geometry.e @ rotation.T
+    w = geometry.w
+    normal = np.cross(r, t)
+    c = np.sum(normal * w, axis=1)
+    j2 = -normal
+    determinant = float(np.linalg.det(j2))
+    if abs(determinant) < SINGULAR:
+        raise SingularConfiguration("parallel singularity, det J2 = 0", determinant)
+    if np.min(np.abs(c)) < SINGULAR:
+        raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
+    j = -np.linalg.solve(j2, np.diag(c))
+    a = -r @ j
+    wr = np.cross(w, r)
+    b = -(wr @ j) / np.sum(wr * t, axis=1)[:, None]
+    return Posture(angles, rotation, r, t, w, c, j2, j, a, b)
+
+
+def bias(at: Posture, gamma_dot: ArrayLike) -> Bias:
+    """Acceleration analysis at gamma_ddot = 0, Eqs. 24 to 49."""
+    rate = np.asarray(gamma_dot, dtype=float)
+    omega, mu_dot, beta_dot = at.j @ rate, at.a @ rate, at.b @ rate
+    tw = np.sum(at.t * at.w, axis=1)
+    m = mu_dot * tw  # Eq. 38
+    n = -beta_dot * (at.r @ omega)  # Eq. 39
+    solved = np.linalg.solve(at.j2, m * rate + n)
+    tr = np.cross(at.t, at.r)
+    f = -beta_dot * (tr @ omega) + at.r @ solved  # Eq. 45
+    wr = np.cross(at.w, at.r)
+    u = at.t @ solved - np.sum(at.t * wr, axis=1) * rate * mu_dot  # Eq. 49
+    return Bias(omega, -solved, f, u)
+
+
+def link_frames(at: Posture) -> tuple[Array, Array]:
+    """Rotations of {1k} and {2k} in {B}, Eqs. 50 to 52, each shape (3, 3, 3)."""
+    first = np.stack([at.r, np.cross(at.w, at.r), at.w], axis=2)
+    second = np.stack([at.r, np.cross(at.t, at.r), at.t], axis=2)
+    return first, second
+
+
+def link_jacobians(at: Posture) -> tuple[Array, Array]:
+    """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 57 and 61, each (3, 3, 3)."""
+    first, second = link_frames(at)
+    d = np.eye(3)
+    ja = np.stack([first[k].T @ np.outer(at.w[k], d[k]) for k in range(3)])
+    jipl = np.stack(
+        [second[k].T @ (np.outer(at.w[k], d[k]) - np.outer(at.r[k], at.a[k])) for k in range(3)]
+    )
+    return ja, jipl
+
+
+def equation_of_motion(
+    mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)
+) -> tuple[Array, Array]:
+    """T1 and T2 of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
+
+    Args:
+        mechanism: geometry and inertias.
+        at: posture.
+        gamma_dot: actuator rates [rad/s], shape (3,).
+        moment: external moment n_ext on the star in {B} [N m], shape (3,).
+
+    Returns:
+        T1 (3, 3) [kg m^2], negative definite, and T2 (3,) [N m].
+
+    """
+    rate = np.asarray(gamma_dot, dtype=float)
+    products = bias(at, rate)
+    inertia = at.rotation @ mechanism.star @ at.rotation.T  # Eq. 64
+    spin = np.cross(products.omega, inertia @ products.omega)
+    n_ext = np.asarray(moment, dtype=float)
+    t1 = at.j.T @ (-inertia @ at.j)  # Eq. 66
+    t2 = at.j.T @ (-inertia @ products.omega_dot - spin + n_ext)  # Eq. 67
+    ja, jipl = link_jacobians(at)
+    first, second = link_frames(at)
+    for k in range(3):
+        turn = second[k].T @ first[k]
+        r, ia, iipl = second[k].T @ at.r[k], mechanism.actuated[k], mechanism.intermediate[k]
+        omega_a, omega_ipl = ja[k] @ rate, jipl[k] @ rate
+        big_l, small_l = -ia @ ja[k], -np.cross(omega_a, ia @ omega_a)  # Eqs. 73, 74
+        big_p = turn @ ja[k] + np.outer(r, at.r[k] @ at.j)  # Eq. 78
+        mu_dot = at.a[k] @ rate
+        small_p = -np.cross(turn @ omega_a, r * mu_dot) - products.mu_ddot[k] * r  # Eq. 79
+        big_k = -iipl @ big_p  # Eq. 81
+        small_k = -iipl @ small_p - np.cross(omega_ipl, iipl @ omega_ipl)  # Eq. 82
+        t1 += ja[k].T @ big_l + jipl[k].T @ big_k  # Eq. 91
+        t2 += ja[k].T @ small_l + jipl[k].T @ small_k  # Eq. 92
+    return t1, t2
+
+
+def direct_dynamics(
+    mechanism: Mechanism,
+    at: Posture,
+    gamma_dot: ArrayLike,
+    torque: ArrayLike,
+    moment: ArrayLike = (0.0, 0.0, 0.0),
+) -> Array:
+    """gamma_ddot [rad/s^2], shape (3,), of actuator torques [N m], Eq. 90."""
+    t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
+    return np.asarray(np.linalg.solve(-t1, t2 + np.asarray(torque, dtype=float)))
+
+
+def inverse_dynamics(
+    mechanism: Mechanism,
+    at: Posture,
+    gamma_dot: ArrayLike,
+    gamma_ddot: ArrayLike,
+    moment: ArrayLike = (0.0, 0.0, 0.0),
+) -> Array:
+    """Actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2], Eq. 90."""
+    t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
+    return np.asarray(-(t1 @ np.asarray(gamma_ddot, dtype=float) + t2))
