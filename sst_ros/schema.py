@@ -47,7 +47,10 @@ class Spec:
             unit = f" [{self.unit}]" if self.unit else ""
             return " ".join(["must be", what, *filter(None, bounds)]) + unit
         return {
+            "integer": f"must be a whole number from {self.least:g} to {self.most:g} [{self.unit}]",
+            "flag": "must be true or false",
             "text": "must be text",
+            "texts": "must be a list of text",
             "choice": "must be one of " + ", ".join(self.choices),
             "section": "must be a mapping",
             "sections": f"must be a list of {' or '.join(map(str, self.lengths))} mappings",
@@ -58,6 +61,21 @@ class Spec:
 def number(doc: str, unit: str, *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
     """Declare a number, or with `shape` a vector or a list of rows."""
     return _declare(Spec("number", doc, unit, **spec), default)
+
+
+def integer(doc: str, unit: str, *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
+    """Declare a whole number."""
+    return _declare(Spec("integer", doc, unit, **spec), default)
+
+
+def flag(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
+    """Declare a switch."""
+    return _declare(Spec("flag", doc), default)
+
+
+def texts(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
+    """Declare a list of text."""
+    return _declare(Spec("texts", doc), default)
 
 
 def text(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
@@ -95,11 +113,14 @@ class Section:
 
     def __post_init__(self) -> None:
         problems = []
-        for name, spec in specs(type(self)).items():
+        for field in dataclasses.fields(self):
+            name, spec, value = field.name, field.metadata["spec"], getattr(self, field.name)
+            if value is None and field.default is None:
+                continue
             try:
-                object.__setattr__(self, name, _accept(spec, getattr(self, name)))
+                object.__setattr__(self, name, _accept(spec, value))
             except ValueError:
-                problems.append(Problem(name, getattr(self, name), spec.allowed()))
+                problems.append(Problem(name, value, spec.allowed()))
         if not problems:
             problems = list(self.check())
         if problems:
@@ -219,6 +240,12 @@ def _accept(spec: Spec, value: Any) -> Any:
         return tuple((_text(name), _text(said)) for name, said in pairs)
     if spec.kind == "text":
         return _text(value)
+    if spec.kind == "texts" and isinstance(value, (list, tuple)):
+        return tuple(_text(entry) for entry in value)
+    if spec.kind == "flag" and (value is True or value is False):
+        return value
+    if spec.kind == "integer" and type(value) is int and spec.least <= value <= spec.most:
+        return value
     if spec.kind == "choice" and value in spec.choices:
         return value
     if spec.kind == "section" and spec.section:
@@ -254,7 +281,7 @@ def _text(value: Any) -> str:
 
 
 def _instance(value: Any, cls: type[Section]) -> Any:
-    if value is None or isinstance(value, cls):
+    if isinstance(value, cls):
         return value
     raise ValueError
 

@@ -74,6 +74,7 @@ class Simulation:
         self.geometry = Geometry.of(scene)
         self.model = kernel.model_of(scene)
         self._method = ExplicitMethod(tableau)
+        self.method = tableau.name
         self._limits = tuple(_limits_of(scene, self.geometry))
         self._state = self._initial()
         self.error_estimate = 0.0

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo: the paper's examples through real nodes, recorded, and judged from the recording."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sst_ros import scene
+from sst_ros.errors import SstError
+from sst_ros.report.run import report
+
+EXAMPLES = ("example1", "example2")
+_READY_S = 30.0
+_END_S = 30.0
+
+
+def demo(out: Path) -> int:
+    """Run both examples into `out`; return 0 if both were recorded and judged.
+
+    Example 2 is the main job and lies in `out` itself, Example 1 in `out`/example1.
+    """
+    for name in EXAMPLES:
+        folder = out if name == "example2" else out / name
+        bag = folder / "bag"
+        if bag.exists():
+            shutil.rmtree(bag)
+        folder.mkdir(parents=True, exist_ok=True)
+        print(f"{name}: {scene.load(name).description}", flush=True)
+        record(name, bag)
+        print(report(bag, folder), flush=True)
+    return 0
+
+
+def record(name: str, bag: Path) -> None:
+    """Play a scene's torques to its simulator, in processes of their own, and record the run.
+
+    Raises:
+        SstError: a node failed or did not end in time; says which.
+
+    """
+    duration = scene.load(name).duration or 1.0
+    with _node("recorder", output=str(bag)) as recorder:
+        run = {"scene": name, "wait_for_command": True, "duration": duration}
+        with _node("simulator", **run) as simulator:
+            _wait_until_ready(recorder)
+            with _node("torque_player", scene=name, wait_for_subscribers=2) as player:
+                _wait_for_end(player, duration + _END_S)
+                _wait_for_end(simulator, _END_S)
+        recorder.send_signal(signal.SIGINT)
+        _wait_for_end(recorder, _END_S)
+
+
+@contextmanager
+def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
+    """Start a node of ours in a domain of this demo; it does not outlive the block."""
+    values = ((key, str(value).lower() if value is True else value) for key, value in given.items())
+    options = [word for key, value in values for word in ("-p", f"{key}:={value}")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sst_ros", command, "--ros-args", *options],
+        env={
+            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            **os.environ,
+        },
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + _READY_S
+    assert recorder.stdout is not None
+    os.set_blocking(recorder.stdout.fileno(), False)
+    while not (recorder.stdout.readline() or "").startswith("ready"):
+        if recorder.poll() is not None or time.monotonic() > deadline:
+            raise SstError(f"the recorder heard no simulator within {_READY_S:g} s")
+        time.sleep(0.05)
+
+
+def _wait_for_end(process: subprocess.Popen[str], timeout: float) -> None:
+    command = process.args[3] if isinstance(process.args, list) else process.args
+    try:
+        status = process.wait(timeout)
+    except subprocess.TimeoutExpired:
+        raise SstError(f"{command} did not end within {timeout:g} s") from None
+    if status != 0:
+        raise SstError(f"{command} failed with status {status}")

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters from a `Section`: descriptors, bounds and the checked, frozen result."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.schema import Section, Spec, specs
+
+P = TypeVar("P", bound=Section)
+
+_TYPES = {
+    "number": Parameter.Type.DOUBLE,
+    "integer": Parameter.Type.INTEGER,
+    "flag": Parameter.Type.BOOL,
+    "text": Parameter.Type.STRING,
+    "choice": Parameter.Type.STRING,
+    "texts": Parameter.Type.STRING_ARRAY,
+}
+_WIDEST = 1e300
+
+
+def declare(node: Node, cls: type[P]) -> P:
+    """Declare every field of `cls` on the node, read-only, and return the values.
+
+    Raises:
+        InputError: values given at start are refused; lists all of them.
+
+    """
+    defaults = cls()
+    # rclpy has no public way to what was given; it is the same on Jazzy and Kilted.
+    given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    values, problems = {}, []
+    for name, spec in specs(cls).items():
+        default = getattr(defaults, name)
+        value = given.get(name, list(default) if isinstance(default, tuple) else default)
+        if spec.kind == "number" and type(value) is int:
+            value = float(value)  # "-p duration:=1" means 1.0
+        try:
+            node.declare_parameter(name, value, _descriptor(name, spec), ignore_override=True)
+        except (InvalidParameterTypeException, InvalidParameterValueException):
+            problems.append(Problem(name, value, spec.allowed()))
+        values[name] = value
+    for name in given.keys() - values.keys() - node._parameters.keys():
+        known = ", ".join(values)
+        node.get_logger().warning(f"parameter {name} is unknown and not used; known are {known}")
+    if problems:
+        raise InputError(node.get_fully_qualified_name(), problems)
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(node.get_fully_qualified_name(), error.problems) from None
+
+
+def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
+    unit = f" [{spec.unit}]" if spec.unit else ""
+    descriptor = ParameterDescriptor(
+        name=name,
+        type=_TYPES[spec.kind].value,
+        description=spec.doc + unit,
+        additional_constraints=spec.allowed(),
+        read_only=True,
+    )
+    low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
+    if spec.kind == "number":
+        # Only a parameter with a range refuses NaN.
+        low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    if spec.kind == "integer":
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    return descriptor

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One process, one node: start, spin until told to stop, leave without a trace."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from sst_ros.errors import SstError
+
+_SPIN_PERIOD_S = 0.05
+
+
+class Worker(Protocol):
+    """What a process runs: a node that is `done` when its work is, and closes in order."""
+
+    node: Node
+    done: threading.Event
+
+    def close(self) -> None:
+        """Finish: still connected, the last thing to publish or write goes out here."""
+
+
+def run(name: str, build: Callable[[], Worker], args: list[str] | None = None) -> int:
+    """Run until SIGINT, SIGTERM or the worker is done; return the exit status.
+
+    The signal handlers of rclpy would cut the connection at once; ours let the worker close.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    worker = None
+    try:
+        worker = build()
+        executor = SingleThreadedExecutor()
+        executor.add_node(worker.node)
+        while not stop.is_set() and not worker.done.is_set():
+            executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
+    except SstError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    finally:
+        if worker is not None:
+            worker.close()
+            worker.node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real nodes in real processes, each test in a ROS domain of its own on localhost."""
+
+import itertools
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+
+DOMAINS = itertools.cycle(range(1 + os.getpid() % 50, 101))
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    number = next(DOMAINS)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    return number
+
+
+class Nodes:
+    """Starts nodes and leaves none behind."""
+
+    def __init__(self):
+        self.running = []
+
+    def start(self, command, *words, executable=None, env=None):
+        argv = executable or [sys.executable, "-m", "sst_ros", command]
+        process = subprocess.Popen(
+            [*argv, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **(env or {})},
+        )
+        self.running.append(process)
+        return process
+
+    def run(self, command, **given):
+        options = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
+        return self.start(command, "--ros-args", *options)
+
+    def line(self, process, timeout=20):
+        assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"
+        return process.stdout.readline()
+
+    def stop(self, process, number=signal.SIGINT, timeout=15):
+        process.send_signal(number)
+        out, err = process.communicate(timeout=timeout)
+        return process.returncode, out, err
+
+    def close(self):
+        for process in self.running:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+
+
+@pytest.fixture
+def nodes(domain):
+    started = Nodes()
+    yield started
+    started.close()
+
+
+class Observer:
+    """A node in the test's own process that keeps all it hears."""
+
+    def __init__(self, domain):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("observer", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.heard = {}
+
+    def listen(self, kind, topic, *, latched=False):
+        heard = self.heard.setdefault(topic, [])
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=1000, durability=durability)
+        self.node.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def publisher(self, kind, topic):
+        publisher = self.node.create_publisher(kind, topic, 10)
+        self.until(lambda: publisher.get_subscription_count() > 0, f"a reader of {topic}")
+        return publisher
+
+    def until(self, condition, what, timeout=20.0):
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, f"no {what} within {timeout} s"
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+@pytest.fixture
+def observer(domain):
+    watching = Observer(domain)
+    yield watching
+    watching.close()

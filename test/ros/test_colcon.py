@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The other world: built by colcon, found as `ros2 run` and `ros2 launch` find things."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sensor_msgs.msg import JointState
+
+pytestmark = pytest.mark.ros
+SOURCE = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def prefix(tmp_path_factory):
+    if shutil.which("colcon", path=Path(sys.executable).parent) is None:
+        pytest.fail("colcon is missing: pip install .[test]")
+    workspace = tmp_path_factory.mktemp("workspace")
+    ignored = shutil.ignore_patterns(".*", "demo_out*", "__pycache__", "*.egg-info", "build")
+    shutil.copytree(SOURCE, workspace / "src" / "sst_ros", ignore=ignored)
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    subprocess.run(
+        [sys.executable, "-m", "colcon", "build", "--event-handlers", "console_direct-"],
+        cwd=workspace,
+        env={**os.environ, "PATH": path},
+        check=True,
+        timeout=110,
+    )
+    return workspace / "install" / "sst_ros"
+
+
+@pytest.fixture
+def overlay(prefix):
+    packages = next(prefix.glob("lib/python*/site-packages"))
+    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages)}
+
+
+def test_the_ament_index_names_the_package(prefix):
+    assert (prefix / "share/ament_index/resource_index/packages/sst_ros").is_file()
+    assert (prefix / "share/sst_ros/package.xml").is_file()
+
+
+def test_all_data_files_are_installed(prefix):
+    share = prefix / "share" / "sst_ros"
+    for folder in ("config", "launch"):
+        for path in (SOURCE / folder).rglob("*.*"):
+            if "__pycache__" not in path.parts:
+                assert (share / path.relative_to(SOURCE)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["simulator", "torque_player", "recorder"])
+def test_ros2_run_finds_the_executables(prefix, name):
+    executable = prefix / "lib" / "sst_ros" / name
+    assert executable.is_file()
+    assert os.access(executable, os.X_OK)
+
+
+def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes, observer):
+    states = observer.listen(JointState, "/joint_states")
+    executable = [str(prefix / "lib" / "sst_ros" / "simulator")]
+    words = ["--ros-args", "-p", "scene:=example1"]
+    process = nodes.start("", *words, executable=executable, env=overlay)
+    observer.until(lambda: states, "states")
+    status, _, err = nodes.stop(process)
+    assert status == 0, err
+    found = subprocess.run(
+        [sys.executable, "-c", "from sst_ros.scene import share_directory as s; print(s())"],
+        env={**os.environ, **overlay},
+        cwd=prefix,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(found.stdout.strip()) == prefix / "share" / "sst_ros"

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+import signal
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
+
+from sst_ros import load_scene
+from sst_ros.scene import Scene
+from sst_ros.schema import read
+from sst_ros.simulation import Simulation
+
+pytestmark = pytest.mark.ros
+COMMANDS = "/sst_simulator/commands"
+
+
+def nanoseconds(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def values(diagnostics):
+    return {pair.key: pair.value for pair in diagnostics.status[0].values}
+
+
+def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
+    states = observer.listen(JointState, "/joint_states")
+    nodes.run("simulator", wait_for_command=True, duration=0.2)
+    commands = observer.publisher(Float64MultiArray, COMMANDS)
+    observer.until(lambda: states, "preview")
+    assert nanoseconds(states[0]) == 0
+    commands.publish(Float64MultiArray(data=[0.1, 0.2, 0.3]))
+    observer.until(lambda: sum(nanoseconds(s) > 0 for s in states) == 101, "the 101 samples")
+
+    run = [state for state in states if nanoseconds(state)]
+    stamps = [nanoseconds(state) for state in run]
+    assert stamps == [stamps[0] + 2_000_000 * k for k in range(101)]
+    assert run[0].name[:4] == ["gamma_1", "gamma_2", "gamma_3", "mu_1"]
+    assert {len(run[0].name), len(run[0].position), len(run[0].velocity), len(run[0].effort)} == {9}
+    assert list(run[0].effort[:3]) == [0.0, 0.0, 0.0]
+    assert list(run[-1].effort) == [0.1, 0.2, 0.3] + 6 * [0.0]
+
+    simulation = Simulation(load_scene("example2"))
+    for _ in range(200):
+        simulation.step((0.1, 0.2, 0.3), 1_000_000)
+    expected = simulation.state.joints
+    assert list(run[-1].position) == [*expected.gamma, *expected.mu, *expected.beta]
+    assert list(run[-1].velocity) == [*expected.gamma_dot, *expected.mu_dot, *expected.beta_dot]
+
+
+def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes, observer):
+    orientation = observer.listen(QuaternionStamped, "/sst_simulator/orientation")
+    euler = observer.listen(Vector3Stamped, "/sst_simulator/euler_zyz")
+    applied = observer.listen(JointTrajectory, "/sst_simulator/applied_torques")
+    nodes.run("simulator", wait_for_command=True, duration=0.05, publish_rate=250)
+    commands = observer.publisher(Float64MultiArray, COMMANDS)
+    observer.until(lambda: orientation and euler and applied, "preview of every topic")
+    commands.publish(Float64MultiArray(data=[1.0, 0.0, 0.0]))
+    observer.until(lambda: sum(nanoseconds(m) > 0 for m in euler) == 14, "the 14 samples")
+    observer.until(lambda: sum(len(m.points) for m in applied) == 50, "torques of the 50 ticks")
+
+    first = [nanoseconds(m) for m in orientation if nanoseconds(m)]
+    assert first == [nanoseconds(m) for m in euler if nanoseconds(m)]
+    ends = [
+        nanoseconds(m) + p.time_from_start.sec * 10**9 + p.time_from_start.nanosec
+        for m in applied
+        for p in m.points
+    ]
+    assert ends == [first[0] + 1_000_000 * (k + 1) for k in range(50)]
+    q = orientation[-1].quaternion
+    assert orientation[-1].header.frame_id == "base"
+    assert math.hypot(q.x, q.y, q.z, q.w) == pytest.approx(1.0, abs=1e-15)
+    e = (2 * (q.x * q.z + q.y * q.w), 2 * (q.y * q.z - q.x * q.w), 1 - 2 * (q.x**2 + q.y**2))
+    angles = euler[-1].vector
+    assert angles.x == pytest.approx(math.atan2(e[1], e[0]), abs=1e-14)
+    assert angles.y == pytest.approx(math.acos(e[2]), abs=1e-14)
+
+
+def test_bad_commands_are_dropped_whole_and_counted(nodes, observer):
+    told = observer.listen(DiagnosticArray, "/diagnostics")
+    states = observer.listen(JointState, "/joint_states")
+    process = nodes.run("simulator", wait_for_command=True)
+    commands = observer.publisher(Float64MultiArray, COMMANDS)
+    commands.publish(Float64MultiArray(data=[0.1, 0.2, 0.3]))
+    bad = [[1.0, 2.0], [1.0] * 4, [], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]]
+    for data in bad:
+        commands.publish(Float64MultiArray(data=data))
+    observer.until(
+        lambda: told and values(told[-1])["commands_dropped"] == str(len(bad)), "dropped commands"
+    )
+    assert values(told[-1])["commands_received"] == "1"
+    assert list(states[-1].effort[:3]) == [0.1, 0.2, 0.3]
+    status, _, err = nodes.stop(process)
+    assert status == 0
+    warnings = [line for line in err.splitlines() if "command dropped" in line]
+    assert len(warnings) == 1
+    assert "must be 3 finite torques" in warnings[0]
+
+
+def test_without_a_command_the_torque_is_zero(nodes, observer):
+    states = observer.listen(JointState, "/joint_states")
+    nodes.run("simulator", scene="example1")
+    observer.until(lambda: len(states) > 20, "states")
+    assert {tuple(state.effort) for state in states} == {(0.0,) * 9}
+    assert states[-1].position[0] != states[0].position[0]
+
+
+def test_a_fault_is_told_and_the_last_valid_state_kept(nodes, observer):
+    told = observer.listen(DiagnosticArray, "/diagnostics")
+    states = observer.listen(JointState, "/joint_states")
+    process = nodes.run("simulator", wait_for_command=True)
+    commands = observer.publisher(Float64MultiArray, COMMANDS)
+    commands.publish(Float64MultiArray(data=[50.0, 0.0, 0.0]))
+    observer.until(lambda: told and values(told[-1])["phase"] == "fault", "fault")
+    assert "gamma_1 > 1.570796 rad" in values(told[-1])["fault"]
+    assert told[-1].status[0].level == b"\x02"
+    assert 1.5 < states[-1].position[0] <= math.pi / 2
+    status, _, err = nodes.stop(process)
+    assert status == 0
+    assert "gamma_1 > 1.570796 rad" in err
+
+
+def test_the_scene_is_latched(nodes, observer):
+    nodes.run("simulator", scene="example1")
+    document = observer.listen(String, "/sst_simulator/scene", latched=True)
+    observer.until(lambda: document, "scene")
+    assert read(Scene, document[0].data, "topic") == load_scene("example1")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_in_order(nodes, observer, number):
+    states = observer.listen(JointState, "/joint_states")
+    process = nodes.run("simulator")
+    observer.until(lambda: states, "states")
+    status, _, err = nodes.stop(process, number)
+    assert status == 0
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"rate": 300}, "rate = 300: must divide 1e9"),
+        ({"publish_rate": 300}, "publish_rate = 300: must divide rate = 1000"),
+        ({"rate": 0}, "rate = 0: must be a whole number from 1 to 100000 [Hz]"),
+        ({"rate": "fast"}, "rate = 'fast': must be a whole number"),
+        ({"duration": ".nan"}, "duration = nan: must be a finite number >= 0"),
+        ({"scene": "nowhere"}, "scene = 'nowhere': must be a readable .yaml file or one of"),
+        ({"scene": 3}, "scene = 3: must be text"),
+        ({"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
+    ],
+)
+def test_refused_parameters_are_named(nodes, given, said):
+    process = nodes.run("simulator", **given)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert said in err
+    assert "Traceback" not in err

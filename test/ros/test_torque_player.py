@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+pytestmark = pytest.mark.ros
+
+
+def test_plays_a_table_against_the_stamps_it_hears(nodes, observer, tmp_path):
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,0.1,0.2,0.3\n0.1,0.4,0.5,0.6\n0.2,0,0,0\n")
+    heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    player = nodes.run("torque_player", csv=table)
+    states = observer.publisher(JointState, "/joint_states")
+    for nanosec in (0, 500, 99_999_999 + 500, 100_000_000 + 500, 200_000_000 + 500):
+        message = JointState()
+        message.header.stamp.nanosec = nanosec
+        before = len(heard)
+        states.publish(message)
+        observer.until(lambda before=before: len(heard) > before, "answer")
+    expected = [[0.1, 0.2, 0.3]] * 3 + [[0.4, 0.5, 0.6], [0.0, 0.0, 0.0]]
+    assert [list(message.data) for message in heard] == expected
+    assert player.wait(timeout=10) == 0
+
+
+def test_silence_of_the_simulator_ends_it_with_a_message(nodes):
+    player = nodes.run("torque_player", timeout=0.5)
+    _, err = player.communicate(timeout=20)
+    assert player.returncode == 1
+    assert "no joint_states for" in err
+    assert "Traceback" not in err
+
+
+def test_a_bad_table_is_refused(nodes, tmp_path):
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,1,2,nan\n")
+    player = nodes.run("torque_player", csv=table)
+    _, err = player.communicate(timeout=20)
+    assert player.returncode == 1
+    assert "line 2: row" in err
