@@ -52,10 +52,10 @@ def record(name: str, bag: Path) -> None:
         with _node("simulator", **run) as simulator:
             _wait_until_ready(recorder)
             with _node("torque_player", scene=name, wait_for_subscribers=2) as player:
-                _wait_for_end(player, duration + _END_S)
-                _wait_for_end(simulator, _END_S)
+                _wait_for_end("torque_player", player, duration + _END_S)
+                _wait_for_end("simulator", simulator, _END_S)
         recorder.send_signal(signal.SIGINT)
-        _wait_for_end(recorder, _END_S)
+        _wait_for_end("recorder", recorder, _END_S)
 
 
 @contextmanager
@@ -91,8 +91,7 @@ def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-def _wait_for_end(process: subprocess.Popen[str], timeout: float) -> None:
-    command = process.args[3] if isinstance(process.args, list) else process.args
+def _wait_for_end(command: str, process: subprocess.Popen[str], timeout: float) -> None:
     try:
         status = process.wait(timeout)
     except subprocess.TimeoutExpired:

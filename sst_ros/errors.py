@@ -88,6 +88,10 @@ class WorkspaceLeft(RunStopped):
     """beta_k left (0, beta_max]: E reached an edge of the base triangle or of the star's arcs."""
 
 
+class ImpactsAccumulate(RunStopped):
+    """Impacts at an end of the stroke follow each other without coming to rest."""
+
+
 class Diverged(RunStopped):
     """The step gave a number that is not finite; nothing of it is kept."""
 

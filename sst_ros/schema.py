@@ -19,6 +19,9 @@ from sst_ros.errors import InputError, Problem
 
 S = TypeVar("S", bound="Section")
 
+DEEPEST = 20
+"""Levels of nesting in a document; PyYAML's time grows with their square."""
+
 
 @dataclass(frozen=True)
 class Spec:
@@ -53,7 +56,9 @@ class Spec:
             "texts": "must be a list of text",
             "choice": "must be one of " + ", ".join(self.choices),
             "section": "must be a mapping",
-            "sections": f"must be a list of {' or '.join(map(str, self.lengths))} mappings",
+            "sections": " ".join(
+                ["must be a list of", *" or ".join(map(str, self.lengths)).split(), "mappings"]
+            ),
             "notes": "must be a mapping from keys to text",
         }[self.kind]
 
@@ -93,9 +98,18 @@ def section(doc: str, cls: type[Section], *, default: Any = dataclasses.MISSING)
     return _declare(Spec("section", doc, section=cls), default)
 
 
-def sections(doc: str, cls: type[Section], lengths: Sequence[int]) -> Any:
-    """Declare a list of sections; one entry stands for all of the longest allowed list."""
-    return _declare(Spec("sections", doc, section=cls, lengths=tuple(lengths)), dataclasses.MISSING)
+def sections(
+    doc: str,
+    cls: type[Section],
+    lengths: Sequence[int],
+    *,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Declare a list of sections, of any length where `lengths` is empty.
+
+    Otherwise one entry stands for all of the longest allowed list.
+    """
+    return _declare(Spec("sections", doc, section=cls, lengths=tuple(lengths)), default)
 
 
 def notes(doc: str) -> Any:
@@ -145,11 +159,17 @@ def read(cls: type[S], source: str, origin: str) -> S:
     """
     problems: list[Problem] = []
     try:
+        depth = 0
         for event in yaml.parse(source, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
             if isinstance(event, yaml.AliasEvent):
                 allowed = "aliases are not allowed; write the value out"
                 problem = Problem("", f"*{event.anchor}", allowed, _line(event))
                 raise InputError(origin, [problem])
+            if depth > DEEPEST:
+                allowed = f"no more than {DEEPEST} levels are allowed"
+                raise InputError(origin, [Problem("", "nested", allowed, _line(event))])
         node = yaml.compose(source, Loader=yaml.SafeLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
@@ -210,7 +230,7 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
     except InputError as error:
         for problem in error.problems:
             key = ".".join(filter(None, [path, problem.key]))
-            line = lines.get(problem.key.partition(".")[0], _line(node))
+            line = _line_at(node, problem.key)
             problems.append(dataclasses.replace(problem, key=key, line=line))
         return None
 
@@ -223,12 +243,27 @@ def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> 
         return tuple(
             _build(spec.section, entry, f"{key}[{index}]", problems) for index, entry in entries
         )
+    if spec.kind == "notes" and isinstance(node, yaml.MappingNode):
+        return _notes(node, key, problems)
     value = _plain(node)
     try:
-        return _accept(spec, value)
+        return _accept(spec, _typed(spec, node, value))
     except ValueError:
         problems.append(Problem(key, value, spec.allowed(), _line(node)))
         return None
+
+
+def _notes(node: yaml.MappingNode, path: str, problems: list[Problem]) -> dict[str, str]:
+    result: dict[str, str] = {}
+    for key_node, value_node in node.value:
+        name, said = str(_plain(key_node)), _plain(value_node)
+        if name in result:
+            problems.append(Problem(f"{path}.{name}", said, "is given twice", _line(key_node)))
+        try:
+            result[name] = _text(said)
+        except ValueError:
+            problems.append(Problem(f"{path}.{name}", said, "must be text", _line(key_node)))
+    return result
 
 
 def _accept(spec: Spec, value: Any) -> Any:
@@ -250,17 +285,20 @@ def _accept(spec: Spec, value: Any) -> Any:
         return value
     if spec.kind == "section" and spec.section:
         return _instance(value, spec.section)
-    many = isinstance(value, (list, tuple)) and len(value) in spec.lengths
-    if spec.kind == "sections" and spec.section and many:
-        full = tuple(value) * (max(spec.lengths) if len(value) == 1 else 1)
-        return tuple(_instance(entry, spec.section) for entry in full)
+    listed = isinstance(value, (list, tuple))
+    if spec.kind == "sections" and spec.section and listed and _fits(len(value), spec.lengths):
+        repeated = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
+        return tuple(_instance(entry, spec.section) for entry in tuple(value) * repeated)
     raise ValueError
 
 
 def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if shape:
-        many = hasattr(value, "__len__") and not isinstance(value, (str, dict, set))
-        if not many or len(value) != shape[0]:
+        try:
+            fits = len(value) == shape[0] and not isinstance(value, (str, dict, set))
+        except TypeError:
+            fits = False
+        if not fits:
             raise ValueError
         return tuple(_numbers(spec, entry, shape[1:]) for entry in value)
     if isinstance(value, bool) or value is None:
@@ -272,6 +310,10 @@ def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if not math.isfinite(result) or not spec.least <= result <= spec.most or result <= spec.above:
         raise ValueError
     return result
+
+
+def _fits(length: int, lengths: tuple[int, ...]) -> bool:
+    return not lengths or length in lengths
 
 
 def _text(value: Any) -> str:
@@ -297,8 +339,33 @@ def _plain(node: yaml.Node | None) -> Any:
     return None
 
 
+def _typed(spec: Spec, node: yaml.Node, value: Any) -> Any:
+    """Turn the text of a plain YAML flag or whole number into what it says."""
+    if spec.kind == "flag" and node.tag.endswith(":bool"):
+        return {"true": True, "false": False}.get(value.lower(), value)
+    if spec.kind == "integer" and node.tag.endswith(":int"):
+        return int(value)
+    return value
+
+
 def _line(node: yaml.Node | yaml.Event | None) -> int | None:
     return None if node is None or node.start_mark is None else int(node.start_mark.line) + 1
+
+
+def _line_at(node: yaml.Node, path: str) -> int | None:
+    """Line of the deepest part of a path, as in "links[0].centre", that the document has."""
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    for key_node, value_node in pairs:
+        name = str(_plain(key_node))
+        if path == name:
+            return _line(key_node)
+        if path.startswith(f"{name}."):
+            return _line_at(value_node, path[len(name) + 1 :])
+        if path.startswith(f"{name}[") and isinstance(value_node, yaml.SequenceNode):
+            index, _, rest = path[len(name) + 1 :].partition("]")
+            entries = value_node.value
+            return _line_at(entries[min(int(index), len(entries) - 1)], rest.removeprefix("."))
+    return _line(node)
 
 
 def _size(shape: tuple[int, ...]) -> str:

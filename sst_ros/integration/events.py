@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where inside a step a distance runs out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from scipy.optimize import brentq
+
+Signal = Callable[[float], float]
+
+TIME_TOLERANCE = 1e-15
+"""Accuracy of a located time [s], above the rounding of the time itself."""
+
+_GRAZING = 1e-12
+
+
+def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
+    """Time x in [0, h] at which `margin` becomes negative, or None.
+
+    Both signals are smooth functions of the time since the step began and `slope` is the rate of
+    `margin`. A dip below zero and back inside the step is found where the slope changes sign once.
+    A margin that starts at zero and grows does not count, one that starts at zero and shrinks does.
+    """
+    begin, end = 0.0, h
+    rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
+    if margin(0.0) <= _GRAZING:
+        if not rising:
+            return 0.0 if margin(0.0) < -_GRAZING or slope(0.0) < 0.0 else None
+        if margin(h) >= 0.0:
+            return None
+        # It grew first: the crossing lies behind the top.
+        begin = _root(slope, 0.0, h) if falling else 0.0
+    elif margin(h) >= 0.0:
+        if rising or falling:
+            return None
+        end = _root(slope, 0.0, h)
+        if margin(end) >= 0.0:
+            return None
+    return _root(margin, begin, end)
+
+
+def _root(signal: Signal, begin: float, end: float) -> float:
+    if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
+        return begin
+    return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The functions of one scene that a run calls: traced, flat, with nothing the scene has not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+from sst_ros.mechanism import energy, kernel
+from sst_ros.mechanism.trace import Program, trace
+from sst_ros.mechanism.triples import rotation_rows
+from sst_ros.scene import Scene
+
+Function = Callable[..., tuple[float, ...]]
+
+QUATERNION = ("x", "y", "z", "w")
+RATE = ("wx", "wy", "wz")
+LAG = ("l1", "l2", "l3")
+TORQUE = ("t1", "t2", "t3")
+MOMENT = ("n1", "n2", "n3")
+
+
+class Dynamics:
+    """Programs of a scene.
+
+    Attributes:
+        model: constants.
+        state: names of the state's numbers: quaternion, body rate, lagged torques if any.
+        drive: names of what acts from outside: torques, and a moment if it comes from a topic.
+
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.model = kernel.model_of(scene)
+        lagging = self.model.time_constant is not None
+        self.state = (*QUATERNION, *RATE, *(LAG if lagging else ()))
+        self.moved = scene.moment is not None and scene.moment.topic
+        self.drive = (*TORQUE, *(MOMENT if self.moved else ()))
+
+    @cached_property
+    def program(self) -> Program:
+        """Derivative of the state by time; inputs are state and drive."""
+        return trace(self._derivative, (*self.state, *self.drive))
+
+    @cached_property
+    def derivative(self) -> Function:
+        """The program as a function of plain floats."""
+        return compiled(self.program)
+
+    @cached_property
+    def joints(self) -> Function:
+        """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven."""
+        return compiled(trace(self._joints, (*QUATERNION, *RATE)))
+
+    @cached_property
+    def acceleration(self) -> Function:
+        """W_dot without external moment, of the first seven numbers and torques that act now."""
+        return compiled(trace(self._acceleration, (*QUATERNION, *RATE, *TORQUE)))
+
+    @cached_property
+    def reach(self) -> Function:
+        """Rows g_k (nine numbers) and gamma_ddot at W_dot = 0, of the first seven numbers."""
+        return compiled(trace(self._reach, (*QUATERNION, *RATE)))
+
+    @cached_property
+    def energies(self) -> Function:
+        """Kinetic and potential energy [J] and power put in [W], of state and drive."""
+        return compiled(trace(self._energies, (*self.state, *self.drive)))
+
+    def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
+        return kernel.derivative(self.model, *self._split(inputs))
+
+    def _joints(self, *state: Any) -> tuple[Any, ...]:
+        return tuple(number for triple in kernel.joints(self.model, state) for number in triple)
+
+    def _acceleration(self, *inputs: Any) -> tuple[Any, ...]:
+        q, rate, torque = inputs[:4], inputs[4:7], inputs[7:]
+        return kernel.body_acceleration(self.model, q, rate, torque)
+
+    def _reach(self, *state: Any) -> tuple[Any, ...]:
+        rows, rate = rotation_rows(state[:4]), state[4:7]
+        legs = [kernel.leg_motion(leg, rows, rate) for leg in self.model.legs]
+        flat = [number for at in legs for number in at.g]
+        return (*flat, *(kernel.rest_accelerations(at, rate)[1] for at in legs))
+
+    def _energies(self, *inputs: Any) -> tuple[Any, ...]:
+        state, torque, moment = self._split(inputs)
+        stored = energy.kinetic(self.model, state), energy.potential(self.model, state)
+        return (*stored, energy.power(self.model, state, torque, moment))
+
+    def _split(self, inputs: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+        size = len(self.state)
+        return inputs[:size], inputs[size : size + 3], inputs[size + 3 :] or None
+
+
+def compiled(program: Program) -> Function:
+    """Turn a program into a Python function of its inputs.
+
+    The function raises ArithmeticError or ValueError where a float has no value.
+    """
+    names: dict[str, Any] = {name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "atan2")}
+    exec(program.source("function"), names)
+    function: Function = names["function"]
+    return function

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Straight-line programs out of ordinary functions: what a scene does not have vanishes.
+
+A function is run once on expressions instead of numbers. Constants fold, products with zero and
+sums with zero disappear, equal subexpressions are computed once, and what no output needs is
+dropped. What is left is a list of operations: it can be counted, differentiated, and written as
+the source of one flat Python function, for the interpreter or for a compiler.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+Value = Any  # an Expression or a float
+
+_TEMPLATES = {
+    "add": "{} + {}",
+    "sub": "{} - {}",
+    "mul": "{} * {}",
+    "div": "{} / {}",
+    "neg": "-{}",
+    "sqrt": "sqrt({})",
+    "tanh": "tanh({})",
+    "exp": "exp({})",
+    "atan2": "atan2({}, {})",
+    "positive": "max({}, 0.0)",
+    "step": "(1.0 if {} > 0.0 else 0.0)",
+}
+_FOLDS: dict[str, Callable[..., float]] = {
+    "sqrt": math.sqrt,
+    "tanh": math.tanh,
+    "exp": math.exp,
+    "atan2": math.atan2,
+    "positive": lambda x: max(x, 0.0),
+    "step": lambda x: float(x > 0.0),
+}
+
+
+class Graph:
+    """All expressions of one trace, each distinct one once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[tuple[str, tuple[Value, ...]]] = []
+        self._known: dict[tuple[Any, ...], Expression] = {}
+
+    def node(self, op: str, *args: Value) -> Expression:
+        """Return the expression op(args), an old one where there is one."""
+        keys = tuple(("n", a.index) if isinstance(a, Expression) else ("c", a) for a in args)
+        key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
+        if key not in self._known:
+            self._known[key] = Expression(self, len(self.nodes))
+            self.nodes.append((op, args))
+        return self._known[key]
+
+
+class Expression:
+    """A number that is not known yet; arithmetic on it is noted in its graph."""
+
+    __slots__ = ("graph", "index")
+    # NumPy scalars must leave the arithmetic to us.
+    __array_ufunc__ = None
+
+    def __init__(self, graph: Graph, index: int) -> None:
+        self.graph = graph
+        self.index = index
+
+    def __add__(self, other: Value) -> Value:
+        if _is(other, 0.0):
+            return self
+        if _negated(other) is not None:
+            return self - _negated(other)
+        if _negated(self) is not None and not _is_constant(other):
+            return other - _negated(self)
+        return self.graph.node("add", self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Value) -> Value:
+        if _is(other, 0.0):
+            return self
+        if other is self:
+            return 0.0
+        inner = _negated(other)
+        return self + inner if inner is not None else self.graph.node("sub", self, other)
+
+    def __rsub__(self, other: Value) -> Value:
+        return -self if _is(other, 0.0) else self.graph.node("sub", other, self)
+
+    def __mul__(self, other: Value) -> Value:
+        if _is_constant(other):
+            if other == 0.0:
+                return 0.0
+            if abs(other) == 1.0:
+                return self if other > 0.0 else -self
+        mine, theirs = _negated(self), _negated(other)
+        if mine is not None and theirs is not None:
+            return mine * theirs
+        if mine is not None:
+            return -(mine * other) if not _is_constant(other) else mine * -other
+        return -(self * theirs) if theirs is not None else self.graph.node("mul", self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Value) -> Value:
+        if _is_constant(other):
+            if abs(other) == 1.0:
+                return self * other
+            if math.frexp(other)[0] in (0.5, -0.5):
+                return self * (1.0 / other)
+        if other is self:
+            return 1.0
+        mine = _negated(self)
+        return -(mine / other) if mine is not None else self.graph.node("div", self, other)
+
+    def __rtruediv__(self, other: Value) -> Value:
+        return 0.0 if _is(other, 0.0) else self.graph.node("div", other, self)
+
+    def __neg__(self) -> Value:
+        inner = _negated(self)
+        return inner if inner is not None else self.graph.node("neg", self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a traced number has no truth value: branch on constants only")
+
+    def traced(self, op: str, *args: Value) -> Value:
+        """Note a function of this expression, or of `args`."""
+        return self.graph.node(op, *(args or (self,)))
+
+
+@dataclass(frozen=True)
+class Program:
+    """A straight-line program.
+
+    Attributes:
+        inputs: names of the inputs.
+        steps: (op, operands) in order; an operand is a float, or the number of an input or, from
+            len(inputs) on, of a step.
+        outputs: operands that are the results.
+
+    """
+
+    inputs: tuple[str, ...]
+    steps: tuple[tuple[str, tuple[float | Operand, ...]], ...]
+    outputs: tuple[float | Operand, ...]
+
+    @property
+    def operations(self) -> Counter[str]:
+        """How often each operation is done."""
+        return Counter(op for op, _ in self.steps)
+
+    def source(self, name: str) -> str:
+        """Source of a flat function of all inputs that returns the tuple of outputs."""
+        names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
+
+        def word(operand: float | Operand) -> str:
+            if isinstance(operand, Operand):
+                return names[operand.number]
+            return repr(operand) if operand >= 0.0 else f"({operand!r})"
+
+        lines = [f"def {name}({', '.join(self.inputs)}):"]
+        for i, (op, operands) in enumerate(self.steps):
+            lines.append(f"    v{i} = " + _TEMPLATES[op].format(*map(word, operands)))
+        lines.append(f"    return ({', '.join(map(word, self.outputs))},)")
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class Operand:
+    """Reference to an input or to the result of a step."""
+
+    number: int
+
+
+def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Program:
+    """Run `function` on one expression per input and return what it does."""
+    graph = Graph()
+    symbols = [graph.node("input", name) for name in inputs]
+    return _program(graph, tuple(inputs), tuple(function(*symbols)))
+
+
+def with_jacobian(
+    function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
+) -> Program:
+    """Trace `function` and its exact derivatives; outputs are f, then df/dx for each x in `by`."""
+    graph = Graph()
+    symbols = [graph.node("input", name) for name in inputs]
+    outputs = tuple(function(*symbols))
+    last = len(graph.nodes)
+    everything = list(outputs)
+    for name in by:
+        slopes = _slopes(graph, last, symbols[list(inputs).index(name)])
+        everything += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
+    return _program(graph, tuple(inputs), tuple(everything))
+
+
+def _slopes(graph: Graph, last: int, by: Expression) -> list[Value]:
+    """Differentiate each of the first `last` nodes by one input (forward mode)."""
+    slopes: list[Value] = []
+    for index in range(last):
+        op, args = graph.nodes[index]
+        here = Expression(graph, index)
+        d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
+        slopes.append(float(index == by.index) if op == "input" else _chain(op, args, d, here))
+    return slopes
+
+
+def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -> Value:
+    x = args[0]
+    if op in ("add", "sub"):
+        return d[0] + d[1] if op == "add" else d[0] - d[1]
+    if op == "mul":
+        return d[0] * args[1] + x * d[1]
+    if op == "div":
+        return (d[0] - here * d[1]) / args[1]
+    if op == "atan2":
+        return (d[0] * args[1] - x * d[1]) / (x * x + args[1] * args[1])
+    inner: dict[str, Callable[[], Value]] = {
+        "neg": lambda: -1.0,
+        "sqrt": lambda: 0.5 / here,
+        "tanh": lambda: 1.0 - here * here,
+        "exp": lambda: here,
+        "positive": lambda: x.traced("step"),
+        "step": lambda: 0.0,
+    }
+    return 0.0 if _is(d[0], 0.0) else inner[op]() * d[0]
+
+
+def _program(graph: Graph, inputs: tuple[str, ...], outputs: tuple[Value, ...]) -> Program:
+    """Keep what the outputs need, in order."""
+    needed: set[int] = set()
+    waiting = [out.index for out in outputs if isinstance(out, Expression)]
+    while waiting:
+        index = waiting.pop()
+        if index not in needed:
+            needed.add(index)
+            op, args = graph.nodes[index]
+            if op != "input":
+                waiting += [a.index for a in args if isinstance(a, Expression)]
+    numbers = {i: i for i in range(len(inputs))}
+    for index in sorted(needed - numbers.keys()):
+        numbers[index] = len(numbers)
+
+    def operand(value: Value) -> float | Operand:
+        return Operand(numbers[value.index]) if isinstance(value, Expression) else float(value)
+
+    steps = []
+    for index in sorted(needed):
+        op, args = graph.nodes[index]
+        if op != "input":
+            steps.append((op, tuple(map(operand, args))))
+    return Program(inputs, tuple(steps), tuple(map(operand, outputs)))
+
+
+def _is_constant(value: Value) -> bool:
+    return not isinstance(value, Expression)
+
+
+def _is(value: Value, number: float) -> bool:
+    return not isinstance(value, Expression) and float(value) == number
+
+
+def _negated(value: Value) -> Value:
+    """Return x where value is -x, else None."""
+    if not isinstance(value, Expression):
+        return None
+    op, args = value.graph.nodes[value.index]
+    return args[0] if op == "neg" else None

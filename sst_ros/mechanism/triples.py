@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vectors of three and symmetric matrices on any kind of number: floats, expressions, columns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Scalar = Any
+Triple = tuple[Scalar, Scalar, Scalar]
+Rows = tuple[Triple, Triple, Triple]
+
+ZERO: Triple = (0.0, 0.0, 0.0)
+
+
+def rotation_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Rows:
+    """Rows of R for a quaternion (x, y, z, w) of any length > 0."""
+    x, y, z, w = q
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    sx, sy, sz = s * x, s * y, s * z
+    xx, yy, zz = sx * x, sy * y, sz * z
+    xy, xz, yz, wx, wy, wz = sx * y, sx * z, sy * z, sx * w, sy * w, sz * w
+    return (
+        (1.0 - (yy + zz), xy - wz, xz + wy),
+        (xy + wz, 1.0 - (xx + zz), yz - wx),
+        (xz - wy, yz + wx, 1.0 - (xx + yy)),
+    )
+
+
+def added(a: Triple, b: Triple) -> Triple:
+    """Return a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def scaled(factor: Scalar, a: Triple) -> Triple:
+    """Return factor a."""
+    return (factor * a[0], factor * a[1], factor * a[2])
+
+
+def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
+    """Return alpha a + beta b."""
+    return (alpha * a[0] + beta * b[0], alpha * a[1] + beta * b[1], alpha * a[2] + beta * b[2])
+
+
+def solve_symmetric(
+    xx: Scalar, yy: Scalar, zz: Scalar, xy: Scalar, xz: Scalar, yz: Scalar,
+    fx: Scalar, fy: Scalar, fz: Scalar,
+) -> Triple:  # fmt: skip
+    """Solve a symmetric positive definite 3 x 3 system by L D L^T."""
+    l21, l31 = xy / xx, xz / xx
+    d2 = yy - l21 * xy
+    e32 = yz - l31 * xy
+    l32 = e32 / d2
+    d3 = zz - l31 * xz - l32 * e32
+    y2 = fy - l21 * fx
+    y3 = fz - l31 * fx - l32 * y2
+    x3 = y3 / d3
+    x2 = y2 / d2 - l32 * x3
+    return (fx / xx - l21 * x2 - l31 * x3, x2, x3)
+
+
+def turned_back(rows: Rows, vector: Triple) -> Triple:
+    """R^T times a vector of {B}."""
+    x, y, z = vector
+    first, second, third = (x * rows[0][i] + y * rows[1][i] + z * rows[2][i] for i in range(3))
+    return (first, second, third)
+
+
+def dot(a: Triple, b: Triple) -> Scalar:
+    """Scalar product of two triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Triple, b: Triple) -> Triple:
+    """Vector product of two triples."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

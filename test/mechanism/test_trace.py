@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sst_ros.mechanism.compiled import compiled
+from sst_ros.mechanism.elementary import atan2, exp, positive, sqrt, tanh
+from sst_ros.mechanism.trace import trace, with_jacobian
+
+FINITE = st.floats(-10.0, 10.0)
+
+
+def total(program):
+    return sum(program.operations.values())
+
+
+@pytest.mark.parametrize(
+    ("function", "operations"),
+    [
+        (lambda x, y: (0.0 * x + y,), 0),
+        (lambda x, y: (x - 0.0, 1.0 * y, y / 1.0), 0),
+        (lambda x, y: (x - x + 0.0 * y,), 0),
+        (lambda x, y: (-(-x),), 0),
+        (lambda x, y: (x * y, y * x), 1),
+        (lambda x, y: (x + -y,), 1),
+        (lambda x, y: (0.0 / x,), 0),
+        (lambda x, y: ((2.0 + 3.0) * x,), 1),
+        (lambda x, y: (x * y + 0.0 * sqrt(x) * tanh(y),), 1),
+    ],
+)
+def test_constants_fold_and_what_is_absent_costs_nothing(function, operations):
+    assert total(trace(function, ("x", "y"))) == operations
+
+
+def test_what_no_output_needs_is_dropped():
+    def function(x, y):
+        exp(x * y)
+        return (x + y,)
+
+    assert trace(function, ("x", "y")).operations == {"add": 1}
+
+
+def everything(x, y):
+    angle = atan2(x * y + 1.0, y - 3.0)
+    return (
+        angle / (2.0 + x * x),
+        -sqrt(1.0 + y * y) * tanh(x),
+        exp(-x * x) - positive(y - 1.0) * 4.0,
+    )
+
+
+@given(FINITE, FINITE)
+def test_a_program_gives_the_bits_of_its_function(x, y):
+    assert compiled(trace(everything, ("x", "y")))(x, y) == everything(x, y)
+
+
+@given(FINITE, FINITE.filter(lambda y: abs(y - 1.0) > 1e-6 and abs(y - 3.0) > 1e-6))
+def test_derivatives_equal_the_complex_step(x, y):
+    program = with_jacobian(everything, ("x", "y"), ("x", "y"))
+    values = compiled(program)(x, y)
+    step = 1e-200
+    by_x = [np.imag(f) / step for f in everything(complex(x, step), complex(y))]
+    by_y = [np.imag(f) / step for f in everything(complex(x), complex(y, step))]
+    assert values[:3] == everything(x, y)
+    assert values[3:] == pytest.approx([*by_x, *by_y], rel=1e-12, abs=1e-14)
+
+
+def test_a_branch_on_a_traced_number_is_refused():
+    with pytest.raises(TypeError, match="branch on constants only"):
+        trace(lambda x: (1.0 if x else 0.0,), ("x",))
+
+
+def test_numpy_constants_do_not_capture_expressions():
+    program = trace(lambda x: (np.float64(2.0) * x, np.float64(1.0) + x), ("x",))
+    assert compiled(program)(3.0) == (6.0, 4.0)
+    assert compiled(trace(lambda x: (x / 4.0,), ("x",)))(3.0) == (0.75,)
