@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import sys
 from pathlib import Path
 
+from sst_ros import scene
 from sst_ros.errors import SstError
+from sst_ros.json_schema import json_schema
+from sst_ros.simulation import Simulation
 
 NODES = ("simulator", "torque_player", "recorder")
 
@@ -21,17 +25,51 @@ def main(arguments: list[str] | None = None) -> int:
         return status
     options = _parser().parse_args(given)
     try:
-        if options.command == "demo":
-            from sst_ros.demo import demo
-
-            return demo(options.out)
-        from sst_ros.report.run import report
-
-        print(report(options.bag, options.out or options.bag.parent / "report"))
+        done: int = options.run(options) or 0
     except SstError as error:
         print(f"sst_ros: {error}", file=sys.stderr)
         return 1
-    return 0
+    return done
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from sst_ros.demo import demo
+
+    return demo(options.out)
+
+
+def _report_run(options: argparse.Namespace) -> None:
+    from sst_ros.report.run import report
+    from sst_ros.report.table import table
+
+    print(table(report(options.bag, options.out or options.bag.parent / "report")))
+
+
+def _scene_list(_: argparse.Namespace) -> None:
+    for name in scene.names():
+        print(f"{name:<18}{scene.load(name).description}")
+
+
+def _scene_show(options: argparse.Namespace) -> None:
+    from sst_ros.report.sheet import sheet
+
+    print(sheet(scene.load(options.scene)), end="")
+
+
+def _scene_check(options: argparse.Namespace) -> int:
+    failed = 0
+    for path in options.files:
+        try:
+            Simulation(scene.load(path))
+            print(f"{path}: valid")
+        except SstError as error:
+            failed = 1
+            print(error)
+    return failed
+
+
+def _scene_schema(_: argparse.Namespace) -> None:
+    print(json.dumps(json_schema(scene.Scene, "sst_ros scene"), indent=2))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -43,13 +81,31 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     demo = commands.add_parser("demo", help="run the paper's examples through the nodes")
     demo.add_argument("--out", type=Path, default=Path("demo_out"), help="folder of the results")
-    report = commands.add_parser("report", help="judge a recorded run").add_subparsers(
-        dest="kind", required=True, metavar="KIND"
-    )
+    demo.set_defaults(run=_demo)
+
+    report = _group(commands.add_parser("report", help="judge a recorded run"))
     run = report.add_parser("run", help="error against run time of a bag")
     run.add_argument("bag", type=Path, help="folder of the bag")
     run.add_argument("--out", type=Path, help="folder of the results; default: beside the bag")
+    run.set_defaults(run=_report_run)
+
+    scenes = _group(commands.add_parser("scene", help="look at scenes"))
+    scenes.add_parser("list", help="the scenes that come with sst_ros").set_defaults(
+        run=_scene_list
+    )
+    show = scenes.add_parser("show", help="what a scene is made of and what it costs")
+    show.add_argument("scene", help="name, or path of a .yaml file")
+    show.set_defaults(run=_scene_show)
+    check = scenes.add_parser("check", help="tell every fault of scene files")
+    check.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    check.set_defaults(run=_scene_check)
+    schema = scenes.add_parser("schema", help="JSON schema for editors")
+    schema.set_defaults(run=_scene_schema)
     return parser
+
+
+def _group(parser: argparse.ArgumentParser) -> argparse._SubParsersAction[argparse.ArgumentParser]:
+    return parser.add_subparsers(dest="kind", required=True, metavar="KIND")
 
 
 if __name__ == "__main__":

@@ -60,7 +60,11 @@ class Base(Section):
     """The fixed spherical triangle P1 P2 P3 in {B}."""
 
     v: tuple[Vector, Vector, Vector] = number(
-        "directions of P1, P2, P3 seen from O, any length, right-handed", "1", shape=(3, 3)
+        "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
+        "1",
+        shape=(3, 3),
+        least=-1e6,
+        most=1e6,
     )
     radius: float = number("radius of the base sphere", "m", above=0.0)
 
@@ -68,8 +72,8 @@ class Base(Section):
         """Refuse triangles without area and left-handed ones."""
         v = np.array(self.v)
         lengths = np.linalg.norm(v, axis=1)
-        if np.any(lengths == 0.0):
-            yield Problem("v", self.v, "no direction may be zero")
+        if np.any(lengths < 1e-6):
+            yield Problem("v", self.v, "no direction may be zero (shorter than 1e-6)")
             return
         volume = float(np.linalg.det(v / lengths[:, None]))
         if abs(volume) < RELATIVE_ROUNDING:

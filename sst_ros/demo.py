@@ -16,6 +16,7 @@ from pathlib import Path
 from sst_ros import scene
 from sst_ros.errors import SstError
 from sst_ros.report.run import report
+from sst_ros.report.table import table
 
 EXAMPLES = ("example1", "example2")
 _READY_S = 30.0
@@ -35,7 +36,7 @@ def demo(out: Path) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
-        print(report(bag, folder), flush=True)
+        print(table(report(bag, folder)), flush=True)
     return 0
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.bodies import Base, Inertia, Link, Payload, Star, Vector
+from sst_ros.document import read
 from sst_ros.errors import InputError, Problem
-from sst_ros.schema import Section, notes, number, read, section, sections, specs, text
+from sst_ros.schema import Section, notes, number, section, sections, specs, text
 from sst_ros.terms import (
     Actuators,
     Friction,

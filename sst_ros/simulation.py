@@ -113,7 +113,8 @@ class Simulation:
         drive = self._drive(torque, moment)
         resting = self._resting
         try:
-            at = self._through_impacts(h, start, drive)
+            with np.errstate(all="ignore"):
+                at = self._through_impacts(h, start, drive)
         except (ArithmeticError, ValueError):
             self._resting = resting
             raise Diverged("the step is not finite", start, self._state) from None

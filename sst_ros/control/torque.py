@@ -42,17 +42,18 @@ def table(path: Path) -> tuple[Profile, float]:
     origin = str(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
+            reader = csv.reader(file)
+            rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(origin, [Problem("csv", origin, f"must be readable ({error})")]) from None
     header = ["time", "tau_1", "tau_2", "tau_3"]
-    if not rows or [name.strip() for name in rows[0]] != header:
-        found = rows[0] if rows else None
+    found = rows[0][1] if rows else None
+    if found is None or [name.strip() for name in found] != header:
         raise InputError(origin, [Problem("header", found, "must be " + ", ".join(header), 1)])
     times: list[float] = []
     torques: list[Torque] = []
     problems = []
-    for line, row in enumerate(rows[1:], start=2):
+    for line, row in rows[1:]:
         try:
             time, first, second, third = (float(entry) for entry in row)
         except ValueError:

@@ -21,11 +21,12 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import scene
+from sst_ros.document import dump
 from sst_ros.errors import Problem, RunStopped
 from sst_ros.nodes import parameters, process
 from sst_ros.nodes.messages import StateMessages, TorqueLog, diagnostics
 from sst_ros.nodes.pacing import Pacer
-from sst_ros.schema import Section, dump, flag, integer, number, text
+from sst_ros.schema import Section, flag, integer, number, text
 from sst_ros.simulation import NANOSECONDS, Simulation
 
 ZERO = (0.0, 0.0, 0.0)

@@ -22,7 +22,7 @@ def total(program):
         (lambda x, y: (0.0 * x + y,), 0),
         (lambda x, y: (x - 0.0, 1.0 * y, y / 1.0), 0),
         (lambda x, y: (x - x + 0.0 * y,), 0),
-        (lambda x, y: (-(-x),), 0),
+        (lambda x, y: (-(0.0 - x),), 0),
         (lambda x, y: (x * y, y * x), 1),
         (lambda x, y: (x + -y,), 1),
         (lambda x, y: (0.0 / x,), 0),

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The physics itself, checked: the kernel against the paper's equations at recorded states.
+
+What is compared is the mechanism of the paper: bodies, torques and the products of velocities.
+Loads that a scene may have beside them are no part of the paper and are left out on both sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sst_ros.errors import SingularConfiguration
+from sst_ros.mechanism import kernel, kinematics, virtual_work
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Array
+from sst_ros.report import states
+from sst_ros.report.recording import Recording
+from sst_ros.scene import Scene
+
+STATES = 20
+
+PAPER = (
+    "name", "description", "base", "star", "actuated_links", "intermediate_links", "initial",
+)  # fmt: skip
+"""Sections of a scene that the paper has."""
+
+
+@dataclass(frozen=True)
+class Formulation:
+    """Difference of the two formulations.
+
+    Attributes:
+        relative: largest difference of W_dot, as a part of the largest W_dot of all states; None
+            where no state could be compared.
+        states: number of states compared; those at a singularity of the paper's J2 are left out.
+
+    """
+
+    relative: float | None
+    states: int
+
+
+def check(recording: Recording, count: int = STATES) -> Formulation:
+    """Compare W_dot at samples spread over the run, under the torques recorded there."""
+    bare = Scene(**{name: getattr(recording.scene, name) for name in PAPER})
+    mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
+    whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
+    chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
+    differences, sizes = [], []
+    for sample in whole[chosen] if len(whole) else ():
+        state = states.recorded(mechanism.geometry, recording, int(sample))
+        if state is None:
+            continue
+        torque = recording.effort[sample]
+        try:
+            paper = _of_the_paper(mechanism, state, torque)
+        except SingularConfiguration:
+            continue
+        first, second, third = torque.tolist()
+        ours = np.array(kernel.derivative(model, state, (first, second, third))[4:])
+        differences.append(float(np.linalg.norm(ours - paper)))
+        sizes.append(float(np.linalg.norm(paper)))
+    if not sizes:
+        return Formulation(None, 0)
+    scale = max(sizes)
+    return Formulation(max(differences) / scale if scale > 0.0 else max(differences), len(sizes))
+
+
+def _of_the_paper(mechanism: virtual_work.Mechanism, state: states.Vector, torque: Array) -> Array:
+    """W_dot in {E} [rad/s^2] by Eqs. 1 to 92."""
+    rotation = rotation_matrix(state[:4])
+    gamma = kinematics.inverse(mechanism.geometry, rotation)[0]
+    posture = virtual_work.posture(mechanism.geometry, gamma, rotation)
+    gamma_dot = np.linalg.solve(posture.j, rotation @ np.array(state[4:]))
+    gamma_ddot = virtual_work.direct_dynamics(mechanism, posture, gamma_dot, torque)
+    # R W_dot = omega_dot, because W x W = 0.
+    omega_dot = posture.j @ gamma_ddot + virtual_work.bias(posture, gamma_dot).omega_dot
+    return np.asarray(rotation.T @ omega_dot)

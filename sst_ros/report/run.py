@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of one recorded run, from its bag alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.report import figures, formulation, recording, reference, summary
+
+SUMMARY = "summary.json"
+
+
+def report(bag: Path, out: Path) -> dict[str, Any]:
+    """Judge a recorded run; write summary.json and the pictures into `out`.
+
+    Returns:
+        The summary, as written; `table.table` makes it text.
+
+    Raises:
+        InputError: the bag is no whole recording of a run, or `out` cannot be written.
+        AssemblyError: the scene's initial gamma has no unique admissible assembly.
+
+    """
+    run = recording.read(bag)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        integration, ideal = reference.integration(run), reference.ideal(run)
+        result = summary.summarise(run, integration, ideal, formulation.check(run))
+        pictures = figures.draw(run, integration, ideal, out)
+        result["pictures"] = [path.name for path in pictures]
+        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+        (out / SUMMARY).write_text(text, encoding="utf-8")
+    except OSError as error:
+        allowed = f"must be a folder that can be written ({error})"
+        raise InputError("report", [Problem("out", str(out), allowed)]) from None
+    return result

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report in numbers: one flat mapping, units in the names, nothing that is not finite.
+
+What a recording does not tell is None, never a guess.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+import platform
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from sst_ros.mechanism.geometry import Array
+from sst_ros.report.formulation import Formulation
+from sst_ros.report.recording import Recording
+from sst_ros.report.reference import Comparison, Deviation
+from sst_ros.report.rows import NANOSECONDS
+from sst_ros.report.states import begins
+
+QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
+
+
+def summarise(
+    recording: Recording,
+    integration: Comparison,
+    ideal: Comparison | None,
+    formulation: Formulation,
+) -> dict[str, Any]:
+    """Collect everything that the report says."""
+    summary: dict[str, Any] = {"scene": recording.scene.name, "bag": str(recording.path)}
+    summary |= _run(recording)
+    summary |= _loss(recording)
+    summary |= _largest("integration_error", integration.error, recording.seconds)
+    summary |= _largest("integration_reference_error", integration.own)
+    summary |= {
+        "reference_steps_per_tick": integration.steps,
+        "samples_compared": integration.compared,
+        "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
+    }
+    if ideal:
+        summary |= _largest("ideal_difference", ideal.error, recording.seconds)
+        summary |= _largest("ideal_reference_error", ideal.own)
+    summary |= {
+        "formulation_difference_relative": formulation.relative,
+        "formulation_states": formulation.states,
+        "effort_difference_max_N_m": _effort_difference(recording),
+        "topics_missing": list(recording.missing),
+        "notes": list(_notes(recording, integration, ideal)),
+        "report": _made_on(),
+    }
+    return summary
+
+
+def _run(recording: Recording) -> dict[str, Any]:
+    told = recording.diagnostics
+    return {
+        "phase": told.get("phase"),
+        "fault": told.get("fault"),
+        "integrator": told.get("integrator"),
+        "ticks": _count(told, "ticks"),
+        "ticks_missed": _count(told, "ticks_missed"),
+        "simulated_time_s": _number(told, "simulated_time_s"),
+        "wall_time_s": _number(told, "wall_time_s"),
+        "real_time_factor": _number(told, "real_time_factor"),
+        "step_mean_us": _number(told, "step_mean_us"),
+        "step_max_us": _number(told, "step_max_us"),
+        "simulator_error_estimate": _number(told, "error_estimate"),
+        "commands_received": _count(told, "commands_received"),
+        "commands_dropped": _count(told, "commands_dropped"),
+        "commands_recorded": recording.commands,
+    }
+
+
+def _loss(recording: Recording) -> dict[str, Any]:
+    recorded, period = len(recording.time_ns), recording.period_ns
+    spacing = np.diff(recording.time_ns)
+    between = int(np.sum(np.maximum(np.rint(spacing / period).astype(int) - 1, 0)))
+    published = _count(recording.diagnostics, "samples_published")
+    # Diagnostics that end before the run does know of fewer samples than the bag holds.
+    lost = max(between, 0 if published is None else published - recorded)
+    return {
+        "samples_published": published,
+        "samples_recorded": recorded,
+        "samples_lost": lost,
+        "samples_recorded_percent": 100.0 * recorded / (recorded + lost),
+        "sample_period_s": period / NANOSECONDS,
+        "stamp_gaps": int(np.count_nonzero(spacing > period)),
+        "samples_missing_between_stamps": between,
+        # The last sample marks the end of the run, wherever that is.
+        "stamps_off_the_period": int(np.count_nonzero(spacing[:-1] % period)),
+        "orientations_lost": int(np.count_nonzero(~np.isfinite(recording.quaternion[:, 0]))),
+        "preview_samples": recording.previews,
+        "tick_period_s": recording.ticks.period_ns / NANOSECONDS,
+        "ticks_recorded": len(recording.ticks.start_ns),
+        "tick_gaps": recording.ticks.gaps,
+    }
+
+
+def _largest(name: str, deviation: Deviation, seconds: Array | None = None) -> dict[str, Any]:
+    """Largest value of each quantity, and when gamma's was reached."""
+    result: dict[str, Any] = {}
+    for quantity, unit in QUANTITIES.items():
+        values = getattr(deviation, quantity)
+        known = values[np.isfinite(values)]
+        result[f"{name}_{quantity}_{unit}"] = float(known.max()) if len(known) else None
+    if seconds is not None:
+        known = np.isfinite(deviation.gamma)
+        at = float(seconds[np.nanargmax(deviation.gamma)]) if known.any() else None
+        result[f"{name}_gamma_largest_at_s"] = at
+    return result
+
+
+def _effort_difference(recording: Recording) -> float | None:
+    """Largest difference between a sample's effort and the torque of the tick that ends at it."""
+    ticks = recording.ticks
+    _, here, there = np.intersect1d(recording.time_ns, ticks.end_ns, True, True)
+    if not len(here):
+        return None
+    return float(np.abs(recording.effort[here] - ticks.torque[there]).max())
+
+
+def _notes(recording: Recording, integration: Comparison, ideal: Comparison | None) -> list[str]:
+    notes = []
+    told, last = recording.diagnostics, recording.seconds[-1]
+    if not told:
+        notes.append("no diagnostics of the run are recorded: what they tell is unknown")
+    elif told.get("phase") not in ("finished", "fault"):
+        notes.append(
+            f"the run was cut short, or its recording was: the last phase is {told.get('phase')}"
+        )
+    if told.get("phase") == "fault" or told.get("fault"):
+        notes.append(
+            f"the run ended by a fault; it is compared up to its last sample, at {last:.6f} s"
+        )
+    if not begins(recording):
+        notes.append("the start of the run is not recorded; times count from the first sample")
+    lost = len(recording.time_ns) - integration.compared
+    if integration.restarts_ns:
+        notes.append(
+            f"torques are missing: the reference began again {len(integration.restarts_ns)} times "
+            f"from a recorded sample; {lost} samples are not compared"
+        )
+    elif lost:
+        notes.append(f"{lost} samples could not be compared")
+    if ideal is None and recording.scene.torque is None:
+        notes.append("the scene has no torques: no ideal to compare with")
+    if "euler_zyz" in recording.missing:
+        notes.append("euler_zyz is not recorded: its pictures show the orientation's angles")
+    return notes
+
+
+def _made_on() -> dict[str, Any]:
+    versions = {name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")}
+    try:
+        own = metadata.version("sst_ros")
+    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+        own = "not installed"
+    return {
+        "sst_ros": own,
+        "python": platform.python_version(),
+        **versions,
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _number(told: dict[str, str], key: str) -> float | None:
+    try:
+        value = float(told[key])
+    except (KeyError, ValueError):
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _count(told: dict[str, str], key: str) -> int | None:
+    value = _number(told, key)
+    return None if value is None else round(value)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque profiles: sines as the scene writes them, tables as the file has them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from models import FAST
+
+from sst_ros.control.torque import sine, table
+from sst_ros.errors import InputError
+from sst_ros.scene import SineTorque, load
+
+HEADER = "time,tau_1,tau_2,tau_3\n"
+
+
+def written(folder, text, encoding="utf-8"):
+    path = folder / "torques.csv"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@FAST
+@given(st.floats(0.0, 10.0))
+def test_torques_of_example_2_are_the_printed_ones(t):
+    """4 sin 18t, 5 cos 12t, 3 cos 24t; phases of pi/2 cost rounding of angles up to 240."""
+    first, second, third = sine(load("example2").torque)(t)
+    assert first == pytest.approx(4.0 * math.sin(18.0 * t), abs=1e-13)
+    assert second == pytest.approx(5.0 * math.cos(12.0 * t), abs=5e-13)
+    assert third == pytest.approx(3.0 * math.cos(24.0 * t), abs=5e-13)
+
+
+def test_a_sine_starts_at_its_phase():
+    torque = SineTorque(amplitude=[1, 2, 3], frequency=[0, 0, 0], phase=[0, math.pi / 2, -1])
+    assert sine(torque)(123.0) == (0.0, 2.0, 3.0 * math.sin(-1.0))
+
+
+def test_rows_hold_until_the_next(tmp_path):
+    profile, last = table(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
+    assert last == 1.0
+    assert profile(0.5) == profile(0.75) == profile(math.nextafter(1.0, 0.0)) == (1.0, 2.0, 3.0)
+    assert profile(1.0) == profile(9.0) == (-4.0, 0.5, 6.0)
+
+
+def test_before_the_first_row_there_is_no_torque(tmp_path):
+    profile, _ = table(written(tmp_path, HEADER + "0.5,1,2,3\n"))
+    assert profile(math.nextafter(0.5, 0.0)) == (0.0, 0.0, 0.0)
+    assert profile(-1.0) == (0.0, 0.0, 0.0)
+
+
+def test_spaces_and_windows_line_ends_are_taken(tmp_path):
+    text = "time, tau_1, tau_2, tau_3\r\n0, 1, 2, 3\r\n"
+    assert table(written(tmp_path, text))[0](0.0) == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"line 1: header = None: must be time, tau_1, tau_2, tau_3"),
+        ("0,1,2,3\n", r"line 1: header = \['0', .*: must be time, tau_1, tau_2, tau_3"),
+        ("t,tau_1,tau_2,tau_3\n", r"line 1: header = \['t', .*: must be time,"),
+        (HEADER, r"rows = 0: must be one or more"),
+        (HEADER + "0,1,2\n", r"line 2: row = \['0', '1', '2'\]: must be four finite numbers"),
+        (HEADER + "0,1,2,3,4\n", r"line 2: row = .*: must be four finite numbers"),
+        (HEADER + "0,1,2,x\n", r"line 2: row = .*'x'\]: must be four finite numbers"),
+        (HEADER + "0,1,2,nan\n", r"line 2: row = .*'nan'\]: must be four finite numbers"),
+        (HEADER + "0,1,inf,3\n", r"line 2: row = .*: must be four finite numbers"),
+        (HEADER + "nan,1,2,3\n", r"line 2: row = .*: must be four finite numbers"),
+        (HEADER + "0,1,2,3\n\n1,1,2,3\n", r"line 3: row = \[\]: must be four finite numbers"),
+        (HEADER + "0,1,2,3\n0,1,2,3\n", r"line 3: time = 0\.0: must be > 0 s, the last"),
+        (HEADER + "1,1,2,3\n0.5,1,2,3\n", r"line 3: time = 0\.5: must be > 1 s, the last"),
+        (HEADER + '"0\n', r"line 2: row = .*: must be four finite numbers"),
+    ],
+)
+def test_refused_tables(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        table(written(tmp_path, text))
+
+
+def test_all_bad_rows_are_told(tmp_path):
+    with pytest.raises(InputError) as caught:
+        table(written(tmp_path, HEADER + "0,1,2,x\n1,1,2,3\n1,1,2,3\n2,,,\n"))
+    assert [problem.line for problem in caught.value.problems] == [2, 4, 5]
+
+
+def test_lines_are_counted_in_the_file_where_a_field_spans_some(tmp_path):
+    with pytest.raises(InputError) as caught:
+        table(written(tmp_path, HEADER + '0,1,2,"3\n"\n1,1,2,x\n'))
+    assert [problem.line for problem in caught.value.problems] == [4]
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"none\.csv.*must be readable .*No such file"):
+        table(tmp_path / "none.csv")
+
+
+def test_a_file_that_is_no_text_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"must be readable"):
+        table(written(tmp_path, HEADER, encoding="utf-16"))
+
+
+def test_a_field_that_is_far_too_long_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"must be readable .*field larger"):
+        table(written(tmp_path, HEADER + "1" * 200_000))
+
+
+@FAST
+@given(st.text(st.characters(codec="utf-8"), max_size=80))
+def test_arbitrary_rows_are_a_profile_or_refused(tmp_path_factory, text):
+    path = written(tmp_path_factory.getbasetemp(), HEADER + text, encoding="utf-8")
+    try:
+        profile, last = table(path)
+    except InputError:
+        return
+    assert all(map(math.isfinite, (*profile(last), last)))

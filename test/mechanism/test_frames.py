@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Orientation conventions against SciPy's Rotation and against products of plain rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from models import FAST
+from scipy.spatial.transform import Rotation
+
+from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix, zyz_angles
+
+ROUNDING = 1e-14  # a few products of numbers up to 1 in double precision
+angles = st.floats(-np.pi, np.pi)
+
+
+def zyz(theta, phi, psi):
+    return Rotation.from_euler("ZYZ", [theta, phi, psi]).as_matrix()
+
+
+def about_z(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def about_y(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+@FAST
+@given(angles, st.floats(1e-3, np.pi - 1e-3), angles)
+def test_zyz_angles_are_scipys(theta, phi, psi):
+    found = zyz_angles(zyz(theta, phi, psi))
+    assert found[1] == pytest.approx(phi, abs=ROUNDING)
+    for ours, given_angle in ((found[0], theta), (found[2], psi)):
+        # Angles about z lose digits like 1 / sin(phi) near the poles.
+        assert abs(np.exp(1j * ours) - np.exp(1j * given_angle)) < ROUNDING / np.sin(phi)
+
+
+@FAST
+@given(angles, st.floats(0.0, np.pi), angles)
+def test_zyz_angles_build_the_rotation_again(theta, phi, psi):
+    rotation = about_z(theta) @ about_y(phi) @ about_z(psi)
+    theta, phi, psi = zyz_angles(rotation)
+    again = about_z(theta) @ about_y(phi) @ about_z(psi)
+    np.testing.assert_allclose(again, rotation, atol=ROUNDING, rtol=0)
+
+
+@pytest.mark.parametrize("phi", [0.0, np.pi])
+def test_at_a_pole_theta_is_zero_and_psi_carries_all(phi):
+    flip = np.diag([1.0, 1.0, 1.0]) if phi == 0.0 else np.diag([-1.0, 1.0, -1.0])
+    rotation = about_z(0.3) @ flip @ about_z(0.5)
+    expected = 0.8 if phi == 0.0 else 0.2
+    np.testing.assert_allclose(zyz_angles(rotation), [0.0, phi, expected], atol=ROUNDING)
+
+
+@pytest.mark.parametrize("phi", [1e-9, 1e-12, np.pi - 1e-9])
+def test_phi_keeps_its_digits_near_the_poles(phi):
+    found = zyz_angles(about_z(0.4) @ about_y(phi) @ about_z(1.1))[1]
+    assert np.sin(found) == pytest.approx(np.sin(phi), rel=1e-6)
+
+
+def test_angles_keep_the_shape_of_a_batch():
+    batch = np.stack([zyz(0.1, 0.2, 0.3), zyz(0.0, 0.0, 0.4), zyz(-1.0, 2.0, 3.0)])
+    singles = np.stack([zyz_angles(rotation) for rotation in batch])
+    np.testing.assert_array_equal(zyz_angles(batch), singles)
+
+
+def test_quaternions_are_x_y_z_w():
+    quarter = [0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)]
+    np.testing.assert_allclose(rotation_matrix(quarter), about_z(np.pi / 2), atol=ROUNDING)
+    np.testing.assert_allclose(quaternion_of(about_z(np.pi / 2)), quarter, atol=ROUNDING)
+
+
+@FAST
+@given(angles, st.floats(0.0, np.pi), angles)
+def test_quaternions_and_matrices_say_the_same(theta, phi, psi):
+    rotation = about_z(theta) @ about_y(phi) @ about_z(psi)
+    quaternion = quaternion_of(rotation)
+    assert quaternion[3] >= 0.0
+    np.testing.assert_allclose(rotation_matrix(quaternion), rotation, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("angle", [1e-15, 1e-12, 1e-8, 1e-3, 1.0, 3.0, np.pi])
+def test_angle_between_is_exact_for_tiny_and_for_large_angles(angle):
+    turned = [0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)]
+    assert angle_between([0.0, 0.0, 0.0, 1.0], turned) == pytest.approx(angle, rel=1e-8)
+
+
+def test_angle_between_does_not_see_the_sign_of_a_quaternion():
+    first = quaternion_of(zyz(0.3, 0.4, 0.5))
+    assert angle_between(first, -first) == 0.0
+
+
+@FAST
+@given(angles, st.floats(0.0, np.pi), angles, angles)
+def test_angle_between_is_the_angle_of_the_relative_rotation(theta, phi, psi, turn):
+    first = zyz(theta, phi, psi)
+    second = first @ zyz(0.7, 1.1, 0.2) @ about_z(turn) @ zyz(0.7, 1.1, 0.2).T
+    found = angle_between(quaternion_of(first), quaternion_of(second))
+    # asin loses half the digits where the angle nears pi.
+    assert found == pytest.approx(abs(turn), abs=1e-7)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of a run as the nodes would record it, without ROS: simulated, edited, written."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from sst_ros import document
+from sst_ros.control.torque import sine
+from sst_ros.errors import RunStopped
+from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.simulation import Simulation
+
+STORE = get_typestore(Stores.ROS2_KILTED)
+START_NS = 1_700_000_000_123_456_789
+TICK_NS = 1_000_000
+TICKS_A_SAMPLE = 2
+NAMES = [f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3)]
+
+JOINTS, ORIENTATION, EULER = (
+    "/joint_states",
+    "/sst_simulator/orientation",
+    "/sst_simulator/euler_zyz",
+)
+APPLIED, SCENE = "/sst_simulator/applied_torques", "/sst_simulator/scene"
+DIAGNOSTICS, COMMANDS = "/diagnostics", "/sst_simulator/commands"
+KINDS = {
+    JOINTS: "sensor_msgs/msg/JointState",
+    ORIENTATION: "geometry_msgs/msg/QuaternionStamped",
+    EULER: "geometry_msgs/msg/Vector3Stamped",
+    APPLIED: "trajectory_msgs/msg/JointTrajectory",
+    SCENE: "std_msgs/msg/String",
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    COMMANDS: "std_msgs/msg/Float64MultiArray",
+}
+
+
+def make(kind: str, **fields: Any) -> Any:
+    package, _, name = kind.partition("/")
+    return STORE.types[f"{package}/msg/{name}"](**fields)
+
+
+def time(ns: int, kind: str = "Time") -> Any:
+    return make(f"builtin_interfaces/{kind}", sec=ns // 10**9, nanosec=ns % 10**9)
+
+
+def header(stamp_ns: int) -> Any:
+    return make("std_msgs/Header", stamp=time(stamp_ns), frame_id="base")
+
+
+@dataclass
+class Entry:
+    """A message of a topic; `sample` is the index of the sample it belongs to, -1 for none."""
+
+    topic: str
+    received_ns: int
+    content: Any
+    sample: int = -1
+
+
+def state_entries(state, stamp_ns: int, received_ns: int, sample: int) -> list[Entry]:
+    joints = state.joints
+    effort = np.zeros(9)
+    effort[:3] = state.torque
+    joint_state = make(
+        "sensor_msgs/JointState",
+        header=header(stamp_ns),
+        name=list(NAMES),
+        position=np.array([*joints.gamma, *joints.mu, *joints.beta]),
+        velocity=np.array([*joints.gamma_dot, *joints.mu_dot, *joints.beta_dot]),
+        effort=effort,
+    )
+    x, y, z, w = state.quaternion
+    turn = make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
+    theta, phi, psi = zyz_angles(rotation_matrix(state.quaternion)).tolist()
+    angles = make("geometry_msgs/Vector3", x=theta, y=phi, z=psi)
+    orientation = make("geometry_msgs/QuaternionStamped", header=header(stamp_ns), quaternion=turn)
+    euler = make("geometry_msgs/Vector3Stamped", header=header(stamp_ns), vector=angles)
+    contents = {JOINTS: joint_state, ORIENTATION: orientation, EULER: euler}
+    return [Entry(topic, received_ns, content, sample) for topic, content in contents.items()]
+
+
+def torque_entry(torques: list, start_ns: int, received_ns: int, sample: int) -> Entry:
+    points = [
+        make(
+            "trajectory_msgs/JointTrajectoryPoint",
+            positions=np.empty(0),
+            velocities=np.empty(0),
+            accelerations=np.empty(0),
+            effort=np.array(torque),
+            time_from_start=time((i + 1) * TICK_NS, "Duration"),
+        )
+        for i, torque in enumerate(torques)
+    ]
+    content = make(
+        "trajectory_msgs/JointTrajectory",
+        header=header(start_ns),
+        joint_names=NAMES[:3],
+        points=points,
+    )
+    return Entry(APPLIED, received_ns, content, sample)
+
+
+def diagnostics_entry(received_ns: int, **values: object) -> Entry:
+    pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(v)) for key, v in values.items()]
+    status = make(
+        "diagnostic_msgs/DiagnosticStatus",
+        level=0,
+        name="/sst_simulator: run",
+        message="",
+        hardware_id="",
+        values=pairs,
+    )
+    content = make("diagnostic_msgs/DiagnosticArray", header=header(received_ns), status=[status])
+    return Entry(DIAGNOSTICS, received_ns, content)
+
+
+def simulated(scene, seconds: float) -> list[Entry]:
+    """Messages of a run with the scene's sines held over each tick, as the nodes send them."""
+    simulation, profile = Simulation(scene), sine(scene.torque)
+    begun = START_NS - 300_000_000
+    text = make("std_msgs/String", data=document.dump(scene))
+    entries = [Entry(SCENE, begun, text)]
+    for preview in range(3):
+        entries += state_entries(simulation.state, 0, begun + preview * 100_000_000, -1)
+        entries.append(torque_entry([], 0, begun + preview * 100_000_000, -1))
+    entries += state_entries(simulation.state, START_NS, START_NS + 50_000, 0)
+    held, samples, fault, ticks = [], 1, "", round(seconds * 1e9 / TICK_NS)
+    state, done = simulation.state, 0
+    for tick in range(ticks):
+        torque = profile(tick * TICK_NS / 1e9)
+        try:
+            state = simulation.step(torque, TICK_NS)
+        except RunStopped as stopped:
+            fault = str(stopped)
+        else:
+            done += 1
+            held.append(torque)
+        # The end of a run is a sample, whether its time has come or not.
+        if held and (len(held) == TICKS_A_SAMPLE or tick == ticks - 1 or fault):
+            stamp = START_NS + done * TICK_NS
+            start = stamp - len(held) * TICK_NS
+            entries.append(torque_entry(held, start, stamp + 40_000, samples))
+            entries += state_entries(state, stamp, stamp + 50_000, samples)
+            held, samples = [], samples + 1
+        if fault:
+            break
+    command = make(
+        "std_msgs/Float64MultiArray",
+        layout=make("std_msgs/MultiArrayLayout", dim=[], data_offset=0),
+        data=np.zeros(3),
+    )
+    entries.append(Entry(COMMANDS, START_NS, command))
+    entries.append(
+        diagnostics_entry(
+            START_NS + done * TICK_NS + 60_000,
+            phase="fault" if fault else "finished",
+            ticks=done,
+            ticks_missed=0,
+            samples_published=samples,
+            step_mean_us=160.5,
+            step_max_us=400.25,
+            real_time_factor=0.999,
+            wall_time_s=seconds / 0.999,
+            simulated_time_s=done * TICK_NS / 1e9,
+            commands_received=ticks,
+            commands_dropped=0,
+            error_estimate=1e-12,
+            fault=fault,
+            integrator="dopri5",
+        )
+    )
+    return sorted(entries, key=lambda entry: entry.received_ns)
+
+
+def write(path: Path, entries: list[Entry], *, sqlite: bool = False, namespace: str = "") -> Path:
+    plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
+    connections: dict[str, Any] = {}
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        for entry in entries:
+            topic, kind = entry.topic, KINDS[entry.topic]
+            if topic not in connections:
+                name = topic if topic == DIAGNOSTICS else namespace + topic
+                connections[topic] = writer.add_connection(name, kind, typestore=STORE)
+            raw = STORE.serialize_cdr(entry.content, kind)
+            writer.write(connections[topic], entry.received_ns, raw)
+    return path
+
+
+def without(entries: list[Entry], *topics: str) -> list[Entry]:
+    return [entry for entry in entries if entry.topic not in topics]
+
+
+def edited(entries: list[Entry], topic: str, sample: int, change) -> list[Entry]:
+    """Copy the messages; `change` gets the content of one of them and returns a new one."""
+    return [
+        dataclasses.replace(entry, content=change(entry.content))
+        if (entry.topic, entry.sample) == (topic, sample)
+        else entry
+        for entry in entries
+    ]

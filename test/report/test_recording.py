@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading bags: what a whole one gives, and that every broken one is refused in words."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from sst_ros import scene
+from sst_ros.errors import InputError
+from sst_ros.report import recording
+
+
+def test_a_run_comes_back_as_it_was_written(written, bags, example2):
+    run = recording.read(written(example2))
+    assert run.scene == scene.load("example2")
+    assert run.start_ns == bags.START_NS
+    assert np.array_equal(run.time_ns, np.arange(151) * 2_000_000)
+    assert np.array_equal(run.ticks.start_ns, np.arange(300) * 1_000_000)
+    assert np.array_equal(run.ticks.end_ns, run.ticks.start_ns + 1_000_000)
+    assert (run.period_ns, run.ticks.period_ns, run.ticks.gaps) == (2_000_000, 1_000_000, 0)
+    assert np.array_equal(run.received_ns - run.start_ns, run.time_ns + 50_000)
+    assert (run.previews, run.commands, run.missing) == (3, 1, ())
+    assert run.diagnostics["phase"] == "finished"
+    assert run.topics["orientation"] == "/sst_simulator/orientation"
+    last = next(e.content for e in example2 if (e.topic, e.sample) == (bags.JOINTS, 150))
+    sections = [run.gamma, run.mu, run.beta], [run.gamma_dot, run.mu_dot, run.beta_dot]
+    assert np.array_equal(np.concatenate([part[150] for part in sections[0]]), last.position)
+    assert np.array_equal(np.concatenate([part[150] for part in sections[1]]), last.velocity)
+    assert np.array_equal(run.effort[150], last.effort[:3])
+    assert np.array_equal(run.effort[1:], run.ticks.torque[1::2])
+    assert np.isfinite(run.euler).all() and np.isfinite(run.quaternion).all()
+
+
+def test_joints_are_found_by_name(tmp_path, bags, example2):
+    order = [4, 8, 0, 2, 1, 3, 7, 6, 5]
+
+    def shuffled(message):
+        names = [message.name[i] for i in order]
+        fields = {f: getattr(message, f)[order] for f in ("position", "velocity", "effort")}
+        return bags.make("sensor_msgs/JointState", header=message.header, name=names, **fields)
+
+    mixed = bags.edited(example2, bags.JOINTS, 70, shuffled)
+    plain = recording.read(bags.write(tmp_path / "a", example2))
+    other = recording.read(bags.write(tmp_path / "b", mixed))
+    for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot", "effort"):
+        assert np.array_equal(getattr(plain, name), getattr(other, name))
+
+
+def test_sqlite_single_files_and_namespaces_are_read(tmp_path, bags, example2):
+    plain = recording.read(bags.write(tmp_path / "a", example2))
+    other = recording.read(bags.write(tmp_path / "b", example2, sqlite=True, namespace="/cell_7"))
+    assert np.array_equal(plain.gamma, other.gamma)
+    assert other.topics["joint_states"] == "/cell_7/joint_states"
+    single = recording.read(next((tmp_path / "a").glob("*.mcap")))
+    assert np.array_equal(plain.ticks.torque, single.ticks.torque)
+
+
+def test_topics_that_are_not_essential_may_be_missing(written, bags, example2):
+    run = recording.read(
+        written(bags.without(example2, bags.EULER, bags.DIAGNOSTICS, bags.COMMANDS))
+    )
+    assert set(run.missing) == {"euler_zyz", "diagnostics", "commands"}
+    assert np.isnan(run.euler).all() and run.diagnostics == {}
+
+
+@pytest.mark.parametrize("topic", ["joint_states", "orientation", "applied_torques", "scene"])
+def test_a_missing_essential_topic_is_named(written, bags, example2, topic):
+    gone = [name for name in bags.KINDS if name.endswith(f"/{topic}")]
+    with pytest.raises(InputError, match=f"{topic} = None: no topic of type .* ends in /{topic}"):
+        recording.read(written(bags.without(example2, *gone)))
+
+
+def test_two_matching_topics_are_refused(tmp_path, bags, example2):
+    bags.KINDS["/other/joint_states"] = bags.KINDS[bags.JOINTS]
+    extra = [e for e in example2 if e.topic == bags.JOINTS][:5]
+    extra = [bags.Entry("/other/joint_states", e.received_ns, e.content) for e in extra]
+    try:
+        path = bags.write(tmp_path / "bag", [*example2, *extra])
+    finally:
+        del bags.KINDS["/other/joint_states"]
+    with pytest.raises(InputError, match=r"/joint_states, /other/joint_states.*only one topic"):
+        recording.read(path)
+
+
+def test_what_is_no_bag_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere.*does not exist"):
+        recording.read(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"empty.*metadata"):
+        recording.read(tmp_path / "empty")
+    for name in ("notes.txt", "noise.mcap", "noise.db3"):
+        (tmp_path / name).write_bytes(bytes(range(256)) * 20)
+        with pytest.raises(InputError, match=f"{name}.*rosbag2"):
+            recording.read(tmp_path / name)
+
+
+@pytest.mark.parametrize("sqlite", [False, True])
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_bag_is_refused(written, bags, example2, sqlite, kept):
+    path = written(example2, sqlite=sqlite)
+    (file,) = [*path.glob("*.mcap"), *path.glob("*.db3")]
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(InputError, match=r"bag.*must be a whole rosbag2 recording"):
+        recording.read(path)
+
+
+def test_garbled_bytes_never_give_a_traceback(written, bags, example2):
+    path = written(example2)
+    (file,) = path.glob("*.mcap")
+    whole = file.read_bytes()
+    generator = np.random.default_rng(2)
+    outcomes = []
+    for at in generator.integers(0, len(whole) - 64, 25):
+        noise = generator.integers(0, 256, 64, dtype=np.uint8).tobytes()
+        file.write_bytes(whole[:at] + noise + whole[at + 64 :])
+        try:
+            outcomes.append(recording.read(path))
+        except InputError as error:
+            outcomes.append(error)
+    assert any(isinstance(outcome, InputError) for outcome in outcomes)
+
+
+def test_a_run_that_never_started_is_refused(written, example2):
+    previews = [entry for entry in example2 if entry.sample < 0]
+    with pytest.raises(InputError, match=r"joint_states = 0: .*3 lie before its start"):
+        recording.read(written(previews))
+
+
+def test_a_run_that_ends_at_once_tells_why(written, bags, example2):
+    first = [entry for entry in example2 if entry.sample < 1 and entry.topic != bags.DIAGNOSTICS]
+    told = bags.diagnostics_entry(bags.START_NS, phase="fault", fault="stopped: gamma_1 < 0")
+    with pytest.raises(InputError, match=r"joint_states = 1: .*stopped: gamma_1 < 0"):
+        recording.read(written([*first, told]))
+
+
+def _changed(message, **paths):
+    """Copy a message with attributes set; `header__stamp` stands for header.stamp."""
+    result = copy.deepcopy(message)
+    for path, value in paths.items():
+        *parents, last = path.split("__")
+        owner = result
+        for parent in parents:
+            owner = getattr(owner, parent)
+        object.__setattr__(owner, last, value)
+    return result
+
+
+def test_contents_that_cannot_be_are_refused(tmp_path, bags, example2):
+    def refusal(topic, change):
+        path = tmp_path / str(len(list(tmp_path.iterdir())))
+        with pytest.raises(InputError) as caught:
+            recording.read(bags.write(path, bags.edited(example2, topic, 70, change)))
+        return str(caught.value)
+
+    nan = np.full(9, np.nan)
+    said = refusal(bags.JOINTS, lambda m: _changed(m, velocity=nan))
+    assert "joint_states" in said and f"not finite at stamp {bags.START_NS + 140_000_000}" in said
+    said = refusal(bags.JOINTS, lambda m: _changed(m, effort=np.zeros(3)))
+    assert "equally long" in said
+    said = refusal(bags.JOINTS, lambda m: _changed(m, name=["a", *m.name[1:]]))
+    assert "joints are missing: gamma_1" in said
+    said = refusal(bags.JOINTS, lambda m: _changed(m, header__stamp=bags.time(bags.START_NS)))
+    assert f"stamp {bags.START_NS} ns comes twice" in said
+    said = refusal(bags.ORIENTATION, lambda m: _changed(m, quaternion__w=3.0))
+    assert "orientation" in said and "must have length 1" in said
+    said = refusal(bags.APPLIED, lambda m: _changed(m, joint_names=["a", "b", "c"]))
+    assert "applied_torques" in said and "gamma_1, gamma_2, gamma_3" in said
+    early = bags.time(bags.START_NS + 137_500_000)
+    said = refusal(bags.APPLIED, lambda m: _changed(m, header__stamp=early))
+    assert "ticks overlap" in said
+
+
+def test_a_scene_that_is_refused_names_topic_and_key(written, bags, example2):
+    def broken(entry):
+        text = entry.content.data.replace("radius: 0.4", "radius: -0.4")
+        return bags.Entry(bags.SCENE, entry.received_ns, bags.make("std_msgs/String", data=text))
+
+    entries = [broken(e) if e.topic == bags.SCENE else e for e in example2]
+    with pytest.raises(InputError, match=r"/sst_simulator/scene: .*star.radius.*> 0"):
+        recording.read(written(entries))

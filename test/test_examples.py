@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shipped scenes against a closed form and against another integrator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sst_ros.control.torque import sine
+from sst_ros.errors import StrokeExceeded
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.scene import load
+from sst_ros.simulation import Simulation
+
+MILLISECOND = 1_000_000
+EXAMPLE1, EXAMPLE2, THIN = load("example1"), load("example2"), load("example2_thin")
+
+
+def swing(t_end):
+    """Example 1 reduced to x = gamma - pi/4 by its symmetry, by another integrator."""
+    star = EXAMPLE1.star.inertia
+    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
+
+    def inertia(x):
+        d, c = 2.0 - np.cos(2 * x), np.cos(x)
+        return star.zz / d**2 + drive.zz + link.yy + 2.0 * link.xx * c**2 / d**2
+
+    def rates(t, y):
+        x, rate = y
+        slope = inertia(x + 1e-20j).imag / 1e-20
+        return rate, (1.13 * np.sin(12.0 * t) - 0.5 * slope * rate**2) / inertia(x)
+
+    start = (0.0, EXAMPLE1.initial.gamma_dot[0])
+    run = solve_ivp(rates, (0, t_end), start, method="DOP853", rtol=1e-13, atol=1e-15)
+    return run.y[:, -1]
+
+
+def swung(simulation, home):
+    """Angle of the star about the centre since home, counted about E."""
+    turn = rotation_matrix(home).T @ rotation_matrix(simulation.state.quaternion)
+    return np.arctan2(turn[1, 0], turn[0, 0])
+
+
+def test_example_1_follows_its_closed_form():
+    """Both integrators err below 1e-12 in 0.3 s; E is off the centre by rounding only."""
+    simulation, torque = Simulation(EXAMPLE1), sine(EXAMPLE1.torque)
+    home = simulation.state.quaternion
+    for k in range(1, 301):
+        simulation.step(torque, MILLISECOND)
+        centre = rotation_matrix(simulation.state.quaternion)[:, 2]
+        assert np.abs(centre - 3.0**-0.5).max() < 1e-12
+        if k % 100 == 0:
+            x, rate = swing(k / 1000.0)
+            np.testing.assert_allclose(simulation.state.joints.gamma, x + np.pi / 4, atol=1e-11)
+            np.testing.assert_allclose(simulation.state.joints.gamma_dot, rate, atol=1e-10)
+            psi = np.arctan(np.sqrt(3.0) * np.tan(x))
+            assert swung(simulation, home) == pytest.approx(psi, abs=1e-11)
+
+
+def test_example_1_returns_after_one_period():
+    """gamma_dot(0) is known to 15 digits, the period is rounded to 1 ns at 0.4 rad/s: 4e-10."""
+    simulation, torque = Simulation(EXAMPLE1), sine(EXAMPLE1.torque)
+    home, rate = simulation.state.quaternion, simulation.state.joints.gamma_dot
+    steps, rest = divmod(round(np.pi / 6 * 1e9), MILLISECOND)
+    largest = 0.0
+    for _ in range(steps):
+        simulation.step(torque, MILLISECOND)
+        largest = max(largest, abs(swung(simulation, home)))
+    simulation.step(torque, rest)
+    assert largest > 0.05
+    assert abs(swung(simulation, home)) < 1e-9
+    np.testing.assert_allclose(simulation.state.joints.gamma_dot, rate, atol=1e-8)
+
+
+def by_scipy(scene, end, events=None):
+    """The same motion by SciPy's DOP853 at its tightest tolerance."""
+    simulation, torque = Simulation(scene), sine(scene.torque)
+    model = kernel.model_of(scene)
+    start = (*simulation.state.quaternion, *simulation.state.body_rate)
+
+    def rates(t, y):
+        return kernel.derivative(model, tuple(y), torque(t))
+
+    return solve_ivp(
+        rates, (0.0, end), start, "DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.01, events=events
+    )
+
+
+def test_example_2_stays_inside_for_its_second():
+    """Dormand-Prince at 1 ms errs by 1e-13, SciPy's reference by 1e-14."""
+    simulation, torque = Simulation(EXAMPLE2), sine(EXAMPLE2.torque)
+    for _ in range(1000):
+        simulation.step(torque, MILLISECOND)
+    truth = by_scipy(EXAMPLE2, 1.0).y[:, -1]
+    state = simulation.state
+    assert state.time_ns == 1000 * MILLISECOND
+    np.testing.assert_allclose(state.body_rate, truth[4:], atol=2e-12)
+    sign = np.sign(truth[:4] @ state.quaternion)
+    np.testing.assert_allclose(state.quaternion, sign * truth[:4], atol=1e-12)
+    assert simulation.error_estimate < 1e-9
+
+
+def time_of_the_end():
+    """When gamma_1 of the thin scene passes pi/2, by SciPy's root of its dense output."""
+    model = kernel.model_of(THIN)
+
+    def margin(t, y):
+        return np.pi / 2 - kernel.joints(model, tuple(y)).gamma[0]
+
+    margin.terminal = True
+    return by_scipy(THIN, 1.0, events=margin).t_events[0][0]
+
+
+def test_thin_example_2_stops_at_the_end_of_the_first_stroke():
+    simulation, torque = Simulation(THIN), sine(THIN.torque)
+    with pytest.raises(StrokeExceeded, match=r"gamma_1 > 1\.570796 rad") as caught:
+        for _ in range(1000):
+            simulation.step(torque, MILLISECOND)
+    assert caught.value.time == pytest.approx(0.9125, abs=5e-4)
+    # SciPy's dense output of a 10 ms step is of order 7: good for 1e-9 s.
+    assert caught.value.time == pytest.approx(time_of_the_end(), abs=1e-9)
+    assert caught.value.state is simulation.state
+    assert simulation.state.time_ns == 912 * MILLISECOND
+    assert simulation.state.joints.gamma[0] < np.pi / 2

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shipped scenes, where their values come from, and every way to get a scene wrong."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sst_ros import scene as scenes
+from sst_ros.document import dump, read
+from sst_ros.errors import InputError
+from sst_ros.scene import Inertia, Scene, load, names
+
+FOLDER = Path(__file__).parents[1] / "config" / "scenes"
+SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")
+every_scene = pytest.mark.parametrize("name", names())
+
+
+def leaves(tree, path=""):
+    """Dotted keys of all numbers of a document; entries of lists belong to the list."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from leaves(value, f"{path}.{key}" if path else key)
+    elif isinstance(tree, list):
+        for value in tree:
+            yield from leaves(value, path)
+    elif isinstance(tree, (int, float)):
+        yield path
+
+
+def test_the_examples_of_the_paper_are_shipped():
+    assert {"example1", "example2", "example2_thin"} <= set(names())
+    assert names() == sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+@every_scene
+def test_a_shipped_scene_is_called_like_its_file(name):
+    assert load(name).name == name
+    assert load(FOLDER / f"{name}.yaml") == load(name)
+
+
+@every_scene
+def test_a_dumped_scene_reads_back_equal(name):
+    scene = load(name)
+    assert read(Scene, dump(scene), "dump") == scene
+
+
+@every_scene
+def test_every_number_says_where_it_comes_from(name):
+    tree = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    told = tree.pop("provenance")
+    for leaf in leaves(tree):
+        parts = leaf.split(".")
+        prefixes = {".".join(parts[: i + 1]) for i in range(len(parts))}
+        assert prefixes & set(told), f"{leaf} has no provenance"
+
+
+@every_scene
+def test_provenance_is_one_of_four_kinds(name):
+    for key, said in load(name).provenance:
+        assert re.match(r"(printed|derived|assumed|chosen)\b", said), key
+
+
+@every_scene
+def test_lost_inertias_are_not_said_to_be_printed(name):
+    for key, said in load(name).provenance:
+        if "inertia" in key:
+            assert not said.startswith("printed")
+
+
+def test_inertia_matrix_is_symmetric_with_the_tensors_entries():
+    matrix = Inertia(xx=3.0, yy=4.0, zz=5.0, xy=0.1, xz=-0.2, yz=0.3).matrix
+    np.testing.assert_array_equal(matrix, [[3, 0.1, -0.2], [0.1, 4, 0.3], [-0.2, 0.3, 5]])
+
+
+def test_an_unknown_name_tells_the_known_ones():
+    with pytest.raises(InputError, match=r"'example9': must be .* one of .*example1, example2, "):
+        load("example9")
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"none\.yaml.*No such file"):
+        load(tmp_path / "none.yaml")
+
+
+def test_a_file_that_is_no_text_is_told(tmp_path):
+    path = tmp_path / "binary.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match="codec can't decode"):
+        load(path)
+
+
+def test_a_name_with_a_null_character_is_told():
+    with pytest.raises(InputError, match="must be a readable"):
+        load("a\0b")
+
+
+def test_one_link_stands_for_three():
+    scene = load("example2")
+    assert len(scene.actuated_links) == 3
+    assert scene.actuated_links[0] == scene.actuated_links[2]
+
+
+def test_a_copy_without_optional_parts_reads_back_equal():
+    lines = SOURCE[: SOURCE.index("torque:")]
+    scene = read(Scene, lines, "origin")
+    assert scene.torque is None
+    assert scene.duration is None
+    assert read(Scene, dump(scene), "dump") == scene
+
+
+def test_an_installation_without_scenes_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(scenes, "__file__", str(tmp_path / "a" / "scene.py"))
+    with pytest.raises(InputError, match=r"config/scenes = .*: was not installed"):
+        scenes.share_directory()

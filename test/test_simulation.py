@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run: its energy, its clock, its start and every way in which it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from models import seeded_samples
+
+from sst_ros.control.torque import sine
+from sst_ros.errors import (
+    Diverged,
+    InputError,
+    NoAdmissibleAssembly,
+    RunStopped,
+    StrokeExceeded,
+    WorkspaceLeft,
+)
+from sst_ros.integration.tableaux import DOP853, RK4
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.energy import kinetic
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.scene import Initial, Stroke, Workspace, load
+from sst_ros.simulation import Simulation
+
+MILLISECOND = 1_000_000
+REST = (0.0, 0.0, 0.0)
+EXAMPLE2, THIN = load("example2"), load("example2_thin")
+IGNORE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+
+
+def energy(simulation):
+    model, state = kernel.model_of(simulation.scene), simulation.state
+    return kinetic(model, (*state.quaternion, *state.body_rate))
+
+
+def started(sample, gamma_dot):
+    initial = Initial(gamma=sample.gamma, gamma_dot=gamma_dot)
+    return Simulation(replace(sample.scene, initial=initial, **IGNORE), DOP853)
+
+
+def run_until_stopped(simulation, torque, steps):
+    """Step by milliseconds; return the error that ends the run and the state before it."""
+    for _ in range(steps):
+        before = simulation.state
+        try:
+            simulation.step(torque, MILLISECOND)
+        except RunStopped as error:
+            return error, before
+    raise AssertionError("the run did not stop")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_energy_is_kept_without_torque(seed):
+    """DOP853 at 1 ms errs below rounding; 200 steps of rounding at 1e-16 keep 1e-13."""
+    (sample,) = seeded_samples(seed + 50, 1)
+    simulation = started(sample, sample.gamma_dot / 2.0)
+    start, before = energy(simulation), simulation.state.quaternion
+    for _ in range(200):
+        simulation.step(REST, MILLISECOND)
+    assert np.abs(np.subtract(simulation.state.quaternion, before)).max() > 0.01
+    assert energy(simulation) == pytest.approx(start, rel=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_energy_grows_by_the_work_of_constant_torques(seed):
+    """Under constant torques the work is tau . (gamma - gamma_0), exactly."""
+    (sample,) = seeded_samples(seed + 60, 1)
+    torque = tuple((sample.torque / 10.0).tolist())
+    simulation = started(sample, sample.gamma_dot / 2.0)
+    start, gamma = energy(simulation), np.array(simulation.state.joints.gamma)
+    for _ in range(100):
+        simulation.step(torque, MILLISECOND)
+    work = np.dot(torque, simulation.state.joints.gamma - gamma)
+    assert abs(work) > 1e-4
+    assert energy(simulation) - start == pytest.approx(work, abs=1e-13 * (1.0 + start))
+
+
+def test_the_start_is_the_one_of_the_scene():
+    initial = Initial(gamma=(0.7, 0.8, 0.9), gamma_dot=(0.1, -0.2, 0.3))
+    state = Simulation(replace(EXAMPLE2, initial=initial)).state
+    assert state.time_ns == 0
+    assert state.torque == REST
+    np.testing.assert_allclose(state.joints.gamma, initial.gamma, atol=1e-14)
+    np.testing.assert_allclose(state.joints.gamma_dot, initial.gamma_dot, atol=1e-14)
+
+
+def test_time_is_counted_in_whole_nanoseconds():
+    simulation = Simulation(replace(EXAMPLE2, **IGNORE))
+    steps = [333_333, 1, 999_999_7, 7, 1_234_567]
+    for _ in range(20):
+        for dt_ns in steps:
+            simulation.step(REST, dt_ns)
+    assert simulation.state.time_ns == 20 * sum(steps)
+    assert isinstance(simulation.state.time_ns, int)
+
+
+def test_a_torque_that_is_a_function_of_time_is_asked_at_simulated_times():
+    asked = []
+
+    def torque(t):
+        asked.append(t)
+        return REST
+
+    simulation = Simulation(EXAMPLE2)
+    for _ in range(3):
+        simulation.step(torque, MILLISECOND)
+    assert min(asked) == 0.0
+    assert max(asked) == pytest.approx(0.003, abs=1e-15)
+
+
+def test_a_constant_and_a_constant_function_move_alike():
+    one, other = Simulation(EXAMPLE2), Simulation(EXAMPLE2)
+    for _ in range(5):
+        one.step((0.1, 0.2, -0.3), MILLISECOND)
+        other.step(lambda t: (0.1, 0.2, -0.3), MILLISECOND)
+    assert one.state == other.state
+    assert one.state.torque == (0.1, 0.2, -0.3)
+
+
+def test_runs_repeat_bit_by_bit():
+    torque, states = sine(EXAMPLE2.torque), []
+    for _ in range(2):
+        simulation = Simulation(EXAMPLE2)
+        for _ in range(20):
+            simulation.step(torque, MILLISECOND)
+        states.append(simulation.state)
+    assert states[0] == states[1]
+
+
+def test_the_quaternion_stays_of_unit_length():
+    simulation, torque = Simulation(EXAMPLE2, RK4), sine(EXAMPLE2.torque)
+    for _ in range(100):
+        simulation.step(torque, 5 * MILLISECOND)
+    assert np.linalg.norm(simulation.state.quaternion) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_error_estimates_add_up():
+    simulation, torque = Simulation(EXAMPLE2), sine(EXAMPLE2.torque)
+    sums = []
+    for _ in range(5):
+        simulation.step(torque, 10 * MILLISECOND)
+        sums.append(simulation.error_estimate)
+    assert np.all(np.diff([0.0, *sums]) > 0.0)
+
+
+def test_the_stroke_may_be_ignored():
+    simulation, torque = Simulation(replace(THIN, **IGNORE)), sine(THIN.torque)
+    for _ in range(1000):
+        simulation.step(torque, MILLISECOND)
+    assert simulation.state.time_ns == 1000 * MILLISECOND
+    assert simulation.state.joints.gamma[0] > np.pi / 2
+
+
+@pytest.mark.parametrize(("leg", "sign"), [(0, -1.0), (1, -1.0), (2, -1.0), (1, 1.0), (2, 1.0)])
+def test_each_end_of_each_stroke_stops_the_run(leg, sign):
+    torque = [0.0] * 3
+    torque[leg] = 5.0 * sign
+    scene = replace(EXAMPLE2, workspace=Workspace(at_edge="ignore"))
+    simulation = Simulation(scene)
+    error, before = run_until_stopped(simulation, tuple(torque), 1000)
+    end = "< 0" if sign < 0 else r"> 1.570796 rad"
+    assert isinstance(error, StrokeExceeded)
+    assert error.reason == f"gamma_{leg + 1} {end}"
+    assert error.state is before is simulation.state
+    assert before.time_ns / 1e9 <= error.time <= before.time_ns / 1e9 + 1e-3
+
+
+def test_the_largest_beta_stops_the_run():
+    scene = replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0))
+    simulation = Simulation(scene)
+    error, before = run_until_stopped(simulation, sine(scene.torque), 1000)
+    assert isinstance(error, WorkspaceLeft)
+    assert error.reason.endswith("> 0.698132 rad")
+    assert error.reason.startswith("beta_")
+    assert max(before.joints.beta) < np.radians(40.0)
+    assert error.state is before
+
+
+def test_an_edge_of_the_base_triangle_stops_the_run():
+    """beta_k = 0 is where E reaches the arc P_k P_k+1, w_k . s = 0."""
+    scene = replace(EXAMPLE2, stroke=Stroke(at_end="ignore"))
+    simulation = Simulation(scene)
+    error, before = run_until_stopped(simulation, (5.0, -5.0, 0.0), 1000)
+    assert isinstance(error, WorkspaceLeft)
+    leg = int(error.reason.removeprefix("beta_")[0]) - 1
+    assert error.reason == f"beta_{leg + 1} < 0"
+    s = rotation_matrix(before.quaternion)[:, 2]
+    along = simulation.geometry.w @ s
+    assert 0.0 < along[leg] < 0.02
+    assert along.argmin() == leg
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning", "ignore:overflow:RuntimeWarning")
+@pytest.mark.parametrize("push", [1e308, -1e308, np.nan, np.inf], ids=str)
+def test_a_step_that_is_not_finite_is_refused_and_nothing_of_it_is_kept(push):
+    simulation = Simulation(EXAMPLE2)
+    simulation.step(REST, MILLISECOND)
+    before, estimate = simulation.state, simulation.error_estimate
+    with pytest.raises(Diverged, match="not finite") as caught:
+        simulation.step((push, 0.0, push), MILLISECOND)
+    assert simulation.state is before is caught.value.state
+    assert simulation.error_estimate == estimate
+    simulation.step(REST, MILLISECOND)
+    assert simulation.state.time_ns == 2 * MILLISECOND
+
+
+@pytest.mark.parametrize("gamma", [(-0.1, 0.7, 0.7), (0.7, 0.7, 1.6)])
+def test_a_start_outside_the_stroke_is_refused(gamma):
+    scene = replace(EXAMPLE2, initial=Initial(gamma=gamma))
+    with pytest.raises(InputError, match=r"initial\.gamma = .*must lie in the stroke") as caught:
+        Simulation(scene)
+    assert "1.570796" in str(caught.value)
+
+
+def test_a_start_outside_an_ignored_stroke_is_taken():
+    scene = replace(EXAMPLE2, initial=Initial(gamma=(1.3, 1.4, 1.58)), **IGNORE)
+    assert Simulation(scene).state.joints.gamma[2] == pytest.approx(1.58, abs=1e-14)
+
+
+def test_a_start_without_admissible_assembly_is_refused():
+    with pytest.raises(NoAdmissibleAssembly, match="gamma = "):
+        Simulation(replace(EXAMPLE2, initial=Initial(gamma=(0.05, 0.05, 1.5))))
