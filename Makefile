@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 RUN = $(VENV)/bin/python
-EXTRAS = ros,record,report
+EXTRAS = ros,record,report,fast
 
 .PHONY: demo test test-all lint format clean
 
@@ -36,7 +36,7 @@ $(VENV)/.demo: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),engines,test]"
 	@touch $@
 
 clean:

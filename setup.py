@@ -41,6 +41,8 @@ setup(
         ],
         "record": ["rosbags>=0.11"],
         "report": ["rosbags>=0.11", "matplotlib>=3.5"],
+        "fast": ["numba>=0.57"],
+        "engines": ["mujoco>=4", "pin>=4"],
         "test": [
             "colcon-common-extensions",
             "hypothesis",

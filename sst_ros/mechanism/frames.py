@@ -44,6 +44,46 @@ def zyz_angles(rotation: ArrayLike) -> Array:
     return np.stack([theta, np.arctan2(sine, r[..., 2, 2]), psi], axis=-1)
 
 
+def unwrap_zyz(angles: ArrayLike) -> Array:
+    """ZYZ angles of a trajectory without jumps.
+
+    (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a motion straight
+    through the pole is smooth in angles if phi may change its sign. Each sample takes that of the
+    two forms, give or take full turns, that is nearest to the sample before. At the pole itself
+    (sin(phi) = 0 as `zyz_angles` gives it, theta = 0) theta stays what it was and psi takes the
+    rest, so theta + psi at phi = 0 and theta - psi at phi = pi are kept.
+
+    Args:
+        angles: (theta, phi, psi) by sample [rad], as from `zyz_angles`, shape (n, 3).
+
+    Returns:
+        Angles [rad], shape (n, 3); the first sample off the pole as given, phi no longer in
+        [0, pi] only.
+
+    """
+    result = np.array(angles, dtype=float)
+    off = np.flatnonzero(~np.isin(result[:, 1], (0.0, np.pi)))
+    start = int(off[0]) if len(off) else 0
+    for row in range(start + 1, len(result)):
+        result[row] = _nearest(result[row - 1], result[row])
+    for row in range(start - 1, -1, -1):
+        result[row] = _nearest(result[row + 1], result[row])
+    return result
+
+
+def _nearest(to: Array, angles: Array) -> Array:
+    """Form of the ZYZ angles, shape (3,), that is nearest to others."""
+    theta, phi, psi = angles
+    if phi in (0.0, np.pi):
+        shift = to[0] - theta
+        psi, theta = psi + (shift if phi else -shift), to[0]
+        forms = np.array([[theta, phi, psi], [theta, -phi, psi]])
+    else:
+        forms = np.array([[theta, phi, psi], [theta + np.pi, -phi, psi + np.pi]])
+    forms += 2.0 * np.pi * np.round((to - forms) / (2.0 * np.pi))
+    return np.asarray(forms[np.argmin(np.abs(forms - to).sum(axis=1))])
+
+
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
     """Angle of the rotation between quaternions [rad], shape (...,); exact for tiny angles."""
     a, b = np.asarray(first, dtype=float), np.asarray(second, dtype=float)

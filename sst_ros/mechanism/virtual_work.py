@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.assemblies import cross
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import Scene
 
@@ -35,9 +36,8 @@ class Mechanism:
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
         """Collect what the equations need from a scene."""
-        actuated = np.stack([link.inertia.matrix for link in scene.actuated_links])
-        intermediate = np.stack([link.inertia.matrix for link in scene.intermediate_links])
-        return cls(Geometry.of(scene), scene.star.inertia.matrix, actuated, intermediate)
+        inertias = scene.star_inertia, scene.actuated_inertias, scene.intermediate_inertias
+        return cls(Geometry.of(scene), *inertias)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None)
     r = kinematics.carriage_directions(geometry, angles)
     t = geometry.e @ rotation.T
     w = geometry.w
-    normal = np.cross(r, t)
+    normal = cross(r, t)
     c = np.sum(normal * w, axis=1)
     j2 = -normal
     determinant = float(np.linalg.det(j2))
@@ -113,9 +113,9 @@ def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None)
         raise SingularConfiguration("parallel singularity, det J2 = 0", determinant)
     if np.min(np.abs(c)) < SINGULAR:
         raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
-    j = -np.linalg.solve(j2, np.diag(c))
+    j = np.asarray(-np.linalg.solve(j2, np.diag(c)), dtype=float)
     a = -r @ j
-    wr = np.cross(w, r)
+    wr = cross(w, r)
     b = -(wr @ j) / np.sum(wr * t, axis=1)[:, None]
     return Posture(angles, rotation, r, t, w, c, j2, j, a, b)
 
@@ -128,17 +128,17 @@ def bias(at: Posture, gamma_dot: ArrayLike) -> Bias:
     m = mu_dot * tw  # Eq. 38
     n = -beta_dot * (at.r @ omega)  # Eq. 39
     solved = np.linalg.solve(at.j2, m * rate + n)
-    tr = np.cross(at.t, at.r)
+    tr = cross(at.t, at.r)
     f = -beta_dot * (tr @ omega) + at.r @ solved  # Eq. 45
-    wr = np.cross(at.w, at.r)
+    wr = cross(at.w, at.r)
     u = at.t @ solved - np.sum(at.t * wr, axis=1) * rate * mu_dot  # Eq. 49
     return Bias(omega, -solved, f, u)
 
 
 def link_frames(at: Posture) -> tuple[Array, Array]:
     """Rotations of {1k} and {2k} in {B}, Eqs. 50 to 52, each shape (3, 3, 3)."""
-    first = np.stack([at.r, np.cross(at.w, at.r), at.w], axis=2)
-    second = np.stack([at.r, np.cross(at.t, at.r), at.t], axis=2)
+    first = np.stack([at.r, cross(at.w, at.r), at.w], axis=2)
+    second = np.stack([at.r, cross(at.t, at.r), at.t], axis=2)
     return first, second
 
 
@@ -171,7 +171,7 @@ def equation_of_motion(
     rate = np.asarray(gamma_dot, dtype=float)
     products = bias(at, rate)
     inertia = at.rotation @ mechanism.star @ at.rotation.T  # Eq. 64
-    spin = np.cross(products.omega, inertia @ products.omega)
+    spin = cross(products.omega, inertia @ products.omega)
     n_ext = np.asarray(moment, dtype=float)
     t1 = at.j.T @ (-inertia @ at.j)  # Eq. 66
     t2 = at.j.T @ (-inertia @ products.omega_dot - spin + n_ext)  # Eq. 67
@@ -181,12 +181,12 @@ def equation_of_motion(
         turn = second[k].T @ first[k]
         r, ia, iipl = second[k].T @ at.r[k], mechanism.actuated[k], mechanism.intermediate[k]
         omega_a, omega_ipl = ja[k] @ rate, jipl[k] @ rate
-        big_l, small_l = -ia @ ja[k], -np.cross(omega_a, ia @ omega_a)  # Eqs. 73, 74
+        big_l, small_l = -ia @ ja[k], -cross(omega_a, ia @ omega_a)  # Eqs. 73, 74
         big_p = turn @ ja[k] + np.outer(r, at.r[k] @ at.j)  # Eq. 78
         mu_dot = at.a[k] @ rate
-        small_p = -np.cross(turn @ omega_a, r * mu_dot) - products.mu_ddot[k] * r  # Eq. 79
+        small_p = -cross(turn @ omega_a, r * mu_dot) - products.mu_ddot[k] * r  # Eq. 79
         big_k = -iipl @ big_p  # Eq. 81
-        small_k = -iipl @ small_p - np.cross(omega_ipl, iipl @ omega_ipl)  # Eq. 82
+        small_k = -iipl @ small_p - cross(omega_ipl, iipl @ omega_ipl)  # Eq. 82
         t1 += ja[k].T @ big_l + jipl[k].T @ big_k  # Eq. 91
         t2 += ja[k].T @ small_l + jipl[k].T @ small_k  # Eq. 92
     return t1, t2

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every rotation R with r_k . R e_k = 0 for k = 1, 2, 3: the roots of one quartic, for many r.
+
+t_1 = cos(x) n + sin(x) m spans the plane across r_1 and s = cos(y) r_1 + sin(y) t_1 x r_1. Legs 2
+and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the cross product of the two
+rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four in (cos x, sin x). Its roots come
+from a companion matrix; each is polished on the rotation itself. t_1 and -t_1 give two
+assemblies, R and R Rot(z, pi), that share s: up to eight.
+
+Resolution: two roots are told apart when the residual r_k . t_k midway between them is more than
+rounding, so that they are some 1e-6 rad apart or gamma is some 1e-12 rad off the fold where they
+meet. Closer ones, real or a complex pair, are a double root in this arithmetic, for r_k and e_k
+are rounded too: they come out as one, with det J2 near 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.mechanism.geometry import Array
+
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+ROUNDING = 1e-15
+"""Largest abs(r_k . t_k) that is rounding and not a residual."""
+
+_NOT_ISOLATED = 1e-13
+_NEAR_REAL = 1e-3
+_NEAR = 1e-3
+_MISFIT = 1e-2
+_STEPS = 40
+_LONGEST_TURN = 0.3
+_LAST_STEP = 1e-9
+_REGULAR = 1e-5
+_SMALL = 1000
+_AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def rotations(r: Array, e: Array) -> tuple[Index, Array, Mask]:
+    """Solve r_k . R e_k = 0 for many configurations at once.
+
+    Args:
+        r: unit vectors r_k in rows, shape (n, 3, 3), one block a configuration.
+        e: axes e_k of the star in {E} in rows, e_1 = (0, 1, 0), shape (3, 3).
+
+    Returns:
+        The configuration that each root belongs to, ascending, shape (m,); the rotations, (m, 3,
+        3), pairs R, R Rot(z, pi) side by side, pairs in the order of (s_z, s_y, s_x); and whether
+        the roots of a configuration are isolated, (n,): where they are not, none is given.
+
+    """
+    r0, rest = r[:, 0], r[:, 1:]
+    n = cross(r0, np.eye(3)[np.argmin(np.abs(r0), axis=1)])
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    m = cross(r0, n)
+    rn, rm = (rest @ n[:, :, None])[..., 0], (rest @ m[:, :, None])[..., 0]
+    ex, ey = e[1:, 0], e[1:, 1]
+    # Coefficients of (cos x, sin x) in a and c, and the number b; shapes (n, 2, 2) and (n, 2).
+    a = ex[:, None] * np.stack([-rm, rn], axis=-1)
+    b = -ex * (rest @ r0[:, :, None])[..., 0]
+    c = ey[:, None] * np.stack([rn, rm], axis=-1)
+    form = _quartic(a, b, c)
+    isolated = np.abs(form).max(axis=1) > _NOT_ISOLATED
+    x, keep = _roots(form, isolated)
+    y, fits = _second_angles(x, a, b, c)
+    owner, root, which = np.nonzero(keep[:, :, None] & fits)
+    x, y = x[owner, root][:, None], y[owner, root, which][:, None]
+    t1 = np.cos(x) * n[owner] + np.sin(x) * m[owner]
+    s = np.cos(y) * r0[owner] + np.sin(y) * cross(t1, r0[owner])
+    rotation, residual = _polish(r[owner], e, columns(cross(t1, s), t1, s))
+    good = residual <= ROUNDING
+    owner, rotation = _distinct(r, e, owner[good], rotation[good])
+    return (*_arranged(owner, rotation), isolated)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product along the last axis; much faster than np.cross on small arrays."""
+    if a.size < _SMALL:
+        ahead = a.take(_AHEAD, -1) * b.take(_BEHIND, -1)
+        return np.asarray(ahead - a.take(_BEHIND, -1) * b.take(_AHEAD, -1))
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return out
+
+
+def _quartic(a: Array, b: Array, c: Array) -> Array:
+    """Coefficients of cos^4, cos^3 sin, ..., sin^4 in cos(y)^2 + sin(y)^2 - 1, shape (n, 5)."""
+    cosine = b[:, :1] * c[:, 1] - b[:, 1:] * c[:, 0]
+    one = a[:, 0] * b[:, 1:] - a[:, 1] * b[:, :1]
+    sine = _product(c[:, 0], a[:, 1]) - _product(a[:, 0], c[:, 1])
+    form = _product(sine, sine)
+    bare = _product(cosine, cosine) - _product(one, one)
+    form[:, :3] += bare
+    form[:, 2:] += bare
+    return form
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of forms, coefficients along the last axis."""
+    result = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
+    for power in range(a.shape[1]):
+        result[:, power : power + b.shape[1]] += a[:, power, None] * b
+    return result
+
+
+def _turned_forms(count: int) -> tuple[Array, Array]:
+    """Angles x0 and matrices that turn a quartic form's coefficients from x to x - x0."""
+    angles = np.arange(count) * np.pi / count
+    matrices = np.zeros((count, 5, 5))
+    for turn, (cosine, sine) in enumerate(zip(np.cos(angles), np.sin(angles), strict=True)):
+        for power in range(5):
+            term = np.ones(1)
+            for factor in [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power:
+                term = np.convolve(term, factor)
+            matrices[turn, :, power] = term
+    return angles, matrices
+
+
+_TURN, _TURNED = _turned_forms(5)
+
+
+def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
+    """Angles x of the roots, shape (n, 4), modulo pi, and which of them may be real."""
+    # Count x from where the form is largest: then its leading coefficient is no small number.
+    best = np.argmax(np.abs(form @ _TURNED[:, 0].T), axis=1)
+    turned = (_TURNED[best] @ form[:, :, None])[..., 0]
+    lead = np.where(isolated, turned[:, 0], 1.0)
+    companion = np.zeros((len(form), 4, 4))
+    companion[:, 0] = -turned[:, 1:] / lead[:, None]
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    z = np.linalg.eigvals(companion)
+    size = z.real**2 + z.imag**2
+    x = _TURN[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, size - 1.0)
+    return x, isolated[:, None] & (np.abs(z.imag) < _NEAR_REAL * (1.0 + size))
+
+
+def _second_angles(x: Array, a: Array, b: Array, c: Array) -> tuple[Array, Mask]:
+    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where the legs agree."""
+    direction = np.stack([np.cos(x), np.sin(x)], axis=1)
+    a, c = a @ direction, c @ direction
+    b = np.broadcast_to(b[:, :, None], a.shape)
+    reach = np.hypot(a, b)
+    steep = reach[:, 1] > reach[:, 0]
+    chosen = np.where(steep, reach[:, 1], reach[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.clip(-np.where(steep, c[:, 1], c[:, 0]) / chosen, -1.0, 1.0)
+    swing = np.arccos(np.where(chosen > 0.0, cosine, 0.0))
+    middle = np.arctan2(np.where(steep, b[:, 1], b[:, 0]), np.where(steep, a[:, 1], a[:, 0]))
+    y = np.stack([middle + swing, middle - swing], axis=-1)
+    misfit = a[..., None] * np.cos(y)[:, None] + b[..., None] * np.sin(y)[:, None] + c[..., None]
+    return y, np.abs(misfit).max(axis=1) < _MISFIT
+
+
+def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
+    """Newton's method on SO(3); the best iterate of each start and its residual."""
+    best, least = rotation.copy(), np.full(len(rotation), np.inf)
+    active, last = np.arange(len(rotation)), np.full(len(rotation), np.inf)
+    for _ in range(_STEPS):
+        t = e @ rotation.transpose(0, 2, 1)
+        residual = np.sum(r * t, axis=2)
+        worst = np.abs(residual).max(axis=1)
+        better = worst < least[active]
+        least[active[better]], best[active[better]] = worst[better], rotation[better]
+        open_ = last > _LAST_STEP
+        if not open_.any():
+            break
+        if not open_.all():
+            active, r, t, rotation = active[open_], r[open_], t[open_], rotation[open_]
+            residual = residual[open_]
+        step = _newton_step(cross(t, r), residual)
+        last = np.sqrt(np.sum(step * step, axis=1))
+        if last.max() > _LONGEST_TURN:
+            step = step * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
+        rotation = turned(rotation, step)
+    return best, least
+
+
+def _newton_step(slope: Array, residual: Array) -> Array:
+    """Solve slope step = -residual; the shortest such step where slope is nearly singular."""
+    first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
+    # A^-1 is the adjugate over the determinant; its columns are these vector products.
+    adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
+    determinant = np.sum(first * adjugate[:, :, 0], axis=1)
+    regular = np.abs(determinant) > _REGULAR
+    scale = -1.0 / np.where(regular, determinant, 1.0)
+    step = (adjugate @ residual[:, :, None])[..., 0] * scale[:, None]
+    if not regular.all():
+        odd = ~regular
+        inverse = np.linalg.pinv(slope[odd], rcond=1e-9)
+        step[odd] = -(inverse @ residual[odd][:, :, None])[..., 0]
+    return np.asarray(step)
+
+
+def turned(rotation: Array, step: Array) -> Array:
+    """Turn R, shape (..., 3, 3), by small rotation vectors `step` in {B} and keep it orthonormal.
+
+    The turn is exact to second order, which is all that Newton's method asks for.
+    """
+    t, s = rotation[..., 1], rotation[..., 2]
+    ts, ss = cross(step, t), cross(step, s)
+    t, s = t + ts + 0.5 * cross(step, ts), s + ss + 0.5 * cross(step, ss)
+    s = s / np.sqrt(np.sum(s * s, axis=-1, keepdims=True))
+    t = t - s * np.sum(s * t, axis=-1, keepdims=True)
+    t = t / np.sqrt(np.sum(t * t, axis=-1, keepdims=True))
+    return columns(cross(t, s), t, s)
+
+
+def columns(a: Array, b: Array, c: Array) -> Array:
+    """Matrices (..., 3, 3) with the given columns."""
+    out = np.empty((*a.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = a, b, c
+    return out
+
+
+def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index, Array]:
+    """Keep one of each root; t_1 and -t_1 count as the same here."""
+    if not len(owner):
+        return owner, rotation
+    fresh = np.ones(len(owner), dtype=bool)
+    for back in range(1, 8):
+        later = np.arange(back, len(owner))
+        later = later[(owner[later] == owner[later - back]) & fresh[later]]
+        if not len(later):
+            continue
+        new, old = rotation[later], rotation[later - back]
+        sign = np.where(np.sum(new[:, :, 1] * old[:, :, 1], axis=1) < 0.0, -1.0, 1.0)
+        old = old * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, None, :]
+        close = np.abs(new - old).max(axis=(1, 2)) < _NEAR
+        if close.any():
+            at = later[close]
+            middle = turned(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
+            t = e @ middle.transpose(0, 2, 1)
+            fresh[at] = np.abs(np.sum(r[owner[at]] * t, axis=2)).max(axis=1) > ROUNDING
+    return owner[fresh], rotation[fresh]
+
+
+def _arranged(owner: Index, rotation: Array) -> tuple[Index, Array]:
+    """Sort, and set the partner R Rot(z, pi) beside each root."""
+    s = np.round(rotation[:, :, 2], 6)
+    order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
+    owner, rotation = owner[order], rotation[order]
+    # t_1 first, then -t_1: of the two the one further along the first base vector that tells.
+    t = np.round(rotation[:, :, 1], 6)
+    lead = t[np.arange(len(t)), np.argmax(t != 0.0, axis=1)] < 0.0
+    rotation = np.where(lead[:, None, None], rotation * [-1.0, -1.0, 1.0], rotation)
+    both = np.stack([rotation, rotation * [-1.0, -1.0, 1.0]], axis=1)
+    return np.repeat(owner, 2), both.reshape(-1, 3, 3)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rates and accelerations of every joint and link, from the actuators or from the star.
+
+Both directions use one leg equation, Eqs. 9 and 24 to 27. Written with c_k = (r x t).w = (w x r).t:
+
+    omega     = w gamma_dot - r mu_dot - t beta_dot
+    omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot
+                - gamma_dot mu_dot (w x r) - beta_dot (omega x t)
+
+Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the star; this
+needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
+and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sst_ros.errors import SingularConfiguration
+from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism.assemblies import cross
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.virtual_work import SINGULAR, Posture
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg.
+
+    Attributes:
+        omega, omega_dot: star, in {B} [rad/s], [rad/s^2], shape (3,).
+        gamma_dot, mu_dot, beta_dot: joint rates [rad/s], shape (3,).
+        gamma_ddot, mu_ddot, beta_ddot: joint accelerations [rad/s^2], shape (3,).
+        omega_a, omega_a_dot: actuated links, in {1k}, Eqs. 53 to 57, shape (3, 3).
+        omega_ipl, omega_ipl_dot: intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3).
+
+    """
+
+    omega: Array
+    omega_dot: Array
+    gamma_dot: Array
+    mu_dot: Array
+    beta_dot: Array
+    gamma_ddot: Array
+    mu_ddot: Array
+    beta_ddot: Array
+    omega_a: Array
+    omega_a_dot: Array
+    omega_ipl: Array
+    omega_ipl_dot: Array
+
+
+def of_actuators(
+    at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = (0.0, 0.0, 0.0)
+) -> Motion:
+    """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
+    rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
+    omega = at.j @ rate
+    omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
+    found = _legs(at.r, at.t, at.w, at.c, omega, omega_dot)
+    return _motion(
+        at.r, at.t, at.w, omega, omega_dot, (rate, *found[1:3], acceleration, *found[4:])
+    )
+
+
+def of_star(
+    geometry: Geometry,
+    rotation: ArrayLike,
+    omega: ArrayLike,
+    omega_dot: ArrayLike = (0.0, 0.0, 0.0),
+    gamma: ArrayLike | None = None,
+) -> Motion:
+    """Everything from omega [rad/s] and omega_dot [rad/s^2] in {B}, each shape (3,).
+
+    Args:
+        geometry: base triangle and star.
+        rotation: R of {E} in {B}, shape (3, 3).
+        omega: angular velocity of the star.
+        omega_dot: its rate of change.
+        gamma: actuator angles that choose the branch of each leg; None takes mu_k in (0, pi).
+
+    Raises:
+        SingularConfiguration: some c_k = 0 (serial).
+
+    """
+    matrix = np.asarray(rotation, dtype=float)
+    if gamma is None:
+        gamma = kinematics.inverse(geometry, matrix)[0]
+    r = kinematics.carriage_directions(geometry, gamma)
+    t, w = geometry.e @ matrix.T, geometry.w
+    c = np.sum(cross(r, t) * w, axis=1)
+    if np.min(np.abs(c)) < SINGULAR:
+        raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
+    star = np.array(omega, dtype=float), np.array(omega_dot, dtype=float)
+    return _motion(r, t, w, *star, _legs(r, t, w, c, *star))
+
+
+def _legs(
+    r: Array, t: Array, w: Array, c: Array, omega: Array, omega_dot: Array
+) -> tuple[Array, ...]:
+    """Joint rates, then joint accelerations, of all legs."""
+    normal, wr, turning = cross(r, t), cross(w, r), cross(omega, t)
+    gamma_dot = (normal @ omega) / c  # Eq. 10
+    mu_dot = -(r @ omega)  # Eq. 18
+    beta_dot = -(wr @ omega) / c  # Eq. 21
+    push = gamma_dot * mu_dot
+    gamma_ddot = (
+        normal @ omega_dot + push * np.sum(normal * wr, axis=1)
+        + beta_dot * np.sum(normal * turning, axis=1)
+    ) / c  # Eq. 29  # fmt: skip
+    mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * turning, axis=1)  # Eq. 42
+    beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c  # Eq. 46
+    return gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
+
+
+def _motion(
+    r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, joints: tuple[Array, ...]
+) -> Motion:
+    gamma_dot, mu_dot, _, gamma_ddot, mu_ddot, _ = joints
+    zero = np.zeros(3)
+    omega_a = np.stack([zero, zero, gamma_dot], axis=1)
+    omega_a_dot = np.stack([zero, zero, gamma_ddot], axis=1)
+    # {2k} = [r, t x r, t]; w has no component along r.
+    turn = np.stack([zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1)
+    x = np.array([1.0, 0.0, 0.0])
+    omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
+    # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
+    push = cross(turn, np.broadcast_to(x, turn.shape))
+    omega_ipl_dot = (
+        gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * push
+    )
+    arrays = (omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
+    for array in arrays:
+        array.setflags(write=False)
+    return Motion(*arrays)

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the star can go, how far every limit is, and how well the actuators hold it there.
+
+A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max, and gamma_k
+lies in its stroke. Two maps: over orientations (direction of s, turn psi about it), where the
+inverse kinematics has one answer, and over gamma, where the direct kinematics has 0 to 3.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.assemblies import columns, cross
+from sst_ros.mechanism.geometry import Array, Geometry
+
+_BLOCK = 20_000
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a designer asks of poses; arrays share the shape (...) of the poses. Read-only.
+
+    Attributes:
+        gamma, mu, beta: joint angles [rad], shape (..., 3).
+        admissible: the manipulator can be there.
+        stroke: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond.
+        edge: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond.
+        reach: smallest beta_max - beta_k [rad].
+        det_j1, det_j2: determinants; 0 at a serial and at a parallel singularity.
+        cond_j: condition number of J = -J2^-1 J1, infinite at both.
+
+    """
+
+    gamma: Array
+    mu: Array
+    beta: Array
+    admissible: NDArray[np.bool_]
+    stroke: Array
+    edge: Array
+    reach: Array
+    det_j1: Array
+    det_j2: Array
+    cond_j: Array
+
+    @property
+    def margin(self) -> Array:
+        """Distance to the nearest of all limits [rad], negative beyond one."""
+        return np.minimum(np.minimum(self.stroke, self.edge), self.reach)
+
+
+@dataclass(frozen=True)
+class OrientationMap:
+    """Measures over m directions of s and n turns psi. Arrays are read-only.
+
+    Attributes:
+        geometry: what was mapped.
+        s: directions in {B}, shape (m, 3).
+        psi: third ZYZ angle [rad], evenly over a full turn, shape (n,).
+        measures: shape (m, n).
+
+    """
+
+    geometry: Geometry
+    s: Array
+    psi: Array
+    measures: Measures
+
+    @property
+    def turn(self) -> Array:
+        """Width of the admissible psi at each direction [rad], shape (m,).
+
+        The ends between two samples are interpolated by the margin.
+        """
+        here, margin = self.measures.admissible, self.measures.margin
+        after, beyond = np.roll(here, -1, axis=1), np.roll(margin, -1, axis=1)
+        inner, outer = np.where(here, margin, beyond), np.where(here, beyond, margin)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.where(outer < 0.0, inner / (inner - outer), 0.5)
+        share = np.where(here & after, 1.0, np.where(here | after, part, 0.0))
+        return np.asarray(share.sum(axis=1) * (2.0 * np.pi / len(self.psi)))
+
+    @property
+    def best_cond_j(self) -> Array:
+        """Least cond J over the admissible psi, shape (m,); NaN where there is none."""
+        least = np.where(self.measures.admissible, self.measures.cond_j, np.inf).min(axis=1)
+        return np.where(np.isfinite(least), least, np.nan)
+
+    @property
+    def best_margin(self) -> Array:
+        """Largest distance to all limits over psi [rad], shape (m,); NaN where there is none."""
+        most = np.where(self.measures.admissible, self.measures.margin, -np.inf).max(axis=1)
+        return np.where(np.isfinite(most), most, np.nan)
+
+
+@dataclass(frozen=True)
+class GammaMap:
+    """Measures over a grid of gamma; of several admissible assemblies the best cond J counts.
+
+    Attributes:
+        geometry: what was mapped.
+        gamma: actuator angles [rad], shape (n, n, n, 3), mid-points of n equal parts of the stroke.
+        count: number of admissible assemblies, shape (n, n, n).
+        rotation: R, shape (n, n, n, 3, 3); NaN where there is none.
+        measures: shape (n, n, n); NaN and not admissible where there is none.
+
+    """
+
+    geometry: Geometry
+    gamma: Array
+    count: NDArray[np.intp]
+    rotation: Array
+    measures: Measures
+
+
+def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measures:
+    """Measure assemblies: gamma [rad], shape (..., 3), with R, shape (..., 3, 3)."""
+    angles, matrices = np.array(gamma, dtype=float), np.asarray(rotation, dtype=float)
+    r = kinematics.carriage_directions(geometry, angles)
+    mu, beta, det_j2, admissible = kinematics.described(geometry, r, matrices)
+    t = geometry.e @ np.swapaxes(matrices, -1, -2)
+    n = cross(r, t)
+    c = np.sum(n * geometry.w, axis=-1)
+    stroke = np.minimum(angles, geometry.arc - angles).min(axis=-1)
+    # J is det J2 times this up to its sign: the condition number needs no division.
+    rows = [cross(n[..., i, :], n[..., i - 2, :]) * c[..., i - 1, None] for i in range(3)]
+    singular = np.linalg.svd(np.nan_to_num(np.stack(rows, axis=-2)), compute_uv=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cond_j = np.where(singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf)
+    found = (
+        angles, mu, beta, admissible & (stroke >= 0.0), stroke, beta.min(axis=-1),
+        geometry.beta_max - beta.max(axis=-1), np.prod(c, axis=-1), det_j2, cond_j,
+    )  # fmt: skip
+    return _measures(found)
+
+
+def over_orientations(
+    geometry: Geometry, s: ArrayLike, turns: int = 180, progress: bool = False
+) -> OrientationMap:
+    """Map directions s, shape (m, 3), with `turns` values of psi each.
+
+    With `progress` a bar on stderr shows how far it is, if stderr is a terminal.
+    """
+    directions = np.array(s, dtype=float)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    psi = np.asarray((np.arange(turns) + 0.5) * (2.0 * np.pi / turns) - np.pi, dtype=float)
+    parts = []
+    for block in _blocks(len(directions), max(1, _BLOCK // turns), "orientations", progress):
+        rotation = orientations(directions[block][:, None], psi)
+        gamma, _, _ = kinematics.inverse(geometry, rotation)
+        parts.append(measures(geometry, gamma, rotation))
+    directions.setflags(write=False)
+    psi.setflags(write=False)
+    return OrientationMap(geometry, directions, psi, _joined(parts))
+
+
+def over_gamma(geometry: Geometry, points: int = 24, progress: bool = False) -> GammaMap:
+    """Map points^3 actuator angles over the whole stroke; `progress` as in over_orientations."""
+    line = (np.arange(points) + 0.5) / points
+    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) * geometry.arc
+    gamma = grid.reshape(-1, 3)
+    count = np.zeros(len(gamma), dtype=np.intp)
+    rotation = np.full((len(gamma), 3, 3), np.nan)
+    for block in _blocks(len(gamma), 2000, "gamma", progress):
+        found = kinematics.direct_many(geometry, gamma[block])
+        valid = found.admissible
+        owner, candidates = found.configuration[valid] + block.start, found.rotation[valid]
+        np.add.at(count, owner, 1)
+        # Worst first: of several the best is written last.
+        order = np.argsort(-measures(geometry, gamma[owner], candidates).cond_j, kind="stable")
+        rotation[owner[order]] = candidates[order]
+    with np.errstate(invalid="ignore"):
+        measured = measures(geometry, gamma, rotation)
+    blank = np.where(count > 0, 0.0, np.nan)
+    values = [getattr(measured, name) for name in Measures.__dataclass_fields__]
+    values = [v if v.dtype == bool or v.ndim > 1 else v + blank for v in values]
+    cube = (points, points, points)
+    shaped = _measures(tuple(v.reshape(cube + v.shape[1:]) for v in values))
+    for array in (grid, count, rotation):
+        array.setflags(write=False)
+    return GammaMap(geometry, grid, count.reshape(cube), rotation.reshape(*cube, 3, 3), shaped)
+
+
+def orientations(s: Array, psi: ArrayLike) -> Array:
+    """R of directions s (..., 3) and third ZYZ angles psi (...) [rad], shape (..., 3, 3).
+
+    theta and phi are those of s; where s = +-z, theta is 0.
+    """
+    sine = np.hypot(s[..., 0], s[..., 1])
+    pole = sine == 0.0
+    safe = np.where(pole, 1.0, sine)
+    ct, st = np.where(pole, 1.0, s[..., 0] / safe), np.where(pole, 0.0, s[..., 1] / safe)
+    along = np.stack([ct * s[..., 2], st * s[..., 2], -sine], axis=-1)
+    across = np.stack([-st, ct, np.zeros_like(st)], axis=-1)
+    angle = np.asarray(psi, dtype=float)[..., None]
+    x = np.cos(angle) * along + np.sin(angle) * across
+    return columns(x, np.cos(angle) * across - np.sin(angle) * along, np.broadcast_to(s, x.shape))
+
+
+def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array, NDArray[np.intp]]:
+    """Directions inside the base triangle, shape (m, 3), and their triangles, shape (n, 3)."""
+    index: dict[tuple[int, int], int] = {}
+    weights: list[tuple[float, float, float]] = []
+    for i in range(divisions + 1):
+        for j in range(divisions + 1 - i):
+            index[i, j] = len(weights)
+            weights.append((i + 0.1, j + 0.1, divisions - i - j + 0.1))
+    faces = []
+    for (i, j), here in index.items():
+        if (i + 1, j) in index and (i, j + 1) in index:
+            faces.append((here, index[i + 1, j], index[i, j + 1]))
+        if (i + 1, j - 1) in index and (i + 1, j) in index:
+            faces.append((here, index[i + 1, j - 1], index[i + 1, j]))
+    s = np.array(weights) @ geometry.v
+    return s / np.linalg.norm(s, axis=1)[:, None], np.array(faces, dtype=np.intp)
+
+
+def _measures(arrays: tuple[Array, ...]) -> Measures:
+    for array in arrays:
+        array.setflags(write=False)
+    return Measures(*arrays)  # type: ignore[arg-type]
+
+
+def _joined(parts: list[Measures]) -> Measures:
+    names = Measures.__dataclass_fields__
+    return _measures(tuple(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+def _blocks(total: int, size: int, label: str, progress: bool) -> Iterator[slice]:
+    """Slices of `size`, with a bar on stderr if it is wanted and stderr is a terminal."""
+    shown = progress and sys.stderr.isatty()
+    for start in range(0, total, size):
+        yield slice(start, min(start + size, total))
+        if shown:
+            done = min(start + size, total)
+            bar = "#" * (40 * done // total)
+            end = "\n" if done == total else ""
+            print(f"\r{label} [{bar:40}] {100 * done // total:3d} %", end=end, file=sys.stderr)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""gamma_ddot against MuJoCo and Pinocchio: the same seven links as a tree with two loops closed.
+
+The tree is base -> actuated -> intermediate for each leg, the star hangs on leg 1, and a point of
+the axis t_k on legs 2 and 3 is tied to the star. Each model is built at one pose and then moved.
+"""
+
+import numpy as np
+import pytest
+from mechanism.closed_chains import ISOTROPIC, random_geometry, random_mechanism, random_pose
+
+from sst_ros.mechanism import continuation, rates, virtual_work
+
+MUJOCO = 1e-6
+PINOCCHIO = 1e-12
+JOINTS = ("g0", "m0", "b0", "g1", "m1", "g2", "m2")
+
+
+class Case:
+    """A mechanism, the pose at which an engine's model is built, and moving states near it."""
+
+    def __init__(self, seed):
+        rng = np.random.default_rng(seed)
+        geometry = ISOTROPIC if seed % 4 == 0 else random_geometry(rng)
+        self.mechanism = random_mechanism(rng, geometry)
+        gamma, rotation = random_pose(rng, geometry)
+        self.w, self.t = geometry.w, geometry.e @ rotation.T
+        across = np.cross(self.w, geometry.v)
+        self.r = np.cos(gamma)[:, None] * geometry.v + np.sin(gamma)[:, None] * across
+        first = [np.stack([r, np.cross(w, r), w], 1) for r, w in zip(self.r, self.w, strict=True)]
+        second = [np.stack([r, np.cross(t, r), t], 1) for r, t in zip(self.r, self.t, strict=True)]
+        self.frames = {"s": rotation}
+        self.tensors = {"s": self.mechanism.star}
+        for k in range(3):
+            self.frames[f"a{k}"], self.frames[f"i{k}"] = first[k], second[k]
+            self.tensors[f"a{k}"] = self.mechanism.actuated[k]
+            self.tensors[f"i{k}"] = self.mechanism.intermediate[k]
+        self.states = [self._state(rng, geometry, gamma, rotation) for _ in range(4)]
+
+    def _state(self, rng, geometry, gamma, rotation):
+        """Angles and rates of the tree's joints, the loads, and what sst_ros answers."""
+        while True:
+            point = gamma + rng.uniform(-0.4, 0.4, 3)
+            try:
+                branch = continuation.follow(geometry, [gamma, point], rotation)
+            except continuation.BranchEnds:
+                continue
+            if branch.sigma[1] > 0.1 and np.abs(np.sin(branch.mu[1])).min() > 0.1:
+                break
+        torque, moment, rate = rng.normal(size=(3, 3)) * [[1.0], [1.0], [2.0]]
+        at = virtual_work.posture(geometry, point, branch.rotation[1])
+        answer = virtual_work.direct_dynamics(self.mechanism, at, rate, torque, moment)
+        motion = rates.of_actuators(at, rate, answer)
+        moved = {name: getattr(branch, name)[1] - getattr(branch, name)[0]
+                 for name in ("gamma", "mu", "beta")}  # fmt: skip
+        kinds = {"g": "gamma", "m": "mu", "b": "beta"}
+        q = {j: moved[kinds[j[0]]][int(j[1])] for j in JOINTS}
+        v = {j: getattr(motion, kinds[j[0]] + "_dot")[int(j[1])] for j in JOINTS}
+        return q, v, torque, moment, answer
+
+
+@pytest.fixture(params=range(8), scope="module")
+def case(request):
+    return Case(request.param)
+
+
+def relative(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+def test_pinocchio(case):
+    pin = pytest.importorskip("pinocchio", reason="Pinocchio is missing: pip install pin")
+    model, still = pin.Model(), pin.SE3.Identity()
+    model.gravity = pin.Motion.Zero()
+    joints = {}
+
+    def hang(joint, parent, axis, body):
+        joints[joint] = model.addJoint(parent, pin.JointModelRevoluteUnaligned(axis), still, joint)
+        tensor = case.frames[body] @ case.tensors[body] @ case.frames[body].T
+        model.appendBodyToJoint(joints[joint], pin.Inertia(1.0, np.zeros(3), tensor), still)
+
+    for k in range(3):
+        hang(f"g{k}", 0, case.w[k], f"a{k}")
+        hang(f"m{k}", joints[f"g{k}"], -case.r[k], f"i{k}")
+        if k == 0:  # depth first: Pinocchio takes the joints of a subtree as neighbours
+            hang("b0", joints["m0"], -case.t[0], "s")
+    ties, tied = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    for k in (1, 2):
+        point = pin.SE3(np.eye(3), case.t[k])
+        kind = pin.ContactType.CONTACT_3D
+        tie = pin.RigidConstraintModel(kind, model, joints["b0"], point, joints[f"m{k}"], point)
+        ties.append(tie)
+        tied.append(tie.createData())
+    place = {name: model.joints[index].idx_v for name, index in joints.items()}
+    for q_by, v_by, torque, moment, expected in case.states:
+        data, q, v, u = model.createData(), *np.zeros((3, model.nv))
+        for name, at in place.items():
+            q[at], v[at] = q_by[name], v_by[name]
+        for k in range(3):
+            u[place[f"g{k}"]] = torque[k]
+        pin.computeJointJacobians(model, data, q)
+        aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        u += pin.getJointJacobian(model, data, joints["b0"], aligned)[3:].T @ moment
+        try:
+            pin.initConstraintDynamics(model, data, ties, tied)
+        except TypeError:  # before Pinocchio 4
+            pin.initConstraintDynamics(model, data, ties)
+        # Each tie has three rows of rank two: proximal steps bring the least-squares answer.
+        proximal = pin.ProximalSettings(1e-16, 1e-3, 30)
+        found = pin.constraintDynamics(model, data, q, v, u, ties, tied, proximal)
+        assert relative(found[[place[f"g{k}"] for k in range(3)]], expected) <= PINOCCHIO
+
+
+def test_mujoco(case):
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    model = mujoco.MjModel.from_xml_string(mujoco_xml(case))
+    # The softness of an equality is (1 - d)/d times these, and d may not exceed 0.9999.
+    model.body_invweight0[:] *= 1e-4
+    place = {name: model.joint(name).dofadr[0] for name in JOINTS}
+    for q_by, v_by, torque, moment, expected in case.states:
+        data = mujoco.MjData(model)
+        for name, at in place.items():
+            data.qpos[at], data.qvel[at] = q_by[name], v_by[name]
+        for k in range(3):
+            data.qfrc_applied[place[f"g{k}"]] = torque[k]
+        data.xfrc_applied[model.body("s").id, 3:] = moment
+        mujoco.mj_forward(model, data)
+        assert np.abs(data.efc_pos).max() < 1e-12 and np.abs(data.efc_vel).max() < 1e-12
+        assert relative(data.qacc[[place[f"g{k}"] for k in range(3)]], expected) <= MUJOCO
+
+
+def mujoco_xml(case):
+    """The model at its building pose, where all joint angles are 0."""
+    bodies = []
+    for k in range(3):
+        star = body("s", case, hinge("b0", -case.t[0])) + "</body>" if k == 0 else ""
+        link = body(f"i{k}", case, hinge(f"m{k}", -case.r[k])) + star + "</body>"
+        bodies.append(body(f"a{k}", case, hinge(f"g{k}", case.w[k])) + link + "</body>")
+    ties = [
+        f'<connect body1="s" body2="i{k}" anchor="{numbers(case.t[k])}" solref="0.01 1"'
+        ' solimp="0.9999 0.9999 0.001"/>'
+        for k in (1, 2)
+    ]
+    return (
+        '<mujoco><compiler angle="radian" balanceinertia="false"/>'
+        '<option gravity="0 0 0" tolerance="0" iterations="100" solver="Newton"/>'
+        f"<worldbody>{''.join(bodies)}</worldbody><equality>{''.join(ties)}</equality></mujoco>"
+    )
+
+
+def body(name, case, joint):
+    """A body with its tensor about O and its centre of mass off O: `connect` scales by it."""
+    tensor, frame = case.tensors[name], case.frames[name]
+    least, middle, most = np.linalg.eigvalsh(tensor)
+    axis = np.linalg.eigh(tensor)[1][:, 2]
+    # A point mass on the axis of the largest moment: it takes from the two smaller ones only.
+    mass, shift = 1.0, np.sqrt(0.2 * (least + middle - most))
+    c = frame @ axis * shift
+    central = frame @ tensor @ frame.T - mass * (c @ c * np.eye(3) - np.outer(c, c))
+    six = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return (
+        f'<body name="{name}"><inertial pos="{numbers(c)}" mass="{mass}"'
+        f' fullinertia="{numbers(six)}"/>{joint}'
+    )
+
+
+def hinge(name, axis):
+    return f'<joint name="{name}" type="hinge" axis="{numbers(axis)}"/>'
+
+
+def numbers(values):
+    return " ".join(f"{value:.17g}" for value in values)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps against one pose at a time, against what is proved, and singular poses against theory."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_pose
+
+from sst_ros.errors import SingularConfiguration
+from sst_ros.mechanism import kinematics, singularities, virtual_work, workspace
+from sst_ros.mechanism.frames import zyz_angles
+
+
+@pytest.fixture(scope="module")
+def isotropic():
+    return chart_of(ISOTROPIC)
+
+
+@pytest.fixture(scope="module")
+def folding():
+    return chart_of(FOLDING)
+
+
+def chart_of(geometry, divisions=16):
+    s, _ = workspace.triangle_directions(geometry, divisions)
+    return workspace.over_orientations(geometry, s, turns=90)
+
+
+def test_measures_are_those_of_the_velocity_analysis():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        geometry = random_geometry(rng)
+        gamma, rotation = random_pose(rng, geometry)
+        at = virtual_work.posture(geometry, gamma, rotation)
+        found = workspace.measures(geometry, gamma, rotation)
+        np.testing.assert_allclose(found.cond_j, np.linalg.cond(at.j), rtol=1e-9)
+        np.testing.assert_allclose(found.det_j2, np.linalg.det(at.j2), rtol=1e-9)
+        np.testing.assert_allclose(found.det_j1, np.prod(at.c), rtol=1e-9)
+        assert found.edge == found.beta.min()
+        assert found.margin == min(found.stroke, found.edge, found.reach)
+
+
+def test_the_map_is_the_inverse_kinematics(isotropic):
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        i, j = rng.integers(len(isotropic.s)), rng.integers(len(isotropic.psi))
+        rotation = workspace.orientations(isotropic.s[i], isotropic.psi[j])
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(zyz_angles(rotation)[2], isotropic.psi[j], atol=1e-12)
+        gamma, _, beta = kinematics.inverse(ISOTROPIC, rotation)
+        np.testing.assert_allclose(isotropic.measures.gamma[i, j], gamma, atol=1e-14)
+        np.testing.assert_allclose(isotropic.measures.beta[i, j], beta, atol=1e-14)
+        described = kinematics.assembly_of(ISOTROPIC, gamma, rotation)
+        inside = np.all((gamma >= 0) & (gamma <= ISOTROPIC.arc))
+        assert isotropic.measures.admissible[i, j] == (described.admissible and inside)
+
+
+def test_the_isotropic_workspace(isotropic):
+    """Proved: no singular pose inside; known: cond J <= 2.44 and 120 deg of turn at the centre."""
+    found = isotropic.measures
+    assert found.cond_j[found.admissible].max() < 2.45
+    assert np.nanmin(isotropic.best_cond_j) >= 1.0
+    assert len(singularities.parallel(isotropic)) == 0
+    centre = workspace.over_orientations(ISOTROPIC, [[1.0, 1.0, 1.0]], turns=720)
+    np.testing.assert_allclose(np.degrees(centre.turn), 120.0, atol=0.5)
+    np.testing.assert_allclose(centre.best_cond_j, 1.0, atol=1e-4)
+    # Home: beta is 35.2644 deg, the ends of the stroke are 45 deg away.
+    np.testing.assert_allclose(np.degrees(centre.best_margin), 35.2644, atol=1.0)
+    assert "parallel: none" in singularities.report(ISOTROPIC, isotropic)
+
+
+def test_a_quarter_of_the_isotropic_gamma_cube_is_empty():
+    found = workspace.over_gamma(ISOTROPIC, points=16)
+    assert set(np.unique(found.count)) == {0, 1}
+    assert 0.22 < np.mean(found.count == 0) < 0.29
+    assert np.array_equal(found.count > 0, found.measures.admissible)
+    assert np.all(np.isnan(found.measures.cond_j[found.count == 0]))
+    row = tuple(np.argwhere(found.count == 1)[100])
+    pose = kinematics.admissible(ISOTROPIC, found.gamma[row])
+    np.testing.assert_allclose(found.rotation[row], pose.rotation, atol=1e-12)
+
+
+def test_of_several_admissible_assemblies_the_best_conditioned_counts():
+    found = workspace.over_gamma(FOLDING, points=16)
+    rows = np.argwhere(found.count > 1)
+    assert len(rows) > 0
+    for row in map(tuple, rows):
+        gamma = found.gamma[row]
+        candidates = [a for a in kinematics.direct(FOLDING, gamma) if a.admissible]
+        assert len(candidates) == found.count[row]
+        conds = [workspace.measures(FOLDING, gamma, a.rotation).cond_j for a in candidates]
+        np.testing.assert_allclose(found.measures.cond_j[row], min(conds), rtol=1e-6)
+
+
+def test_parallel_singularities_of_the_folding_geometry(folding):
+    """v = I, alpha = 210, 75, 75 deg: tan b1 sin a2 + tan b2 sin a3 + tan b3 sin a1 = 0."""
+    poses = singularities.parallel(folding)
+    assert len(poses) > 20
+    a1, a2, a3 = FOLDING.alpha
+    for i in range(len(poses)):
+        described = kinematics.assembly_of(FOLDING, poses.gamma[i], poses.rotation[i])
+        assert described.admissible
+        assert abs(described.det_j2) < 1e-13
+        tangents = np.tan(poses.beta[i])
+        assert abs(tangents @ [np.sin(a2), np.sin(a3), np.sin(a1)]) < 1e-11
+        with pytest.raises(SingularConfiguration, match="parallel"):
+            virtual_work.posture(FOLDING, poses.gamma[i], poses.rotation[i])
+    assert "parallel: none" not in singularities.report(FOLDING, folding)
+
+
+def test_serial_singularities_lie_on_the_edge():
+    poses = singularities.serial(FOLDING)
+    assert len(poses) > 0
+    for i in range(len(poses)):
+        k, rotation = poses.leg[i], poses.rotation[i]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+        t = rotation @ FOLDING.e[k]
+        assert np.linalg.norm(np.cross(t, FOLDING.w[k])) < 1e-14
+        assert abs(FOLDING.w[k] @ rotation[:, 2]) < 1e-14
+        others = [j for j in range(3) if j != k]
+        assert np.all(poses.beta[i, others] > 0)
+    assert len(singularities.serial(ISOTROPIC)) == 0
+
+
+def test_directions_fill_the_triangle():
+    rng = np.random.default_rng(3)
+    for geometry in (ISOTROPIC, random_geometry(rng)):
+        s, faces = workspace.triangle_directions(geometry, 12)
+        assert len(s) == 13 * 14 // 2 and len(faces) == 12**2
+        assert np.all(s @ geometry.w.T > 0)
+        np.testing.assert_allclose(np.linalg.norm(s, axis=1), 1.0, atol=1e-15)
+        areas = np.linalg.det(s[faces])
+        assert np.all(areas * areas[0] > 0)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_bar_is_for_terminals_only(terminal, monkeypatch):
+    stream = io.StringIO()
+    stream.isatty = lambda: terminal
+    monkeypatch.setattr(sys, "stderr", stream)
+    workspace.over_gamma(ISOTROPIC, points=4, progress=True)
+    assert ("100 %" in stream.getvalue()) == terminal
+
+
+def test_the_picture(tmp_path, isotropic, folding):
+    pytest.importorskip("matplotlib")
+    from sst_ros.report.workspace_figure import draw
+
+    _, faces = workspace.triangle_directions(ISOTROPIC, 16)
+    figure = draw([isotropic, folding], [faces, faces], ["isotropic", "general"])
+    assert len(figure.axes) == 12  # six pictures, six colour bars
+    figure.savefig(tmp_path / "workspace.png", dpi=40)
+    assert (tmp_path / "workspace.png").stat().st_size > 10_000
