@@ -88,12 +88,16 @@ class WorkspaceLeft(RunStopped):
     """beta_k left (0, beta_max]: E reached an edge of the base triangle or of the star's arcs."""
 
 
+class SingularityReached(RunStopped):
+    """mu_k reached 0 or pi: the arc of the star lies along the base arc, gamma_k has no value."""
+
+
 class ImpactsAccumulate(RunStopped):
     """Impacts at an end of the stroke follow each other without coming to rest."""
 
 
 class Diverged(RunStopped):
-    """The step gave a number that is not finite; nothing of it is kept."""
+    """No step, however small, resolves the motion to the tolerance with finite numbers."""
 
 
 def _shorten(value: object, limit: int = 80) -> str:

@@ -6,30 +6,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
-from sst_ros.errors import Diverged, ImpactsAccumulate, InputError, Problem, RunStopped
-from sst_ros.integration.events import first_crossing
-from sst_ros.integration.explicit import ExplicitMethod
-from sst_ros.integration.tableaux import DORMAND_PRINCE, Tableau
-from sst_ros.limits import Limit, limits_of
+from sst_ros.errors import Diverged, InputError, Problem
+from sst_ros.integration.journey import Journey, Point
+from sst_ros.integration.tableaux import METHODS
+from sst_ros.integration.walk import CannotStep, Change
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.contacts import RigidEnds
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.kernel import Joints
 from sst_ros.scene import Scene
 
 NANOSECONDS = 1_000_000_000
+AUTO = "auto"
+INTEGRATORS = (AUTO, *METHODS)
 Triple = tuple[float, float, float]
-Vector = tuple[float, ...]
 Torque: TypeAlias = Triple | Callable[[float], Triple]
-
-_IMPACTS_PER_STEP = 1000
-_RESTING_RATE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -52,173 +48,157 @@ class State:
     torque: Triple
 
 
-class _Point(NamedTuple):
-    """A point inside a step: time since it began, state, joints (angles, rates), local error."""
-
-    x: float
-    y: Vector
-    joints: Vector
-    error: float
-
-
 class Simulation:
     """Direct dynamics of a scene from its initial state.
 
-    Attributes:
+    Args:
         scene: what is simulated.
-        geometry: its constant vectors.
-        dynamics: its traced functions.
-        method: name of the integrator.
-        error_estimate: sum of the local error estimates so far, in units of (q, W).
+        integrator: auto, or a method of `integration.tableaux.METHODS`.
+        tolerance: largest local error of a step: of the quaternion, and of the rate relative to
+            its length. RK4 has no error estimate; it takes one pair of steps a call.
+        compiled: run under numba; the digits are the same, the first step of a new scene takes
+            seconds.
+
+    Attributes:
+        geometry: constant vectors of the scene.
+        dynamics: traced functions of the scene.
 
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
-        InputError: the initial gamma lies outside the stroke.
+        InputError: the initial gamma lies outside the stroke, or an argument is not allowed.
 
     """
 
-    def __init__(self, scene: Scene, tableau: Tableau = DORMAND_PRINCE) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        integrator: str = AUTO,
+        *,
+        tolerance: float = 1e-10,
+        compiled: bool = False,
+    ) -> None:
+        integrator = getattr(integrator, "name", integrator)
+        if integrator not in INTEGRATORS:
+            allowed = "must be one of " + ", ".join(INTEGRATORS)
+            raise InputError("simulation", [Problem("integrator", integrator, allowed)])
+        if not tolerance > 0.0:
+            raise InputError("simulation", [Problem("tolerance", tolerance, "must be > 0")])
         self.scene = scene
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics(scene)
-        self.method = tableau.name
-        self.error_estimate = 0.0
-        self._method = ExplicitMethod(tableau)
-        self._limits = tuple(limits_of(scene, self.geometry))
-        self._ends = RigidEnds(self.dynamics)
-        self._resting: tuple[Limit, ...] = ()
-        self._y, self._state = self._initial()
+        self._journey = Journey(
+            scene, self.geometry, self.dynamics, integrator, tolerance, compiled=compiled
+        )
+        self._start = self._initial()
+        self.reset()
+
+    def reset(self) -> State:
+        """Go back to the initial state at time zero."""
+        self._journey.reset()
+        self._point = self._start
+        self._energy = self._stored()
+        self._state = self._as_state(0, (0.0, 0.0, 0.0))
+        return self._state
 
     @property
     def state(self) -> State:
         """The last valid state."""
         return self._state
 
+    @property
+    def method(self) -> str:
+        """Name of the method in use."""
+        return self._journey.method
+
+    @property
+    def changes(self) -> list[Change]:
+        """Changes of method that auto has made: time [s], method, reason."""
+        return list(self._journey.changes)
+
+    @property
+    def error_estimate(self) -> float:
+        """Estimated global error of the orientation so far [rad].
+
+        A companion takes steps of twice the length; their difference, over 2^order - 1, is the
+        error of the run, rounding included where it is what the difference consists of.
+        """
+        return self._journey.errors(self._point)[0]
+
+    @property
+    def rate_error_estimate(self) -> float:
+        """Estimated global error of the body rate so far [rad/s]."""
+        return self._journey.errors(self._point)[1]
+
+    @property
+    def energy_residual(self) -> float:
+        """Energy now, less energy at the start, less the work done on the manipulator [J]."""
+        return self._stored() - self._energy - self._journey.work(self._point)
+
+    @property
+    def closure_residual(self) -> float:
+        """Largest abs(r_k . t_k): how far the loops are from closed."""
+        r = kinematics.carriage_directions(self.geometry, self._state.joints.gamma)
+        t = self.geometry.e @ rotation_matrix(self._state.quaternion).T
+        return float(np.abs(np.sum(r * t, axis=1)).max())
+
+    @property
+    def conditioning(self) -> dict[str, float]:
+        """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
+        r = kinematics.carriage_directions(self.geometry, self._state.joints.gamma)
+        t = self.geometry.e @ rotation_matrix(self._state.quaternion).T
+        determinant = float(np.linalg.det(np.cross(t, r)))
+        return {"sin_mu": min(map(math.sin, self._state.joints.mu)), "det_j2": determinant}
+
     def step(self, torque: Torque, dt_ns: int, moment: Triple = (0.0, 0.0, 0.0)) -> State:
-        """Advance by dt_ns [ns].
+        """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
         Args:
-            torque: commanded torques [N m], held constant or as a function of t [s].
-            dt_ns: length of the step [ns].
+            torque: commanded torques [N m], held constant, or a function of t [s], for which
+                explicit methods in plain Python are used.
+            dt_ns: length [ns], > 0.
             moment: external moment on the star in {B} [N m], used where the scene takes it from
                 a topic.
 
         Raises:
-            StrokeExceeded, WorkspaceLeft: the motion ends inside this step; when, the error says.
+            InputError: an argument is not finite, or dt_ns not positive.
+            StrokeExceeded, WorkspaceLeft, SingularityReached: the motion ends inside; when, the
+                error says.
             ImpactsAccumulate: impacts follow each other without end.
-            Diverged: the result is not finite. In all cases the state stays as it was.
+            Diverged: no step resolves the motion. In all cases the state stays as it was.
 
         """
-        start, h = self._state.time_ns / NANOSECONDS, dt_ns / NANOSECONDS
-        drive = self._drive(torque, moment)
-        resting = self._resting
+        _refuse_bad_input(torque, dt_ns, moment)
+        start = self._state.time_ns / NANOSECONDS
+        drive = (*moment,) if self.dynamics.moved else ()
         try:
             with np.errstate(all="ignore"):
-                at = self._through_impacts(h, start, drive)
-        except (ArithmeticError, ValueError):
-            self._resting = resting
-            raise Diverged("the step is not finite", start, self._state) from None
-        except RunStopped:
-            self._resting = resting
-            raise
-        self._y = at.y
-        self._state = self._as_state(self._state.time_ns + dt_ns, at, drive(start + h))
-        self.error_estimate += at.error
+                point = self._journey.travel(
+                    self._point, start, dt_ns / NANOSECONDS, torque, drive, self._state
+                )
+        except (CannotStep, ArithmeticError, ValueError) as error:
+            told = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
+            raise Diverged(f"{error or 'not finite'} ({told})", start, self._state) from None
+        self._point = point
+        time_ns = self._state.time_ns + dt_ns
+        asked = torque(time_ns / NANOSECONDS) if callable(torque) else torque
+        self._state = self._as_state(time_ns, self._journey.limited(asked))
         return self._state
 
-    def _through_impacts(self, h: float, start: float, drive: Callable[[float], Vector]) -> _Point:
-        """Go on to h; impacts on the way are part of it, the other limits are its end."""
-        at = self._point(0.0, self._y, 0.0)
-        reason = ""
-        for _ in range(_IMPACTS_PER_STEP):
-            at, hit = self._advance(at, h, start, drive)
-            if hit is None:
-                return at
-            if hit.error is not None:
-                raise hit.error(hit.reason, start + at.x, self._state)
-            at, reason = self._strike(at, hit), hit.reason
-        raise ImpactsAccumulate(reason, start + at.x, self._state)
+    def _stored(self) -> float:
+        size = len(self.dynamics.state)
+        kinetic, potential, _ = self.dynamics.energies(
+            *self._point.y[:size], *(0.0,) * len(self.dynamics.drive)
+        )
+        return kinetic + potential
 
-    def _advance(
-        self, at: _Point, h: float, start: float, drive: Callable[[float], Vector]
-    ) -> tuple[_Point, Limit | None]:
-        """Go on to h, or to the first limit that is met before."""
+    def _as_state(self, time_ns: int, torque: Triple) -> State:
+        y, at = self._point.y, self._point.joints
+        if len(self.dynamics.state) > 7:
+            torque = (y[7], y[8], y[9])
+        joints = Joints(*zip(at[::3], at[1::3], at[2::3], strict=True))
+        return State(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), joints, torque)
 
-        def rates(t: float, y: Vector) -> Sequence[float]:
-            slope = self.dynamics.derivative(*y, *drive(t))
-            legs = [limit.leg for limit in self._resting]
-            return self._ends.held(y, slope, legs)[0] if legs else slope
-
-        def after(x: float) -> _Point:
-            y, error = self._method.step(rates, start + at.x, at.y, x)
-            return self._point(at.x + x, y, at.error + error)
-
-        left = h - at.x
-        end = after(left)
-        first: tuple[float, Limit] | None = None
-        for limit in self._limits:
-            if not limit.may_be_crossed(at.joints, end.joints) or limit in self._resting:
-                continue
-            x = first_crossing(
-                lambda x: limit.margin(after(x).joints),  # noqa: B023
-                lambda x: limit.slope(after(x).joints),  # noqa: B023
-                left,
-            )
-            if x is not None and (first is None or x < first[0]):
-                first = (x, limit)
-        if first is not None:
-            return after(first[0]), first[1]
-        self._release(end, drive(start + h))
-        return end, None
-
-    def _strike(self, at: _Point, limit: Limit) -> _Point:
-        """Bounce off a limit, or come to rest where the bounce is not worth the name."""
-        restitution = self.scene.stroke.restitution or 0.0
-        if abs(limit.slope(at.joints)) * restitution < _RESTING_RATE:
-            restitution = 0.0
-            self._resting = (*self._resting, limit)
-        y = self._ends.after_impact(at.y, limit.leg, restitution)
-        return self._point(at.x, y, at.error)
-
-    def _release(self, at: _Point, drive: Vector) -> None:
-        """Let go of ends that would have to pull."""
-        if self._resting:
-            legs = [limit.leg for limit in self._resting]
-            slope = self.dynamics.derivative(*at.y, *drive)
-            torques = self._ends.held(at.y, slope, legs)[1]
-            pushing = zip(self._resting, torques, strict=True)
-            self._resting = tuple(limit for limit, torque in pushing if limit.sign * torque > 0.0)
-
-    def _drive(self, torque: Torque, moment: Triple) -> Callable[[float], Vector]:
-        """Give what acts from outside as a function of time; torques within their limit."""
-        limit = self.scene.actuators.torque_limit if self.scene.actuators else None
-        more = moment if self.dynamics.moved else ()
-
-        def limited(torques: Triple) -> Vector:
-            if limit is None:
-                return (*torques, *more)
-            clamped = [min(max(tau, -limit), limit) for tau in torques]
-            return (*clamped, *more)
-
-        if callable(torque):
-            return lambda t: limited(torque(t))
-        constant = limited(torque)
-        return lambda t: constant
-
-    def _point(self, x: float, y: Vector, error: float) -> _Point:
-        length = math.hypot(*y[:4])
-        if not all(map(math.isfinite, y)) or length == 0.0:
-            raise ArithmeticError
-        unit = (*(part / length for part in y[:4]), *y[4:])
-        return _Point(x, unit, self.dynamics.joints(*unit[:7]), error)
-
-    def _as_state(self, time_ns: int, at: _Point, drive: Vector) -> State:
-        qx, qy, qz, qw, wx, wy, wz, *lagged = at.y
-        t1, t2, t3 = lagged or drive[:3]
-        joints = Joints(*zip(at.joints[::3], at.joints[1::3], at.joints[2::3], strict=True))
-        return State(time_ns, (qx, qy, qz, qw), (wx, wy, wz), joints, (t1, t2, t3))
-
-    def _initial(self) -> tuple[Vector, State]:
+    def _initial(self) -> Point:
         initial = self.scene.initial
         gamma = np.array(initial.gamma)
         outside = np.any((gamma < 0) | (gamma > self.geometry.arc))
@@ -229,7 +209,16 @@ class Simulation:
         assembly = kinematics.admissible(self.geometry, gamma)
         posture = virtual_work.posture(self.geometry, gamma, assembly.rotation)
         rate = assembly.rotation.T @ posture.j @ np.array(initial.gamma_dot)
-        lagged = [0.0] * (len(self.dynamics.state) - 7)
-        y = (*quaternion_of(assembly.rotation).tolist(), *rate.tolist(), *lagged)
-        at = self._point(0.0, y, 0.0)
-        return at.y, self._as_state(0, at, (0.0, 0.0, 0.0))
+        return self._journey.begin([*quaternion_of(assembly.rotation).tolist(), *rate.tolist()])
+
+
+def _refuse_bad_input(torque: Torque, dt_ns: int, moment: Sequence[float]) -> None:
+    problems = []
+    if not callable(torque) and not (len(torque) == 3 and all(map(math.isfinite, torque))):
+        problems.append(Problem("torque", torque, "must be three finite numbers [N m]"))
+    if not all(map(math.isfinite, moment)):
+        problems.append(Problem("moment", moment, "must be three finite numbers [N m]"))
+    if dt_ns <= 0:
+        problems.append(Problem("dt_ns", dt_ns, "must be > 0 [ns]"))
+    if problems:
+        raise InputError("step", problems)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coefficients of the explicit Runge-Kutta methods, as data.
+"""Coefficients of the methods, as data.
 
 Sources: RK4, Kutta 1901. Dormand-Prince 5(4), J. Comput. Appl. Math. 6 (1980) 19-26. DOP853,
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 2nd ed., section II.10.
+RODAS4, Hairer & Wanner, Solving Ordinary Differential Equations II, 2nd ed., section VI.4.
 """
 
 from __future__ import annotations
@@ -218,4 +219,63 @@ DOP853 = Tableau(
     ),
 )
 
-METHODS = {method.name: method for method in (RK4, DORMAND_PRINCE, DOP853)}
+
+@dataclass(frozen=True)
+class Rosenbrock:
+    """A linearly implicit method in the form without matrix products; gamma is 1/4.
+
+    Attributes:
+        name: short name.
+        order: order of the solution that goes on.
+        error_order: order p of the error estimate.
+        a: weights of the stages in the arguments; the last two rows end in 1.
+        c: weights of the stages in the right-hand sides, over h.
+        alpha: nodes.
+        d: weights of the derivative by time.
+
+    """
+
+    name: str
+    order: int
+    error_order: int
+    a: tuple[tuple[float, ...], ...]
+    c: tuple[tuple[float, ...], ...]
+    alpha: tuple[float, ...]
+    d: tuple[float, ...]
+
+
+_RODAS_LAST = (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950)
+
+RODAS4 = Rosenbrock(
+    name="rodas4",
+    order=4,
+    error_order=3,
+    a=(
+        (),
+        (1.544,),
+        (0.9466785280815826, 0.2557011698983284),
+        (3.314825187068521, 2.896124015972201, 0.9986419139977817),
+        _RODAS_LAST,
+        (*_RODAS_LAST, 1.0),
+    ),
+    c=(
+        (),
+        (-5.6688,),
+        (-2.430093356833875, -0.2063599157091915),
+        (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
+        (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
+        (
+            8.083246795921522,
+            -7.981132988064893,
+            -31.52159432874371,
+            16.31930543123136,
+            -6.058818238834054,
+        ),
+    ),
+    alpha=(0.0, 0.386, 0.21, 0.63, 1.0, 1.0),
+    d=(0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0),
+)
+
+METHODS: dict[str, Tableau | Rosenbrock] = {
+    method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4)
+}

@@ -30,6 +30,11 @@ def exp(x: Any) -> Any:
     return math.exp(x) if type(x) is float else _other("exp", x)
 
 
+def sin(x: Any) -> Any:
+    """Sine."""
+    return math.sin(x) if type(x) is float else _other("sin", x)
+
+
 def positive(x: Any) -> Any:
     """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
     if type(x) is float:

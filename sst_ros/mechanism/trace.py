@@ -26,17 +26,11 @@ _TEMPLATES = {
     "sqrt": "sqrt({})",
     "tanh": "tanh({})",
     "exp": "exp({})",
+    "sin": "sin({})",
+    "cos": "cos({})",
     "atan2": "atan2({}, {})",
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
-}
-_FOLDS: dict[str, Callable[..., float]] = {
-    "sqrt": math.sqrt,
-    "tanh": math.tanh,
-    "exp": math.exp,
-    "atan2": math.atan2,
-    "positive": lambda x: max(x, 0.0),
-    "step": lambda x: float(x > 0.0),
 }
 
 
@@ -223,6 +217,8 @@ def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -
         "sqrt": lambda: 0.5 / here,
         "tanh": lambda: 1.0 - here * here,
         "exp": lambda: here,
+        "sin": lambda: x.traced("cos"),
+        "cos": lambda: -x.traced("sin"),
         "positive": lambda: x.traced("step"),
         "step": lambda: 0.0,
     }

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One module of source for a scene's functions and the loops around them, and two ways to run it.
+
+The text is the same for the interpreter and for numba, so both take the same operations in the
+same order. Under numba it is written to a cache folder whose file names are digests of the text
+and of all versions; a folder that cannot be written means compiling anew in this process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from sst_ros.integration import loops
+from sst_ros.integration.steps import explicit_step
+from sst_ros.integration.tableaux import Rosenbrock, Tableau
+from sst_ros.mechanism.trace import Program
+
+_EXPLICIT = (loops.size_of, loops.normalise, loops.pair, loops.march)
+_IMPLICIT = (loops.factorise, loops.substitute, loops.attempt_linearly_implicit, *_EXPLICIT)
+
+_PLAIN = """\
+from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
+
+def vector(n):
+    return [0.0] * n
+
+def square(n):
+    return [[0.0] * n for _ in range(n)]
+
+def rows(m, n):
+    return [[0.0] * n for _ in range(m)]
+"""
+
+_NUMBA = """\
+from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
+import numba
+import numpy as np
+
+jit = numba.njit(cache={cache}, error_model="numpy")
+
+@jit
+def vector(n):
+    return np.zeros(n)
+
+@jit
+def square(n):
+    return np.zeros((n, n))
+
+@jit
+def rows(m, n):
+    return np.zeros((m, n))
+"""
+
+
+def numba_version() -> str | None:
+    """Version of numba, None where it is not installed or SST_ROS_NUMBA=0 says not to use it."""
+    if os.environ.get("SST_ROS_NUMBA") == "0" or importlib.util.find_spec("numba") is None:
+        return None
+    import numba
+
+    return str(numba.__version__)
+
+
+def source(
+    program: Program, jacobian: Program | None, method: Tableau | Rosenbrock, size: int, drive: int
+) -> list[str]:
+    """Functions of the module, one text each, in the order in which they need each other.
+
+    Args:
+        program: derivative of the state; inputs t, state, drive.
+        jacobian: derivative, and its derivatives by t and by each state; for implicit methods.
+        method: the integrator.
+        size: numbers in the state.
+        drive: numbers in the drive.
+
+    """
+    y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(drive)]
+    texts = [program.source("rhs")]
+    if isinstance(method, Tableau):
+        new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
+        texts += [explicit_step(method, size, drive), _attempt(y, d, new)]
+        return texts + [inspect.getsource(function) for function in _EXPLICIT]
+    assert jacobian is not None
+    slope = [f"slope[{i}]" for i in range(size)]
+    outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
+    outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
+    inputs = ", ".join(["t", *y, *d])
+    texts += [
+        jacobian.source("jacobian"),
+        f"def linearise(t, y, d, slope, by_time, matrix):\n"
+        f"    ({', '.join(outputs)},) = jacobian({inputs})\n",
+        f"def evaluate(t, y, d, slope):\n    ({', '.join(slope)},) = rhs({inputs})\n",
+    ]
+    functions = [inspect.getsource(function) for function in _IMPLICIT]
+    return texts + [text.replace("attempt_linearly_implicit", "attempt") for text in functions]
+
+
+def load(texts: list[str], constants: dict[str, Any], *, numba: bool) -> ModuleType:
+    """Turn function texts into a module, for the interpreter or compiled by numba."""
+    named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
+    if not numba:
+        return _executed("\n".join([_PLAIN, named, *texts]), "sst_ros_plain")
+    body = "\n".join([named, *(f"@jit\n{text}" for text in texts)])
+    cached = _NUMBA.format(cache=True) + body
+    path = _cached_file(cached)
+    if path is None:
+        return _executed(_NUMBA.format(cache=False) + body, "sst_ros_compiled")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # numba finds the module again when it loads from its cache.
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
+    call = f"step({', '.join(['t', 'h', *y, *d])})"
+    return f"def attempt(t, h, y, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
+
+
+def _executed(text: str, name: str) -> ModuleType:
+    module = ModuleType(name)
+    exec(compile(text, f"<{name}>", "exec"), module.__dict__)
+    return module
+
+
+def _cached_file(text: str) -> Path | None:
+    """File that holds `text`; None where no folder for it can be written."""
+    import numpy
+
+    versions = (sys.version, numba_version(), numpy.__version__, platform.machine())
+    digest = hashlib.sha256("\n".join([text, *map(str, versions)]).encode()).hexdigest()[:24]
+    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sst_ros"
+    path = Path(os.environ.get("SST_ROS_CACHE") or default) / f"sst_{digest}.py"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            # Two processes may write at once: each its own file, then one atomic rename.
+            with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
+                file.write(text)
+            Path(file.name).replace(path)
+        with tempfile.TemporaryFile(dir=path.parent):
+            return path
+    except (OSError, RuntimeError):
+        return None
+
+
+Loop = Callable[..., Any]

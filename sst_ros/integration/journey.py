@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way of a scene's state through one control period: steps, limits, impacts, rest at ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sst_ros.errors import ImpactsAccumulate
+from sst_ros.integration.events import first_crossing
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import METHODS, Rosenbrock
+from sst_ros.integration.walk import Change, Leg, Walk
+from sst_ros.limits import Limit, limits_of
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.compiled import compiled as plain
+from sst_ros.mechanism.contacts import RigidEnds
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Scene
+
+if TYPE_CHECKING:
+    from sst_ros.simulation import State, Torque, Triple
+
+_IMPACTS_PER_PERIOD = 1000
+_RESTING_RATE = 1e-7
+_ROUNDING = 64 * 2.220446049250313e-16
+
+
+class Point(NamedTuple):
+    """State y, companion z and joints (nine angles, nine rates) at one instant."""
+
+    y: list[float]
+    z: list[float]
+    joints: tuple[float, ...]
+
+
+class Journey:
+    """Travels through control periods; between them it keeps what rests against an end."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        geometry: Geometry,
+        dynamics: Dynamics,
+        integrator: str,
+        tolerance: float,
+        *,
+        compiled: bool,
+    ) -> None:
+        self._scene = scene
+        self._dynamics = dynamics
+        self._system = System(dynamics, work=True)
+        self._limits = tuple(limits_of(scene, geometry))
+        self._ends = RigidEnds(dynamics)
+        self._limit = scene.actuators.torque_limit if scene.actuators else None
+        self._walk = Walk(self._system, integrator, tolerance, compiled=compiled)
+        explicit = integrator if not isinstance(METHODS.get(integrator), Rosenbrock) else "auto"
+        # Torques that are functions, and ends that hold: the slope is put together in Python.
+        self._slow = Walk(self._system, explicit, tolerance, compiled=False, slope=self._slope)
+        self._rhs: Callable[..., tuple[float, ...]] | None = None
+        self._torque: Callable[[float], Triple] | None = None
+        self._start = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what has happened."""
+        self._resting: tuple[Limit, ...] = ()
+        self._legs = 0
+        self._lost = 0.0
+        self._order = 99
+        self._walk.history.clear()
+
+    @property
+    def method(self) -> str:
+        """Name of the method in use."""
+        return self._walk.method.name
+
+    @property
+    def changes(self) -> list[Change]:
+        """Changes of method."""
+        return self._walk.history
+
+    def begin(self, y: list[float]) -> Point:
+        """Complete quaternion and body rate to a state; no torque yet, no work done."""
+        full = [*y, *(0.0,) * (len(self._system.state) - 7)]
+        return Point(full, list(full), self._dynamics.joints(*full[:7]))
+
+    def limited(self, torque: Triple) -> Triple:
+        """Clamp torques to the limit of the actuators."""
+        if self._limit is None:
+            return torque
+        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in torque)
+        return (first, second, third)
+
+    def errors(self, at: Point) -> tuple[float, float]:
+        """Estimated global errors of orientation [rad] and body rate [rad/s]."""
+        ahead = math.dist(at.y[:4], at.z[:4]), math.dist(at.y[:4], [-x for x in at.z[:4]])
+        apart = (2.0 * min(ahead), math.dist(at.y[4:7], at.z[4:7]))
+        rounding = _ROUNDING * math.sqrt(self._legs + 1.0)
+        share = 1.0 / (2.0**self._order - 1.0)
+        scale = (1.0, max(1.0, math.hypot(*at.y[4:7])))
+        first, second = (
+            max(d * share, min(d, rounding * s)) for d, s in zip(apart, scale, strict=True)
+        )
+        return first, second
+
+    def work(self, at: Point) -> float:
+        """Work done on the manipulator, less what friction and impacts have taken [J]."""
+        return at.y[-1] - self._lost
+
+    def travel(
+        self,
+        at: Point,
+        start: float,
+        h: float,
+        torque: Torque,
+        more: tuple[float, ...],
+        state: State,
+    ) -> Point:
+        """Go on from `at` by h [s]; impacts on the way are part of it, other limits its end.
+
+        Raises:
+            RunStopped: a limit was met; it carries `state`, and nothing has changed.
+            CannotStep: no step resolves the motion.
+
+        """
+        kept = self._resting, self._lost, self._legs, self._order
+        self._start = start
+        self._torque = torque if callable(torque) else None
+        drive = (*((0.0,) * 3 if callable(torque) else self.limited(torque)), *more)
+        try:
+            x = 0.0
+            for _ in range(_IMPACTS_PER_PERIOD):
+                at, x, hit = self._until_limit(at, x, h, drive)
+                if hit is None:
+                    self._release(at, h, drive)
+                    return at
+                if hit.error is not None:
+                    raise hit.error(hit.reason, start + x, state)
+                at, reason = self._strike(at, hit), hit.reason
+            raise ImpactsAccumulate(reason, start + x, state)
+        except Exception:
+            self._resting, self._lost, self._legs, self._order = kept
+            raise
+
+    def _until_limit(
+        self, at: Point, x: float, h: float, drive: tuple[float, ...]
+    ) -> tuple[Point, float, Limit | None]:
+        """Go on from x to h, or to the first limit that is met before."""
+        slow = self._torque is not None or bool(self._resting)
+        walk = self._slow if slow else self._walk
+        for leg in walk.legs(x, h, at.y, at.z, drive):
+            self._legs += 1
+            self._order = min(self._order, walk.method.order)
+            joints = self._dynamics.joints(*leg.y[:7])
+            near = [
+                limit
+                for limit in self._limits
+                if limit.may_be_crossed(at.joints, joints) and limit not in self._resting
+            ]
+            met = self._first_met(near, walk, leg, at, drive) if near else None
+            if met is not None:
+                leg = walk.retake(leg.t, met[0], at.y, at.z, drive)
+                return self._point(leg), leg.t + met[0], met[1]
+            at = Point(leg.y, leg.z, joints)
+        return at, h, None
+
+    def _first_met(
+        self, near: list[Limit], walk: Walk, leg: Leg, at: Point, drive: tuple[float, ...]
+    ) -> tuple[float, Limit] | None:
+        def joints(x: float) -> tuple[float, ...]:
+            return self._dynamics.joints(*walk.retake(leg.t, x, at.y, at.z, drive).y[:7])
+
+        met = []
+        for limit in near:
+            x = first_crossing(
+                lambda x: limit.margin(joints(x)),  # noqa: B023
+                lambda x: limit.slope(joints(x)),  # noqa: B023
+                leg.h,
+            )
+            if x is not None:
+                met.append((x, limit))
+        return min(met, key=lambda pair: pair[0]) if met else None
+
+    def _strike(self, at: Point, limit: Limit) -> Point:
+        """Bounce off a limit, or come to rest where the bounce is not worth the name."""
+        restitution = self._scene.stroke.restitution or 0.0
+        if abs(limit.slope(at.joints)) * restitution < _RESTING_RATE:
+            restitution = 0.0
+            self._resting = (*self._resting, limit)
+        before = self._kinetic(at.y)
+        y = list(self._ends.after_impact(tuple(at.y), limit.leg, restitution))
+        z = list(self._ends.after_impact(tuple(at.z), limit.leg, restitution))
+        self._lost += before - self._kinetic(y)
+        return Point(y, z, self._dynamics.joints(*y[:7]))
+
+    def _release(self, at: Point, h: float, drive: tuple[float, ...]) -> None:
+        """Let go of ends that would have to pull."""
+        if self._resting:
+            legs = [limit.leg for limit in self._resting]
+            slope = self._free_slope(h, *at.y, *drive)
+            torques = self._ends.held(tuple(at.y), slope, legs)[1]
+            pushing = zip(self._resting, torques, strict=True)
+            self._resting = tuple(limit for limit, torque in pushing if limit.sign * torque > 0.0)
+
+    def _slope(self, t: float, *inputs: Any) -> tuple[float, ...]:
+        """Differentiate the state under torques that are a function, or held by ends."""
+        slope = self._free_slope(t, *inputs)
+        if not self._resting:
+            return slope
+        legs = [limit.leg for limit in self._resting]
+        return self._ends.held(inputs[: len(self._system.state)], slope, legs)[0]
+
+    def _free_slope(self, t: float, *inputs: Any) -> tuple[float, ...]:
+        if self._rhs is None:
+            self._rhs = plain(self._system.program)
+        if self._torque is not None:
+            size = len(self._system.state)
+            torque = self.limited(self._torque(self._start + t))
+            inputs = (*inputs[:size], *torque, *inputs[size + 3 :])
+        return self._rhs(t, *inputs)
+
+    def _kinetic(self, y: list[float]) -> float:
+        size = len(self._dynamics.state)
+        return self._dynamics.energies(*y[:size], *(0.0,) * len(self._dynamics.drive))[0]
+
+    def _point(self, leg: Leg) -> Point:
+        return Point(leg.y, leg.z, self._dynamics.joints(*leg.y[:7]))

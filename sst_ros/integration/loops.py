@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
+"""Loops around a step, as text: `backend` puts them behind a scene's functions and runs them.
+
+They run on lists as plain Python and on arrays under numba. Names that are not defined here come
+from the module that `backend` writes.
+"""
+# ruff: noqa: F821
+
+from __future__ import annotations
+
+
+def pair(t, h, y, z, d, new_y, new_z, error):
+    """Advance y by two steps of h / 2 and its companion z by one of h (global Richardson).
+
+    Returns the size of the local error estimate of y, relative to a tolerance of 1.
+    """
+    middle = vector(SIZE)
+    other = vector(SIZE)
+    attempt(t, 0.5 * h, y, d, middle, error)
+    first = size_of(error, y, middle, h)
+    attempt(t + 0.5 * h, 0.5 * h, middle, d, new_y, error)
+    second = size_of(error, middle, new_y, h)
+    attempt(t, h, z, d, new_z, other)
+    normalise(new_y)
+    normalise(new_z)
+    return first + second
+
+
+def size_of(error, old, new, h):
+    """Largest error relative to what it is an error of; infinite where it has no value.
+
+    Quaternion: absolute. Rate: relative to its length, but not below 1e-3 rad a step, so that rest
+    can be reached. Lagging torques: relative to the largest of them. Work is not looked at.
+    """
+    largest = 0.0
+    for i in range(4):
+        largest = max(largest, abs(error[i]))
+    length, floor, worst = 0.0, 1e-3 / abs(h), 0.0
+    for i in range(4, 7):
+        length = max(length, abs(old[i]), abs(new[i]))
+        worst = max(worst, abs(error[i]))
+    largest = max(largest, worst / max(length, floor))
+    torque, worst = 1e-300, 0.0
+    for i in range(7, 7 + LAG):
+        torque = max(torque, abs(old[i]), abs(new[i]))
+        worst = max(worst, abs(error[i]))
+    largest = max(largest, worst / torque)
+    total = 0.0
+    for i in range(SIZE):
+        total += new[i] + error[i]
+    return largest if total - total == 0.0 else INFINITE
+
+
+def normalise(y):
+    """Give the quaternion length 1."""
+    factor = 1.0 / sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2] + y[3] * y[3])
+    for i in range(4):
+        y[i] = y[i] * factor
+
+
+def march(t, h, count, y, d, new_y):
+    """Advance y by `count` steps of h; the error estimates are not looked at."""
+    error = vector(SIZE)
+    for i in range(SIZE):
+        new_y[i] = y[i]
+    for k in range(count):
+        attempt(t + k * h, h, new_y, d, new_y, error)
+        normalise(new_y)
+
+
+def attempt_linearly_implicit(t, h, y, d, new_y, error):
+    """One step of RODAS4 (Hairer & Wanner, Solving ODEs II, section VI.4), exact Jacobian.
+
+    Order 4, L-stable, stiffly accurate; the error estimate is of order 3.
+    """
+    matrix = square(SIZE)
+    slope = vector(SIZE)
+    by_time = vector(SIZE)
+    pivot = vector(SIZE)
+    linearise(t, y, d, slope, by_time, matrix)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            matrix[i][j] = -matrix[i][j]
+        matrix[i][i] += 1.0 / (0.25 * h)
+    factorise(matrix, pivot)
+    u = rows(6, SIZE)
+    at = vector(SIZE)
+    right = vector(SIZE)
+    for stage in range(6):
+        for i in range(SIZE):
+            at[i] = y[i]
+        for j in range(stage):
+            for i in range(SIZE):
+                at[i] += RODAS_A[stage][j] * u[j][i]
+        if stage:
+            evaluate(t + RODAS_ALPHA[stage] * h, at, d, slope)
+        for i in range(SIZE):
+            right[i] = slope[i] + h * RODAS_D[stage] * by_time[i]
+            for j in range(stage):
+                right[i] += RODAS_C[stage][j] / h * u[j][i]
+        substitute(matrix, pivot, right)
+        for i in range(SIZE):
+            u[stage][i] = right[i]
+    for i in range(SIZE):
+        new_y[i] = at[i] + u[5][i]
+        error[i] = u[5][i]
+
+
+def factorise(a, pivot):
+    """LU decomposition with partial pivoting, in place."""
+    for k in range(SIZE):
+        best = k
+        for i in range(k + 1, SIZE):
+            if abs(a[i][k]) > abs(a[best][k]):
+                best = i
+        pivot[k] = best
+        if best != k:
+            for j in range(SIZE):
+                a[k][j], a[best][j] = a[best][j], a[k][j]
+        for i in range(k + 1, SIZE):
+            factor = a[i][k] / a[k][k]
+            a[i][k] = factor
+            for j in range(k + 1, SIZE):
+                a[i][j] -= factor * a[k][j]
+
+
+def substitute(a, pivot, b):
+    """Solve with the decomposition of `factorise`, in place."""
+    for k in range(SIZE):
+        best = int(pivot[k])
+        b[k], b[best] = b[best], b[k]
+        for i in range(k + 1, SIZE):
+            b[i] -= a[i][k] * b[k]
+    for k in range(SIZE - 1, -1, -1):
+        for j in range(k + 1, SIZE):
+            b[k] -= a[k][j] * b[j]
+        b[k] /= a[k][k]
