@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from sst_ros.errors import RunStopped, StrokeExceeded, WorkspaceLeft
+from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene import Scene
+
+
+SINGULAR_MU = 1e-6
+"""Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
 
 
 class Limit(NamedTuple):
@@ -49,9 +54,12 @@ class Limit(NamedTuple):
 
 
 def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield the ends that the scene neither ignores nor makes elastic."""
+    """Yield serial singularities, and the ends that the scene neither ignores nor makes elastic."""
     stroke: type[RunStopped] | None = StrokeExceeded if scene.stroke.at_end == "stop" else None
     for k in range(3):
+        name = f"serial singularity, mu_{k + 1}"
+        yield Limit(f"{name} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
+        yield Limit(f"{name} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
         if scene.stroke.at_end in ("stop", "impact"):
             arc, name = float(geometry.arc[k]), f"gamma_{k + 1}"
             yield Limit(f"{name} < 0", stroke, k, 1.0, 0.0)

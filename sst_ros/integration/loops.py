@@ -22,9 +22,11 @@ def pair(t, h, y, z, d, new_y, new_z, error):
     attempt(t + 0.5 * h, 0.5 * h, middle, d, new_y, error)
     second = size_of(error, middle, new_y, h)
     attempt(t, h, z, d, new_z, other)
+    # In proportion, so that it counts only where the longer step is unstable.
+    companion = size_of(other, z, new_z, h) * SHARE
     normalise(new_y)
     normalise(new_z)
-    return first + second
+    return max(first + second, companion)
 
 
 def size_of(error, old, new, h):
@@ -116,7 +118,7 @@ def factorise(a, pivot):
                 best = i
         pivot[k] = best
         if best != k:
-            for j in range(SIZE):
+            for j in range(k, SIZE):
                 a[k][j], a[best][j] = a[best][j], a[k][j]
         for i in range(k + 1, SIZE):
             factor = a[i][k] / a[k][k]

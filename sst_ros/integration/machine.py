@@ -88,7 +88,8 @@ class Machine:
 
     def _constants(self) -> dict[str, Any]:
         lag = 3 if set(LAG) <= set(self.system.state) else 0
-        constants: dict[str, Any] = {"SIZE": len(self.system.state), "LAG": lag}
+        share = 0.5**self.method.error_order
+        constants: dict[str, Any] = {"SIZE": len(self.system.state), "LAG": lag, "SHARE": share}
         if isinstance(self.method, Rosenbrock):
             # numba wants rows of one length.
             padded = [
