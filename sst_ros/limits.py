@@ -11,7 +11,6 @@ from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, Works
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene import Scene
 
-
 SINGULAR_MU = 1e-6
 """Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
 
