@@ -115,6 +115,27 @@ def load(texts: list[str], constants: dict[str, Any], *, numba: bool) -> ModuleT
     path = _cached_file(cached)
     if path is None:
         return _executed(_NUMBA.format(cache=False) + body, "sst_ros_compiled")
+    return _imported(path)
+
+
+def load_parallel(texts: list[str], last: str) -> ModuleType:
+    """Compile texts of a batch; the last function runs its loop over blocks on all cores."""
+    heads = [_NUMBA.format(cache=cache) + "from numba import prange\n" for cache in (True, False)]
+    parallel = '\n@numba.njit(cache={}, error_model="numpy", parallel=True)\n'
+    bodies = [
+        "\n".join([head, *texts, parallel.format(cache) + last])
+        for head, cache in zip(heads, (True, False), strict=True)
+    ]
+    path = _cached_file(bodies[0])
+    return _imported(path) if path else _executed(bodies[1], "sst_ros_batch")
+
+
+def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
+    call = f"step({', '.join(['t', 'h', *y, *d])})"
+    return f"def attempt(t, h, y, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
+
+
+def _imported(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -122,11 +143,6 @@ def load(texts: list[str], constants: dict[str, Any], *, numba: bool) -> ModuleT
     sys.modules[path.stem] = module
     spec.loader.exec_module(module)
     return module
-
-
-def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
-    call = f"step({', '.join(['t', 'h', *y, *d])})"
-    return f"def attempt(t, h, y, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
 
 
 def _executed(text: str, name: str) -> ModuleType:

@@ -8,8 +8,6 @@ inverse kinematics has one answer, and over gamma, where the direct kinematics h
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.assemblies import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.progress import slices
 
 _BLOCK = 20_000
 
@@ -150,7 +149,7 @@ def over_orientations(
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     psi = np.asarray((np.arange(turns) + 0.5) * (2.0 * np.pi / turns) - np.pi, dtype=float)
     parts = []
-    for block in _blocks(len(directions), max(1, _BLOCK // turns), "orientations", progress):
+    for block in slices(len(directions), max(1, _BLOCK // turns), "orientations", progress):
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         parts.append(measures(geometry, gamma, rotation))
@@ -166,7 +165,7 @@ def over_gamma(geometry: Geometry, points: int = 24, progress: bool = False) -> 
     gamma = grid.reshape(-1, 3)
     count = np.zeros(len(gamma), dtype=np.intp)
     rotation = np.full((len(gamma), 3, 3), np.nan)
-    for block in _blocks(len(gamma), 2000, "gamma", progress):
+    for block in slices(len(gamma), 2000, "gamma", progress):
         found = kinematics.direct_many(geometry, gamma[block])
         valid = found.admissible
         owner, candidates = found.configuration[valid] + block.start, found.rotation[valid]
@@ -229,15 +228,3 @@ def _measures(arrays: tuple[Array, ...]) -> Measures:
 def _joined(parts: list[Measures]) -> Measures:
     names = Measures.__dataclass_fields__
     return _measures(tuple(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
-
-def _blocks(total: int, size: int, label: str, progress: bool) -> Iterator[slice]:
-    """Slices of `size`, with a bar on stderr if it is wanted and stderr is a terminal."""
-    shown = progress and sys.stderr.isatty()
-    for start in range(0, total, size):
-        yield slice(start, min(start + size, total))
-        if shown:
-            done = min(start + size, total)
-            bar = "#" * (40 * done // total)
-            end = "\n" if done == total else ""
-            print(f"\r{label} [{bar:40}] {100 * done // total:3d} %", end=end, file=sys.stderr)

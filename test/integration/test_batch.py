@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+import numba
+import numpy as np
+import pytest
+
+from sst_ros import Simulation, load_scene
+from sst_ros.control.torque import sine
+from sst_ros.errors import InputError, RunStopped
+from sst_ros.integration.batch import Batch
+from sst_ros.scene import Initial
+
+EXAMPLE2 = load_scene("example2")
+N = 100
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return Batch(EXAMPLE2, profile=True)
+
+
+@pytest.fixture(scope="module")
+def gamma():
+    starts = np.random.default_rng(5).uniform(0.6, 1.0, (N, 3))
+    starts[7] = (0.05, 0.05, 1.5)  # no admissible assembly
+    return starts
+
+
+@pytest.fixture(scope="module")
+def result(batch, gamma):
+    return batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100, keep_every=25)
+
+
+def single(gamma):
+    from dataclasses import replace
+
+    simulation = Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))), "dop853")
+    torque = sine(EXAMPLE2.torque)
+    try:
+        for _ in range(100):
+            simulation.step(torque, 10_000_000)
+    except RunStopped as stopped:
+        return simulation.state, stopped
+    return simulation.state, None
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5])
+def test_a_scenario_equals_a_run_of_its_own(result, gamma, n):
+    state, stopped = single(gamma[n])
+    sign = np.sign(result.quaternion[n] @ state.quaternion)
+    np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=1e-10)
+    np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=1e-9)
+    assert result.fault[n] == ("" if stopped is None else stopped.reason)
+    if stopped is not None:
+        assert 0.0 <= result.fault_time[n] - stopped.time <= 0.01 + 1e-12
+
+
+def test_faults_stay_with_their_scenario(result):
+    assert result.fault[7] == "no unique admissible assembly"
+    assert 0 < sum(map(bool, result.fault)) < N
+    assert np.all(np.isfinite(result.quaternion))
+    assert np.all(np.isfinite(result.body_rate))
+    ended = np.array([bool(text) for text in result.fault])
+    assert np.array_equal(np.isfinite(result.fault_time), ended)
+
+
+def test_threads_change_no_bit(batch, gamma, result):
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    again = batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100)
+    numba.set_num_threads(threads)
+    assert np.array_equal(again.quaternion, result.quaternion)
+    assert np.array_equal(again.body_rate, result.body_rate)
+    assert again.fault == result.fault
+
+
+def test_trajectories_are_kept_when_asked_for(result, gamma):
+    assert result.kept.shape == (5, N, 7)
+    assert np.array_equal(result.kept[-1, :, :4], result.quaternion)
+    assert np.all(np.isfinite(result.kept))
+
+
+def test_its_local_error_is_told_and_small(result):
+    started = np.array([text != "no unique admissible assembly" for text in result.fault])
+    assert np.all(result.local_error[started] < 1e-9)
+    assert np.all(result.local_error[started] > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (((np.zeros((2, 2))), (0, 0, 0)), r"gamma = \(2, 2\): must have the shape"),
+        ((np.full((2, 3), np.nan), (0, 0, 0)), "(?s)gamma = .*must be finite"),
+        ((np.full((2, 3), 0.8), np.zeros((3, 3))), r"gamma_dot = \(3, 3\): must have the shape"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(batch, arguments, said):
+    with pytest.raises(InputError, match=said):
+        batch.run(*arguments, step=0.01, count=1)
+
+
+def test_scenes_that_a_batch_cannot_run_are_refused():
+    with pytest.raises(InputError, match=r"stroke.at_end = 'impact': must not be impact"):
+        Batch(load_scene("impacts"))
+    with pytest.raises(InputError, match="torque = None: must be given"):
+        Batch(load_scene("stiff"), profile=True)
