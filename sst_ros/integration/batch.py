@@ -119,7 +119,7 @@ class Batch:
         size = keep_every or max(1, count // _CHUNKS)
         for part in slices(count, size, self.scene.name, progress):
             span = part.stop - part.start
-            self._module.batch(part.start * step, step, span, start, given, code, when, error)
+            self._module.batch(step, part.start, span, start, given, code, when, error)
             if keep_every and span == keep_every:
                 kept.append(start[:7].T.copy())
         when[code == _NO_START] = 0.0

@@ -15,7 +15,7 @@ NOT_FINITE = 1000
 
 
 def batch_source(program: Program, margins: Program, tableau: Tableau, size: int) -> list[str]:
-    """Texts of a module whose `batch(t, h, count, y, d, code, when, error)` runs all lanes.
+    """Texts of a module whose `batch(h, first, count, y, d, code, when, error)` runs all lanes.
 
     Args:
         program: derivative; inputs t, state, drive.
@@ -92,14 +92,14 @@ def step(t, h, y, d, k, s, new, e, lanes):
 def _block(size: int, drive: int, margin_count: int, stages: int) -> str:
     return f"""\
 @jit
-def block(t, h, count, y, d, code, when, error, lanes):
+def block(h, first, count, y, d, code, when, error, lanes):
     k = np.empty(({stages}, {size}, {LANES}))
     s = np.empty(({size}, {LANES}))
     new = np.empty(({size}, {LANES}))
     e = np.empty(({size}, {LANES}))
     far = np.empty(({margin_count}, {LANES}))
     for n in range(count):
-        step(t + n * h, h, y, d, k, s, new, e, lanes)
+        step((first + n) * h, h, y, d, k, s, new, e, lanes)
         for i in range(lanes):
             x0, x1, x2, x3 = new[0, i], new[1, i], new[2, i], new[3, i]
             scale = 1.0 / sqrt(x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3)
@@ -123,7 +123,7 @@ def block(t, h, count, y, d, code, when, error, lanes):
                         found = j + 1
             if found != 0:
                 code[i] = found
-                when[i] = t + (n + 1) * h
+                when[i] = (first + n + 1) * h
                 continue
             for j in range({size}):
                 y[j, i] = new[j, i]
@@ -134,7 +134,7 @@ def block(t, h, count, y, d, code, when, error, lanes):
 def driver() -> str:
     """Source of the loop over blocks, for all cores."""
     return f"""\
-def batch(t, h, count, y, d, code, when, error):
+def batch(h, first, count, y, d, code, when, error):
     blocks = (y.shape[1] + {LANES - 1}) // {LANES}
     for b in prange(blocks):
         lo = b * {LANES}
@@ -144,6 +144,6 @@ def batch(t, h, count, y, d, code, when, error):
         given = np.empty((d.shape[0], {LANES}))
         part[:, :lanes] = y[:, lo:hi]
         given[:, :lanes] = d[:, lo:hi]
-        block(t, h, count, part, given, code[lo:hi], when[lo:hi], error[lo:hi], lanes)
+        block(h, first, count, part, given, code[lo:hi], when[lo:hi], error[lo:hi], lanes)
         y[:, lo:hi] = part[:, :lanes]
 """
