@@ -52,6 +52,27 @@ class Limit(NamedTuple):
         return self.margin(end) < 0.0 or turned or self.margin(begin) <= 0.0
 
 
+def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
+    """Joint, lower and upper end of what the limits allow; infinite where there is none."""
+    found: dict[int, tuple[float, float]] = {}
+    for limit in limits:
+        low, high = found.get(limit.joint, (-math.inf, math.inf))
+        found[limit.joint] = (limit.end, high) if limit.sign > 0.0 else (low, limit.end)
+    return [(joint, low, high) for joint, (low, high) in found.items()]
+
+
+def all_far(
+    ranges: list[tuple[int, float, float]], begin: Sequence[float], end: Sequence[float]
+) -> bool:
+    """Say quickly that no limit may have been crossed: inside at both ends, no rate turned."""
+    for joint, low, high in ranges:
+        if not (low < begin[joint] < high and low <= end[joint] <= high):
+            return False
+        if begin[joint + 9] * end[joint + 9] < 0.0:
+            return False
+    return True
+
+
 def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
     """Yield serial singularities, and the ends that the scene neither ignores nor makes elastic."""
     stroke: type[RunStopped] | None = StrokeExceeded if scene.stroke.at_end == "stop" else None

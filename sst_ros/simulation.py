@@ -90,6 +90,7 @@ class Simulation:
             scene, self.geometry, self.dynamics, integrator, tolerance, compiled=compiled
         )
         self._start = self._initial()
+        self._given: tuple[Torque, tuple[float, ...]] = ((0.0, 0.0, 0.0), ())
         self.reset()
 
     def reset(self) -> State:
@@ -97,7 +98,8 @@ class Simulation:
         self._journey.reset()
         self._point = self._start
         self._energy = self._stored()
-        self._state = self._as_state(0, (0.0, 0.0, 0.0))
+        self._state = self._as_state(0, (0.0, 0.0, 0.0), self._point)
+        self._before, self._last = self._point, self._state
         return self._state
 
     @property
@@ -178,11 +180,34 @@ class Simulation:
         except (CannotStep, ArithmeticError, ValueError) as error:
             told = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
             raise Diverged(f"{error or 'not finite'} ({told})", start, self._state) from None
+        self._before, self._last, self._given = self._point, self._state, (torque, drive)
         self._point = point
         time_ns = self._state.time_ns + dt_ns
         asked = torque(time_ns / NANOSECONDS) if callable(torque) else torque
-        self._state = self._as_state(time_ns, self._journey.limited(asked))
+        self._state = self._as_state(time_ns, self._journey.limited(asked), point)
         return self._state
+
+    def within(self, time_ns: int) -> State:
+        """State at a time inside the last step, to the full accuracy of the run.
+
+        It is stepped to from the beginning of that step, under the torques that were given.
+
+        Raises:
+            InputError: the time is not inside the last step.
+
+        """
+        began, end = self._last.time_ns, self._state.time_ns
+        if not began <= time_ns <= end:
+            allowed = f"must lie in the last step, {began} to {end} ns"
+            raise InputError("within", [Problem("time_ns", time_ns, allowed)])
+        if time_ns == began:
+            return self._last
+        torque, more = self._given
+        h = (time_ns - began) / NANOSECONDS
+        start = began / NANOSECONDS
+        point = self._journey.revisited(self._before, start, h, torque, more, self._last)
+        asked = torque(time_ns / NANOSECONDS) if callable(torque) else torque
+        return self._as_state(time_ns, self._journey.limited(asked), point)
 
     def _stored(self) -> float:
         size = len(self.dynamics.state)
@@ -191,8 +216,8 @@ class Simulation:
         )
         return kinetic + potential
 
-    def _as_state(self, time_ns: int, torque: Triple) -> State:
-        y, at = self._point.y, self._point.joints
+    def _as_state(self, time_ns: int, torque: Triple, point: Point) -> State:
+        y, at = point.y, point.joints
         if len(self.dynamics.state) > 7:
             torque = (y[7], y[8], y[9])
         joints = Joints(*zip(at[::3], at[1::3], at[2::3], strict=True))

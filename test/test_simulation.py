@@ -239,3 +239,24 @@ def test_a_start_outside_an_ignored_stroke_is_taken():
 def test_a_start_without_admissible_assembly_is_refused():
     with pytest.raises(NoAdmissibleAssembly, match="gamma = "):
         Simulation(replace(EXAMPLE2, initial=Initial(gamma=(0.05, 0.05, 1.5))))
+
+
+@pytest.mark.parametrize("name", ["example2", "impacts", "friction"])
+def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
+    scene = load(name)
+    torque = sine(scene.torque)
+    simulation, other = Simulation(scene), Simulation(scene)
+    for _ in range(9):
+        simulation.step(torque, 100 * MILLISECOND)
+        other.step(torque, 100 * MILLISECOND)
+    simulation.step(torque, 100 * MILLISECOND)
+    end, estimate = simulation.state, simulation.error_estimate
+    found = simulation.within(930 * MILLISECOND)
+    expected = other.step(torque, 30 * MILLISECOND)
+    np.testing.assert_allclose(found.joints.gamma, expected.joints.gamma, atol=1e-8)
+    assert found.time_ns == expected.time_ns
+    assert simulation.state is end
+    assert simulation.error_estimate == estimate
+    assert simulation.within(900 * MILLISECOND).time_ns == 900 * MILLISECOND
+    with pytest.raises(InputError, match="time_ns = 1: must lie in the last step"):
+        simulation.within(1)

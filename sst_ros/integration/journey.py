@@ -12,7 +12,7 @@ from sst_ros.integration.events import first_crossing
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import METHODS, Rosenbrock
 from sst_ros.integration.walk import Change, Leg, Walk
-from sst_ros.limits import Limit, limits_of
+from sst_ros.limits import Limit, all_far, limits_of, ranges_of
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.compiled import compiled as plain
 from sst_ros.mechanism.contacts import RigidEnds
@@ -52,6 +52,7 @@ class Journey:
         self._dynamics = dynamics
         self._system = System(dynamics, work=True)
         self._limits = tuple(limits_of(scene, geometry))
+        self._ranges = ranges_of(self._limits)
         self._ends = RigidEnds(dynamics)
         self._limit = scene.actuators.torque_limit if scene.actuators else None
         self._walk = Walk(self._system, integrator, tolerance, compiled=compiled)
@@ -69,6 +70,7 @@ class Journey:
         self._legs = 0
         self._lost = 0.0
         self._order = 99
+        self._book: tuple[tuple[Limit, ...], float, int, int] = ((), 0.0, 0, 99)
         self._walk.history.clear()
 
     @property
@@ -125,7 +127,7 @@ class Journey:
             CannotStep: no step resolves the motion.
 
         """
-        kept = self._resting, self._lost, self._legs, self._order
+        kept = self._book = self._resting, self._lost, self._legs, self._order
         self._start = start
         self._torque = torque if callable(torque) else None
         drive = (*((0.0,) * 3 if callable(torque) else self.limited(torque)), *more)
@@ -144,6 +146,24 @@ class Journey:
             self._resting, self._lost, self._legs, self._order = kept
             raise
 
+    def revisited(
+        self,
+        at: Point,
+        start: float,
+        h: float,
+        torque: Torque,
+        more: tuple[float, ...],
+        state: State,
+    ) -> Point:
+        """Go a part of the last way again, and leave everything as it is now."""
+        now, began = (self._resting, self._lost, self._legs, self._order), self._book
+        self._resting, self._lost, self._legs, self._order = began
+        try:
+            return self.travel(at, start, h, torque, more, state)
+        finally:
+            self._book = began
+            self._resting, self._lost, self._legs, self._order = now
+
     def _until_limit(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
@@ -154,6 +174,9 @@ class Journey:
             self._legs += 1
             self._order = min(self._order, walk.method.order)
             joints = self._dynamics.joints(*leg.y[:7])
+            if all_far(self._ranges, at.joints, joints):
+                at = Point(leg.y, leg.z, joints)
+                continue
             near = [
                 limit
                 for limit in self._limits
