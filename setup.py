@@ -46,6 +46,7 @@ setup(
         "test": [
             "colcon-common-extensions",
             "hypothesis",
+            "jsonschema",
             "mpmath",
             "mypy",
             "pytest",

@@ -12,7 +12,6 @@ from pathlib import Path
 from sst_ros import scene
 from sst_ros.errors import SstError
 from sst_ros.json_schema import json_schema
-from sst_ros.simulation import Simulation
 
 NODES = ("simulator", "torque_player", "recorder")
 
@@ -57,10 +56,12 @@ def _scene_show(options: argparse.Namespace) -> None:
 
 
 def _scene_check(options: argparse.Namespace) -> int:
+    from sst_ros.report.check import check
+
     failed = 0
     for path in options.files:
         try:
-            Simulation(scene.load(path))
+            check(path)
             print(f"{path}: valid")
         except SstError as error:
             failed = 1
@@ -70,6 +71,12 @@ def _scene_check(options: argparse.Namespace) -> int:
 
 def _scene_schema(_: argparse.Namespace) -> None:
     print(json.dumps(json_schema(scene.Scene, "sst_ros scene"), indent=2))
+
+
+def _scene_keys(_: argparse.Namespace) -> None:
+    from sst_ros.report.keys import keys
+
+    print(keys(), end="")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -101,6 +108,8 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(run=_scene_check)
     schema = scenes.add_parser("schema", help="JSON schema for editors")
     schema.set_defaults(run=_scene_schema)
+    keys = scenes.add_parser("keys", help="reference of all keys, as Markdown")
+    keys.set_defaults(run=_scene_keys)
     return parser
 
 

@@ -25,7 +25,10 @@ RELATIVE_ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Inertia(Section):
-    """A symmetric inertia tensor about O; off-diagonal entries are those of the tensor."""
+    """A symmetric inertia tensor, about O for all but the payload.
+
+    Off-diagonal entries are those of the tensor: xy = -sum(m x y), the negative product of inertia.
+    """
 
     xx: float = number("inertia tensor, xx", "kg m^2")
     yy: float = number("inertia tensor, yy", "kg m^2")

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import yaml
 
+from sst_ros import partial
 from sst_ros.errors import InputError, Problem
 from sst_ros.schema import Section, Spec, accept, frozen_text, specs
 
@@ -54,6 +56,12 @@ def dump(document: Section) -> str:
     return str(yaml.safe_dump(_tree(document), sort_keys=False, allow_unicode=True))
 
 
+def line_of(source: str, key: str) -> int | None:
+    """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
+    node = yaml.compose(source, Loader=yaml.SafeLoader)
+    return None if node is None else _line_at(node, key)
+
+
 def _tree(value: Any) -> Any:
     if isinstance(value, Section):
         pairs = ((name, spec, getattr(value, name)) for name, spec in specs(type(value)).items())
@@ -90,16 +98,19 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
             key = f"{path}.{field.name}" if path else field.name
             allowed = "is missing; " + known[field.name].allowed()
             problems.append(Problem(key, None, allowed, _line(node)))
+    found: Iterable[Problem]
     if len(problems) > before:
-        return None
-    try:
-        return cls(**values)
-    except InputError as error:
-        for problem in error.problems:
-            key = ".".join(filter(None, [path, problem.key]))
-            line = _line_at(node, problem.key)
-            problems.append(dataclasses.replace(problem, key=key, line=line))
-        return None
+        found = partial.problems(cls, values)
+    else:
+        try:
+            return cls(**values)
+        except InputError as error:
+            found = error.problems
+    for problem in found:
+        key = ".".join(filter(None, [path, problem.key]))
+        line = _line_at(node, problem.key)
+        problems.append(dataclasses.replace(problem, key=key, line=line))
+    return None
 
 
 def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> Any:

@@ -11,9 +11,10 @@ import dataclasses
 import math
 from typing import Any
 
-from sst_ros.schema import Section, Spec, specs
+from sst_ros.schema import Section, Spec
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_TEXT = {"type": "string", "pattern": "\\S"}
 
 
 def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
@@ -22,14 +23,16 @@ def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
 
 
 def _object(cls: type[Section]) -> dict[str, Any]:
-    declared = specs(cls)
-    required = [
-        field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING
-    ]
-    properties = {name: _property(spec) for name, spec in declared.items()}
     described: dict[str, Any] = {"type": "object", "additionalProperties": False}
     if cls.__doc__:
         described["description"] = cls.__doc__.partition("\n")[0]
+    properties, required = {}, []
+    for field in dataclasses.fields(cls):
+        properties[field.name] = _property(field.metadata["spec"])
+        if field.default is dataclasses.MISSING:
+            required.append(field.name)
+        elif isinstance(field.default, (bool, int, float, str)):
+            properties[field.name]["default"] = field.default
     return {**described, "properties": properties, "required": required}
 
 
@@ -45,16 +48,14 @@ def _property(spec: Spec) -> dict[str, Any]:
     if spec.kind == "section" and spec.section:
         return _object(spec.section) | described
     if spec.kind == "sections" and spec.section:
-        lengths = spec.lengths or (0,)
-        bounds = {"minItems": min(lengths), "maxItems": max(lengths)}
-        return described | {
-            "type": "array",
-            "items": _object(spec.section),
-            **(bounds if spec.lengths else {}),
-        }
+        lengths = [{"minItems": length, "maxItems": length} for length in spec.lengths]
+        entries = {"type": "array", "items": _object(spec.section)}
+        return described | entries | ({"anyOf": lengths} if lengths else {})
     if spec.kind == "notes":
-        return described | {"type": "object", "additionalProperties": {"type": "string"}}
-    return described | {"type": {"flag": "boolean", "texts": "array"}.get(spec.kind, "string")}
+        return described | {"type": "object", "additionalProperties": _TEXT}
+    if spec.kind == "texts":
+        return described | {"type": "array", "items": _TEXT}
+    return described | ({"type": "boolean"} if spec.kind == "flag" else _TEXT)
 
 
 def _numbers(spec: Spec, shape: tuple[int, ...]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,9 @@ from sst_ros.terms import (
 )
 
 Matrix = NDArray[np.float64]
+
+LARGEST = 1e9
+"""No number of a scene is larger; anything beyond is a slip of units."""
 
 __all__ = [
     "Actuators",
@@ -101,24 +104,38 @@ class Scene(Section):
         """Inertias of the intermediate links in {2k}, shape (3, 3, 3) [kg m^2]."""
         return np.stack([_matrix(link) for link in self.intermediate_links])
 
-    def check(self) -> Iterator[Problem]:
+    def checks(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
         """Refuse what contradicts itself across sections."""
+        return (self._sizes, self._centres, self._weights, self._notes)
+
+    def _sizes(self) -> Iterator[Problem]:
+        for key, value in _numbers(self, ""):
+            if abs(value) > LARGEST:
+                allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
+                yield Problem(key, value, allowed)
+
+    def _centres(self) -> Iterator[Problem]:
         reach = max(self.base.radius, self.star.radius)
-        bodies: dict[str, Star | Link] = {"star": self.star}
-        bodies |= {f"actuated_links[{k}]": link for k, link in enumerate(self.actuated_links)}
-        bodies |= {
-            f"intermediate_links[{k}]": link for k, link in enumerate(self.intermediate_links)
-        }
-        for key, body in bodies.items():
+        for key, body in self._bodies():
             if np.linalg.norm(body.centre) > reach:
                 yield Problem(f"{key}.centre", body.centre, f"must lie within {reach:g} m of O")
-        masses = [body.mass for body in bodies.values()]
-        if self.gravity and not any(masses) and self.payload is None:
+
+    def _weights(self) -> Iterator[Problem]:
+        heavy = self.payload or any(body.mass for _, body in self._bodies())
+        if self.gravity and not heavy:
             allowed = "acts on nothing: no body has a mass"
             yield Problem("gravity", self.gravity.acceleration, allowed)
+
+    def _notes(self) -> Iterator[Problem]:
         for key, said in self.provenance:
             if not _has(type(self), key.split(".")):
                 yield Problem(f"provenance.{key}", said, "is about a key that no scene has")
+
+    def _bodies(self) -> Iterator[tuple[str, Star | Link]]:
+        yield "star", self.star
+        for key in ("actuated_links", "intermediate_links"):
+            for k, link in enumerate(getattr(self, key)):
+                yield f"{key}[{k}]", link
 
 
 def _matrix(link: Link) -> Matrix:
@@ -132,15 +149,25 @@ def load(name_or_path: str | Path) -> Scene:
         InputError: there is no such scene, or its document is refused.
 
     """
+    source, origin = text_of(name_or_path)
+    return read(Scene, source, origin)
+
+
+def text_of(name_or_path: str | Path) -> tuple[str, str]:
+    """Return the YAML text of a scene, found as by `load`, and the path that it is from.
+
+    Raises:
+        InputError: there is no such file, or it is no text.
+
+    """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
     try:
-        source = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())} ({error})"
         raise InputError("scene", [Problem("scene", str(name_or_path), allowed)]) from None
-    return read(Scene, source, str(path))
 
 
 def names() -> list[str]:
@@ -160,6 +187,19 @@ def share_directory() -> Path:
             if (candidate / "config" / "scenes").is_dir():
                 return candidate
     raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
+
+
+def _numbers(value: object, key: str) -> Iterator[tuple[str, float]]:
+    """Yield every number of a section with its key."""
+    if isinstance(value, Section):
+        for name in specs(type(value)):
+            yield from _numbers(getattr(value, name), f"{key}.{name}" if key else name)
+    elif isinstance(value, tuple):
+        for index, entry in enumerate(value):
+            inner = f"{key}[{index}]" if isinstance(entry, Section) else key
+            yield from _numbers(entry, inner)
+    elif isinstance(value, float):
+        yield key, value
 
 
 def _has(cls: type[Section], path: list[str]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -129,9 +129,13 @@ class Section:
             except ValueError:
                 problems.append(Problem(name, value, spec.allowed()))
         if not problems:
-            problems = list(self.check())
+            problems = [problem for check in self.checks() for problem in check()]
         if problems:
             raise InputError(type(self).__name__.lower(), problems)
+
+    def checks(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
+        """List the checks of several fields at once; override where some do without others."""
+        return (self.check,)
 
     def check(self) -> Iterator[Problem]:
         """Yield the faults that no single field shows; override where there can be some."""

@@ -15,6 +15,9 @@ from sst_ros.schema import Section, choice, flag, number, section
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
 
+SMOOTHING = 1e-2
+STRIBECK = 0.1
+
 
 @dataclass(frozen=True)
 class Gravity(Section):
@@ -51,11 +54,11 @@ class Friction(Section):
     viscous: float = number("viscous coefficient", "N m s/rad", default=0.0, least=0.0)
     coulomb: float = number("Coulomb torque", "N m", default=0.0, least=0.0)
     smoothing: float = number(
-        "rate over which the Coulomb torque changes sign", "rad/s", default=1e-2, above=0.0
+        "rate over which the Coulomb torque changes sign", "rad/s", default=SMOOTHING, above=0.0
     )
     static: float = number("breakaway torque (Stribeck); 0 for none", "N m", default=0.0, least=0.0)
     stribeck: float = number(
-        "rate at which the breakaway torque has faded", "rad/s", default=0.1, above=0.0
+        "rate at which the breakaway torque has faded", "rad/s", default=STRIBECK, above=0.0
     )
 
     def check(self) -> Iterator[Problem]:
@@ -64,6 +67,10 @@ class Friction(Section):
             yield Problem("viscous", self.viscous, "friction without a coefficient: leave it out")
         if self.static and self.static < self.coulomb:
             yield Problem("static", self.static, f"must be >= coulomb = {self.coulomb:g} N m")
+        if self.smoothing != SMOOTHING and not (self.coulomb or self.static):
+            yield Problem("smoothing", self.smoothing, "acts on coulomb or static: give one")
+        if self.stribeck != STRIBECK and not self.static:
+            yield Problem("stribeck", self.stribeck, "acts on static: give it")
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,8 @@ class Spring(Section):
 class Actuators(Section):
     """What stands between a command and the torque of a joint; the same in all legs.
 
-    Commands and limits are torques at the joint, behind the gear.
+    Commands and limits are torques at the joint, behind the gear. A command is limited first, then
+    it lags.
     """
 
     rotor_inertia: float = number("inertia of the motor's rotor", "kg m^2", default=0.0, least=0.0)
@@ -102,6 +110,14 @@ class Actuators(Section):
     time_constant: float | None = number(
         "time constant of a first-order lag of the torque", "s", default=None, above=0.0
     )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse actuators that change nothing, and a gear without a rotor behind it."""
+        if self.gear_ratio != 1.0 and not self.rotor_inertia:
+            allowed = "acts on rotor_inertia only (torques are those at the joint): give it"
+            yield Problem("gear_ratio", self.gear_ratio, allowed)
+        elif not self.rotor_inertia and self.torque_limit is self.time_constant is None:
+            yield Problem("", None, "changes nothing: leave it out")
 
 
 @dataclass(frozen=True)

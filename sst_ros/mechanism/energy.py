@@ -18,7 +18,6 @@ def kinetic(model: Model, state: State) -> Scalar:
     rows = rotation_rows((x, y, z, w))
     for leg in model.legs:
         at = leg_motion(leg, rows, (wx, wy, wz))
-        total = total + leg.ixx / at.u * at.a_dot * at.a_dot
         total = total + (leg.a0 + leg.a2 * (at.a * at.a)) * at.gamma_dot * at.gamma_dot
         if leg.ixy or leg.ixz or leg.iyz:
             root = sqrt(at.u)

@@ -6,10 +6,11 @@ With a = cos(mu_k) = t.w, p = t x w, u = 1 - a^2 and g = (w - a t)/u a leg moves
 
     a_dot = p.W,    gamma_dot = g.W,
 
-both rates of true coordinates, so each leg is a system with the two coordinates (a, gamma) and
-the kinetic energy (B a_dot^2 + 2 C a_dot gamma_dot + A gamma_dot^2) / 2. Its inertia forces act
-on the star through p and g (virtual work). The loops are closed by construction, and M is
-positive definite wherever u > 0: only a serial singularity (t_k = +-w_k) has no dynamics.
+both rates of true coordinates. Across t_k the intermediate link turns as the star does, so the part
+Ixx (1 - t t^T) of its inertia belongs to the star, for good; what is left of a leg is the kinetic
+energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces act on the star through p and g
+(virtual work). The loops are closed by construction, and M is positive definite wherever u > 0:
+only a serial singularity (t_k = +-w_k) has no dynamics.
 
 The inertial part uses + - * / and, for a link with products of inertia xz or yz, one square root;
 loads may need angles (`loads`). The functions run on floats, complex numbers, NumPy columns,
@@ -19,6 +20,8 @@ mpmath numbers and expressions alike; the simulation runs what `trace` leaves of
 from __future__ import annotations
 
 from typing import NamedTuple
+
+import numpy as np
 
 from sst_ros.mechanism import loads
 from sst_ros.mechanism.elementary import sqrt
@@ -47,7 +50,8 @@ State = tuple[Scalar, ...]
 class Leg(NamedTuple):
     """Constants of one leg: axis w and start v of the arc in {B}, axis (e0, e1, 0) in {E}.
 
-    The energies are Ixx/u, A0 + A2 a^2 - 2 Iyz a sqrt(u) and Ixz a/sqrt(u) - Ixy for B, A, C.
+    A = A0 + A2 a^2 - 2 Iyz a sqrt(u) and C = Ixz a/sqrt(u) - Ixy, with A0 = I_a(zz) + Iyy - Ixx and
+    A2 = Izz - Iyy + Ixx.
     """
 
     w: Triple
@@ -55,7 +59,6 @@ class Leg(NamedTuple):
     across: Triple
     e0: float
     e1: float
-    ixx: float
     a0: float
     a2: float
     ixy: float
@@ -68,7 +71,8 @@ class Model(NamedTuple):
     """All constants of the dynamics.
 
     Attributes:
-        star: inertia (xx, yy, zz, xy, xz, yz) of star and payload in {E} [kg m^2].
+        star: inertia (xx, yy, zz, xy, xz, yz) in {E} of star, payload and what of the intermediate
+            links turns with the star [kg m^2].
         legs: the three legs.
         gravity: acceleration of free fall in {B} [m/s^2]; None without gravity.
         weight: mass times centre of star and payload in {E} [kg m].
@@ -106,7 +110,8 @@ def model_of(scene: Scene) -> Model:
         link, drive_zz = links[k], float(drives[k][2, 2])
         xx, yy, zz = (float(link[i, i]) for i in range(3))
         xy, xz, yz = float(link[0, 1]), float(link[0, 2]), float(link[1, 2])
-        constants = (xx, drive_zz + yy, zz - yy, xy, xz, yz)
+        constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
+        star = star + xx * (np.eye(3) - np.outer(geometry.e[k], geometry.e[k]))
         legs.append(
             Leg(w, v, cross(w, v), e[0], e[1], *constants, loads.of_leg(scene, geometry, k))
         )
@@ -167,24 +172,20 @@ def body_acceleration(
         at = leg_motion(leg, rows, rate)
         a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
         a_rest, gamma_rest = rest_accelerations(at, rate)
-        # T = (B a_dot^2 + 2 C a_dot gamma_dot + A gamma_dot^2) / 2; slopes are d/da.
-        b_inertia = leg.ixx / u
-        b_slope = 2.0 * a * b_inertia / u
+        # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
         a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
-        force_a = b_inertia * a_rest
-        force_a = force_a + 0.5 * (b_slope * a_dot * a_dot - a_slope * gamma_dot * gamma_dot)
-        force_gamma = a_inertia * gamma_rest + a_slope * a_dot * gamma_dot - drive
-        toward_a, toward_gamma = scaled(b_inertia, p), scaled(a_inertia, g)
+        c_inertia: Scalar = 0.0
+        c_slope: Scalar = 0.0
         if leg.ixy or leg.ixz or leg.iyz:
             root = sqrt(u)
             c_inertia, c_slope = leg.ixz * a / root - leg.ixy, leg.ixz / (u * root)
-            a_more = -2.0 * leg.iyz * a * root
-            slope_more = -2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
-            force_a = force_a + c_inertia * gamma_rest - 0.5 * slope_more * gamma_dot * gamma_dot
-            force_gamma = force_gamma + c_inertia * a_rest + c_slope * a_dot * a_dot
-            force_gamma = force_gamma + a_more * gamma_rest + slope_more * a_dot * gamma_dot
-            toward_a = axpy(c_inertia, g, b_inertia, p)
-            toward_gamma = axpy(c_inertia, p, a_inertia + a_more, g)
+            a_inertia = a_inertia - 2.0 * leg.iyz * a * root
+            a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
+        force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
+        force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
+        force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
+        toward_a = scaled(c_inertia, g)
+        toward_gamma = axpy(a_inertia, g, c_inertia, p)
         if leg.loads is not None:
             at_gamma, at_mu, at_beta = loads.joint_torques(leg.loads, at, leg.across, leg.v, field)
             force_gamma = force_gamma - at_gamma

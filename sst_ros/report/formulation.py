@@ -53,7 +53,7 @@ def check(recording: Recording, count: int = STATES) -> Formulation:
         state = states.recorded(mechanism.geometry, recording, int(sample))
         if state is None:
             continue
-        torque = recording.effort[sample]
+        state, torque = state[:7], recording.effort[sample]  # the torque that acts, lagged or not
         try:
             paper = _of_the_paper(mechanism, state, torque)
         except SingularConfiguration:

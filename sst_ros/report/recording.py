@@ -19,6 +19,7 @@ from sst_ros.scene import Scene
 KINDS = ("gamma", "mu", "beta")
 JOINTS = tuple(f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3))
 ACTUATED = JOINTS[:3]
+MOMENTS = ("moment_x", "moment_y", "moment_z")
 
 TOPICS = (
     Topic("joint_states", "/joint_states", "sensor_msgs/msg/JointState", True),
@@ -38,12 +39,15 @@ class Ticks:
     Attributes:
         start_ns, end_ns: the tick, relative to the start of the run [ns], shape (m,).
         torque: actuator torques held over the tick [N m], shape (m, 3).
+        moment: external moment on the star in {B} held over the tick [N m], shape (m, 3); None
+            where it was not recorded.
 
     """
 
     start_ns: Integers
     end_ns: Integers
     torque: Array
+    moment: Array | None = None
 
     @property
     def period_ns(self) -> int:
@@ -136,8 +140,10 @@ class _Reader:
         self._joints = Rows(path, "joint_states", 21)
         self._orientation = Rows(path, "orientation", 4)
         self._euler = Rows(path, "euler_zyz", 3)
-        # Besides the torque the end of the tick, as its distance to the start: exact in a double.
-        self._ticks = Rows(path, "applied_torques", 4)
+        # Besides torque and moment the end of the tick, as its distance to the start: exact in a
+        # double.
+        self._ticks = Rows(path, "applied_torques", 7)
+        self._moved = True
         self._order: tuple[list[str], list[int]] = ([], [])
         self._scenes: set[str] = set()
         self._diagnostics: dict[str, str] = {}
@@ -172,9 +178,11 @@ class _Reader:
         stamp = nanoseconds(message.header.stamp)
         if stamp == 0:
             return
-        places = [0, 1, 2]
+        places, more = [0, 1, 2], [0.0, 0.0, 0.0]
+        self._moved &= set(MOMENTS) <= set(message.joint_names)
         if message.joint_names:
-            places = self._places(message.joint_names, ACTUATED, "applied_torques")
+            wanted = (*ACTUATED, *(MOMENTS if self._moved else ()))
+            places = self._places(message.joint_names, wanted, "applied_torques")
         start = stamp
         for point in message.points:
             end = stamp + nanoseconds(point.time_from_start)
@@ -184,7 +192,8 @@ class _Reader:
             if len(point.effort) != max(3, len(message.joint_names)):
                 allowed = f"must be a torque for each actuator (stamp {start} ns)"
                 raise refused(self._path, "applied_torques", list(point.effort), allowed)
-            self._ticks.add(received_ns, start, [end - start, *point.effort[places]])
+            row = [end - start, *point.effort[places], *([] if self._moved else more)]
+            self._ticks.add(received_ns, start, row)
             start = end
 
     def scene(self, _: int, message: Any) -> None:
@@ -242,7 +251,12 @@ class _Reader:
             effort=effort,
             quaternion=quaternion,
             euler=aligned(stamps, *self._euler.sorted()),
-            ticks=Ticks(starts - begin, ends - begin, ticks[:, 1:]),
+            ticks=Ticks(
+                starts - begin,
+                ends - begin,
+                ticks[:, 1:4],
+                ticks[:, 4:] if self._moved else None,
+            ),
             previews=self._previews,
             commands=self._commands,
             diagnostics=self._diagnostics,

@@ -21,6 +21,8 @@ where samples are lost and the first one may belong to a later time."""
 def initial(scene: Scene) -> Vector:
     """State at t = 0, seven numbers (quaternion, W in {E} [rad/s]), by the paper's kinematics.
 
+    Actuators that lag add three: they give no torque yet.
+
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
 
@@ -29,14 +31,20 @@ def initial(scene: Scene) -> Vector:
     rotation = kinematics.admissible(geometry, gamma).rotation
     posture = virtual_work.posture(geometry, gamma, rotation)
     rate = rotation.T @ posture.j @ np.array(scene.initial.gamma_dot)
-    return (*quaternion_of(rotation).tolist(), *rate.tolist())
+    lagged = (0.0,) * (lags(scene) * 3)
+    return (*quaternion_of(rotation).tolist(), *rate.tolist(), *lagged)
+
+
+def lags(scene: Scene) -> bool:
+    """Tell whether the torques of the actuators are part of the state."""
+    return scene.actuators is not None and scene.actuators.time_constant is not None
 
 
 def recorded(geometry: Geometry, recording: Recording, sample: int) -> Vector | None:
     """State at a sample, or None where its orientation was lost.
 
     W follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
-    that could be singular; the mean of the three is taken.
+    that could be singular; the mean of the three is taken. Torques that lag are its effort.
     """
     quaternion = recording.quaternion[sample]
     if not np.all(np.isfinite(quaternion)):
@@ -49,7 +57,8 @@ def recorded(geometry: Geometry, recording: Recording, sample: int) -> Vector | 
         for rate in (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
     )
     rate = (w * gamma_dot - r * mu_dot - t * beta_dot).mean(axis=0)
-    return (*quaternion.tolist(), *rate.tolist())
+    lagged = recording.effort[sample].tolist() if lags(recording.scene) else ()
+    return (*quaternion.tolist(), *rate.tolist(), *lagged)
 
 
 def begins(recording: Recording) -> bool:
@@ -69,7 +78,7 @@ def begins(recording: Recording) -> bool:
 
 
 def outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
-    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of states (n, 7).
+    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states.
 
     Rows of nan stay nan.
     """

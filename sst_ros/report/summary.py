@@ -20,7 +20,7 @@ from sst_ros.report.formulation import Formulation
 from sst_ros.report.recording import Recording
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.rows import NANOSECONDS
-from sst_ros.report.states import begins
+from sst_ros.report.states import begins, lags
 
 QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 
@@ -140,15 +140,20 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
     if not begins(recording):
         notes.append("the start of the run is not recorded; times count from the first sample")
     lost = len(recording.time_ns) - integration.compared
-    if integration.restarts_ns:
+    notes += integration.reasons
+    if integration.restarts_ns and not integration.reasons:
         notes.append(
             f"torques are missing: the reference began again {len(integration.restarts_ns)} times "
             f"from a recorded sample; {lost} samples are not compared"
         )
     elif lost:
         notes.append(f"{lost} samples could not be compared")
+    if ideal is None and recording.scene.moment and recording.scene.moment.topic:
+        notes.append("the moment comes from a topic: no ideal to compare with")
     if ideal is None and recording.scene.torque is None:
         notes.append("the scene has no torques: no ideal to compare with")
+    if lags(recording.scene):
+        notes.append("the actuators lag: efforts differ from the torques that are asked for")
     if "euler_zyz" in recording.missing:
         notes.append("euler_zyz is not recorded: its pictures show the orientation's angles")
     return notes

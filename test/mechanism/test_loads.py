@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from models import FAST, samples, seeded_samples
 
 from sst_ros.bodies import Inertia, Link, Payload
-from sst_ros.mechanism import energy, kernel, virtual_work
+from sst_ros.mechanism import energy, kernel, loads, virtual_work
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.terms import (
     Actuators,
@@ -179,17 +179,32 @@ def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
 
 
 def test_elastic_ends_push_only_beyond_the_stroke_and_never_pull():
-    scene = only(
-        seeded_samples(9, 1)[0], stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0)
-    )
-    from sst_ros.mechanism.loads import _push, of_leg
+    sample = seeded_samples(9, 1)[0]
+    scene = only(sample, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
+    ends = loads.of_leg(scene, sample.geometry, 0).ends
+    assert loads._push(ends, 0.5 * ends.arc, 1.0) == 0.0
+    assert loads._push(ends, -0.01, 0.0) == pytest.approx(1.0)
+    assert loads._push(ends, ends.arc + 0.01, 0.0) == pytest.approx(-1.0)
+    assert loads._push(ends, -0.01, -0.1) == pytest.approx(1.5)
+    assert loads._push(ends, -0.01, 10.0) == 0.0
 
-    ends = of_leg(scene, Dynamics(scene) and seeded_samples(9, 1)[0].geometry, 0).ends
-    assert _push(ends, 0.5 * ends.arc, 1.0) == 0.0
-    assert _push(ends, -0.01, 0.0) == pytest.approx(1.0)
-    assert _push(ends, ends.arc + 0.01, 0.0) == pytest.approx(-1.0)
-    assert _push(ends, -0.01, -0.1) == pytest.approx(1.5)
-    assert _push(ends, -0.01, 10.0) == 0.0
+
+@pytest.mark.parametrize("v", [-2.0, -0.05, 0.0, 0.003, 0.4])
+def test_friction_is_the_documented_torque_of_its_rate(v):
+    friction = Friction(viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01)
+    fading = 0.2 + 0.3 * np.exp(-((v / 0.1) ** 2))
+    expected = 0.3 * v + fading * np.tanh(v / 0.01)
+    assert loads.resistance(friction, v) == pytest.approx(expected, rel=1e-14)
+    assert loads.resistance(friction, -v) == -loads.resistance(friction, v)
+    assert loads.resistance(friction, v) * v >= 0.0
+
+
+def test_springs_at_one_joint_add_up():
+    sample = seeded_samples(13, 1)[0]
+    two = [Spring(joint="mu_1", stiffness=k, rest=r) for k, r in ((2.0, 0.5), (3.0, -0.2))]
+    together = extra_torque(sample, springs=tuple(two))
+    alone = [extra_torque(sample, springs=(spring,)) for spring in two]
+    assert together == pytest.approx(sum(alone), rel=1e-10)
 
 
 def test_lagging_actuators_follow_the_command_with_their_time_constant():

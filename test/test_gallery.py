@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every shipped scene runs, and does what its description says."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sst_ros.control.torque import sine
+from sst_ros.errors import RunStopped, StrokeExceeded
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.report.check import check
+from sst_ros.scene import load, names
+from sst_ros.simulation import Simulation
+
+FOLDER = Path(__file__).parents[1] / "config" / "scenes"
+REST = (0.0, 0.0, 0.0)
+STEP_NS = 2_000_000
+STEPS = {"fast_spin": 200_000, "stiff": 20_000_000}
+
+
+@cache
+def run(name):
+    """A scene at every step of its whole duration: the simulation, its states, what ended it."""
+    scene = load(name)
+    simulation = Simulation(scene)
+    torque = sine(scene.torque) if scene.torque else REST
+    states, step = [simulation.state], STEPS.get(name, STEP_NS)
+    try:
+        for _ in range(round(scene.duration * 1e9 / step)):
+            states.append(simulation.step(torque, step))
+    except RunStopped as stopped:
+        return simulation, states, stopped
+    return simulation, states, None
+
+
+def of(name, quantity):
+    """A joint quantity over a whole run, shape (n, 3); nothing may have ended it."""
+    _, states, stopped = run(name)
+    assert stopped is None
+    return np.array([getattr(state.joints, quantity) for state in states])
+
+
+def energy(simulation, state):
+    return sum(simulation.dynamics.energies(*state.quaternion, *state.body_rate, *REST)[:2])
+
+
+def drift(name):
+    """Largest change of the energy over a run, in largest kinetic energies."""
+    simulation, states, _ = run(name)
+    all_energies = [energy(simulation, state) for state in states]
+    kinetic = [simulation.dynamics.energies(*s.quaternion, *s.body_rate, *REST)[0] for s in states]
+    return np.ptp(all_energies) / max(kinetic)
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_scene_is_small_commented_and_can_start(name):
+    source = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    assert source.startswith("# ")
+    assert source.count("\n") < 70 and max(map(len, source.splitlines())) <= 110
+    numbers = [line for line in source.splitlines() if re.search(r"[:,[] *-?\d", line)]
+    told = [line for line in numbers if "#" in line or "printed" in line or "chosen" in line]
+    assert len(told) > len(numbers) / 2
+    assert check(name).name == name
+
+
+def test_example1_swings_about_a_centre_at_rest():
+    assert np.ptp(of("example1", "gamma")) > 0.04
+    for state in run("example1")[1]:
+        assert rotation_matrix(state.quaternion)[:, 2] == pytest.approx([3.0**-0.5] * 3, abs=1e-11)
+
+
+def test_example2_stays_in_its_stroke_for_the_whole_second():
+    gamma = of("example2", "gamma")
+    assert run("example2")[1][-1].time_ns == 1_000_000_000
+    assert gamma.min() > 0.0 and gamma.max() < np.pi / 2
+
+
+def test_example2_thin_meets_the_end_of_a_stroke():
+    _, states, stopped = run("example2_thin")
+    assert isinstance(stopped, StrokeExceeded) and stopped.reason.startswith("gamma_1 > ")
+    assert 0.9 < stopped.time < 1.0
+    assert states[-1].joints.gamma[0] == pytest.approx(np.pi / 2, abs=0.02)
+
+
+def test_gravity_payload_conserves_energy_while_it_swings():
+    assert np.ptp(of("gravity_payload", "gamma")) > 0.1
+    assert drift("gravity_payload") < 1e-8
+
+
+def test_friction_keeps_the_kinetic_energy_below_that_of_the_frictionless_scene():
+    simulation, states, _ = run("friction")
+    free, torque = (
+        Simulation(replace(simulation.scene, friction=None)),
+        sine(load("friction").torque),
+    )
+    freely = [free.step(torque, STEP_NS) for _ in range(450)]
+    rubbed, unrubbed = (
+        np.mean([energy(simulation, state) for state in some]) for some in (states[:450], freely)
+    )
+    assert rubbed < 0.8 * unrubbed
+    assert np.ptp(of("friction", "gamma"), axis=0).min() > 0.05
+
+
+def test_elastic_stops_catch_the_actuator_and_throw_it_back():
+    gamma, rate = of("elastic_stops", "gamma")[:, 0], of("elastic_stops", "gamma_dot")[:, 0]
+    beyond = np.flatnonzero(gamma > np.pi / 2)
+    assert len(beyond) and gamma.max() < np.pi / 2 + 0.1
+    assert rate[beyond[0]] > 0.0 and gamma[beyond[-1] + 1 :].min() < np.pi / 2 - 0.01
+
+
+def test_impacts_bounce_and_never_pass_the_end():
+    gamma, rate = of("impacts", "gamma"), of("impacts", "gamma_dot")
+    assert gamma.max() <= np.pi / 2 + 1e-9 and gamma.min() >= -1e-9
+    # An impact turns a rate at an end within one step, by 1.6 times its size.
+    hits = [
+        (leg, end)
+        for end, sign in ((np.pi / 2, 1.0), (0.0, -1.0))
+        for leg in range(3)
+        for i in np.flatnonzero(
+            (np.abs(gamma[:-1, leg] - end) < 0.01)
+            & (sign * rate[:-1, leg] > 0.1)
+            & (sign * rate[1:, leg] < -0.05)
+        )
+        if rate[i + 1, leg] == pytest.approx(-0.6 * rate[i, leg], rel=0.1)
+    ]
+    assert hits == [(0, np.pi / 2), (2, np.pi / 2), (0, 0.0), (1, 0.0)]
+
+
+def test_fast_spin_is_fast_and_conserves_energy():
+    assert np.abs(of("fast_spin", "gamma_dot")).max() > 100.0
+    assert drift("fast_spin") < 1e-6
+
+
+def test_general_is_general_and_moves():
+    scene = load("general")
+    assert len(set(run("general")[0].geometry.arc.tolist())) == 3
+    assert len(set(scene.star.alpha_deg)) == 3
+    inertias = [scene.star.inertia, scene.intermediate_links[0].inertia]
+    assert all(i.xy and i.xz and i.yz for i in inertias)
+    assert np.ptp(of("general", "gamma"), axis=0).min() > 0.02
+
+
+def test_stiff_creeps_to_the_rest_of_its_springs():
+    """1000 rate = -500 (gamma - rest) once inertia has died: off by 500 / 1000^2 of the way."""
+    scene, gamma = load("stiff"), of("stiff", "gamma")
+    start, rest = np.array(scene.initial.gamma), np.array([0.9, 0.7, 0.8])
+    seconds = np.array([state.time_ns for state in run("stiff")[1]]) / 1e9
+    expected = rest + (start - rest) * np.exp(-0.5 * seconds)[:, None]
+    assert np.abs(gamma[-1] - start).max() > 0.03
+    assert gamma == pytest.approx(expected, abs=3e-4 * np.abs(start - rest).max())

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The JSON schema accepts what `read` accepts and refuses what it can; the key reference is new."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sst_ros import __main__ as cli
+from sst_ros.json_schema import json_schema
+from sst_ros.report.keys import keys
+from sst_ros.scene import Scene, names
+
+jsonschema = pytest.importorskip("jsonschema")
+
+ROOT = Path(__file__).parents[1]
+SCHEMA = json_schema(Scene, "sst_ros scene")
+VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
+
+
+def tree(name="example2"):
+    path = ROOT / "config" / "scenes" / f"{name}.yaml"
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def test_the_schema_is_one():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+def test_the_command_prints_the_schema(capsys):
+    assert cli.main(["scene", "schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == SCHEMA
+
+
+@pytest.mark.parametrize("name", names())
+def test_shipped_scenes_are_valid(name):
+    VALIDATOR.validate(tree(name))
+
+
+LINK = {"inertia": {"xx": 1.0, "yy": 1.0, "zz": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "path"),
+    [
+        ("colour", "red", []),
+        ("name", " ", ["name"]),
+        ("duration", "1 s", ["duration"]),
+        ("duration", 0, ["duration"]),
+        ("duration", None, ["duration"]),
+        ("base", {"v": [[1, 0, 0], [0, 1, 0]], "radius": 1}, ["base", "v"]),
+        ("base", {"radius": 1}, ["base"]),
+        ("actuated_links", [LINK, LINK], ["actuated_links"]),
+        ("intermediate_links", [{"mass": -1}], ["intermediate_links", 0, "mass"]),
+        ("stroke", {"at_end": "bounce"}, ["stroke", "at_end"]),
+        ("stroke", {"at_end": "impact", "restitution": 2}, ["stroke", "restitution"]),
+        ("moment", {"topic": "yes"}, ["moment", "topic"]),
+        ("springs", [{"joint": "mu_1", "stiffness": 0, "rest": 0}], ["springs", 0, "stiffness"]),
+        ("friction", {"gamma_1": {}}, ["friction"]),
+        ("provenance", {"base": 3}, ["provenance", "base"]),
+    ],
+)
+def test_bad_documents_are_refused_where_they_are_bad(key, value, path):
+    errors = list(VALIDATOR.iter_errors({**tree(), key: value}))
+    assert [list(error.absolute_path) for error in errors] == [path]
+
+
+def test_every_key_is_described_with_its_unit():
+    friction = SCHEMA["properties"]["friction"]["properties"]["gamma"]["properties"]
+    assert friction["viscous"]["description"] == "viscous coefficient [N m s/rad]"
+    assert friction["smoothing"]["default"] == 0.01
+
+    def bare(schema):
+        for name, entry in schema.get("properties", {}).items():
+            if not entry.get("description"):
+                yield name
+            yield from bare(entry)
+            yield from bare(entry.get("items", {}))
+
+    assert list(bare(SCHEMA)) == []
+
+
+def test_the_reference_of_keys_in_docs_is_up_to_date():
+    said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+    assert said == keys(), "python -m sst_ros scene keys > docs/scenes.md"
+
+
+def test_the_reference_names_every_key():
+    said = keys()
+
+    def all_keys(schema):
+        for name, entry in schema.get("properties", {}).items():
+            yield name
+            yield from all_keys(entry)
+            yield from all_keys(entry.get("items", {}))
+
+    assert [name for name in all_keys(SCHEMA) if f"| `{name}` |" not in said] == []

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sheet of a scene and the costs in it: absent terms cost nothing, present ones are counted."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+from mechanism.bare_kernel import program_of
+
+from sst_ros import __main__ as cli
+from sst_ros.integration.advice import advise
+from sst_ros.mechanism.compiled import Dynamics, compiled
+from sst_ros.report.costs import TERMS, costs, operations
+from sst_ros.report.sheet import WIDTH, sheet
+from sst_ros.scene import Scene, load, names
+from sst_ros.terms import (
+    Actuators,
+    Friction,
+    JointFriction,
+    Moment,
+    Spring,
+    Stroke,
+)
+
+EXAMPLE2 = load("example2")
+every_scene = pytest.mark.parametrize("name", names())
+
+
+def everything() -> Scene:
+    rub = Friction(viscous=1.0, coulomb=1.0, static=2.0)
+    return replace(
+        load("gravity_payload"),
+        moment=Moment(topic=True),
+        friction=JointFriction(gamma=rub, mu=rub, beta=rub),
+        springs=(Spring(joint="mu_1", stiffness=1.0, rest=0.0),),
+        actuators=Actuators(
+            rotor_inertia=1e-4, gear_ratio=10.0, torque_limit=3.0, time_constant=0.1
+        ),
+        stroke=Stroke(at_end="elastic", stiffness=100.0, damping=1.0),
+    )
+
+
+def test_the_plain_scene_costs_what_a_kernel_without_optional_terms_costs():
+    """At most 3 % more; example2 has diagonal link inertias, general has full ones."""
+    for name in ("example2", "general"):
+        scene = load(name)
+        assert operations(scene) <= 1.03 * program_of(scene).operations.total()
+
+
+def test_the_kernel_without_optional_terms_is_the_same_physics():
+    inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
+    for name in ("example2", "general"):
+        bare = compiled(program_of(load(name)))(*inputs)
+        assert Dynamics(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
+
+
+@every_scene
+def test_absent_terms_cost_nothing_and_present_ones_something(name):
+    for cost in costs(load(name)):
+        assert cost.present or cost.adds == 0
+        assert cost.adds >= 0
+
+
+def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
+    scene = everything()
+    for term in TERMS:
+        if term.name not in ("actuated links", "intermediate links"):
+            assert term.value(scene), term.name
+            scene = term.without(scene)
+    assert Dynamics(scene).program == Dynamics(load("example2_thin")).program
+
+
+def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
+    """Inertias and limits fold into constants or act outside the right-hand side."""
+    added = {cost.name: cost.adds for cost in costs(everything())}
+    folded = {"payload", "rotors", "torque limit"}
+    assert {name for name, adds in added.items() if not adds} == folded
+
+
+def test_no_angle_and_no_root_is_computed_in_a_plain_scene():
+    assert set(Dynamics(EXAMPLE2).program.operations) == {"add", "sub", "mul", "div"}
+
+
+def test_a_viscous_friction_costs_a_few_multiplications_only():
+    scene = replace(EXAMPLE2, friction=JointFriction(gamma=Friction(viscous=0.1)))
+    extra = Dynamics(scene).program.operations - Dynamics(EXAMPLE2).program.operations
+    assert set(extra) <= {"add", "sub", "mul"}
+    assert 3 <= extra.total() <= 6
+
+
+@every_scene
+def test_a_sheet_says_all_that_one_asks(name):
+    scene, said = load(name), sheet(load(name))
+    total = sum(Dynamics(scene).program.operations.values())
+    assert said.startswith(f"{name}: {scene.description}\n")
+    assert f"right-hand side: 7 states, {total} operations" in said
+    for cost in costs(scene):
+        row = rf"^  {cost.name} +{cost.adds} +{cost.without}$"
+        listed = said[said.index("terms left out, 0 operations") : said.index("\nends")]
+        if cost.present:
+            assert re.search(row, said, re.MULTILINE)
+        else:
+            assert cost.name in " ".join(listed.split())
+    for key, reason in scene.provenance:
+        assert re.search(rf"^  {key} +{re.escape(reason[:20])}", said, re.MULTILINE)
+    assert advise(scene) in " ".join(said.split())
+    assert max(map(len, said.splitlines()[1:])) <= WIDTH
+
+
+def test_the_moments_topic_is_there_only_when_the_scene_takes_it():
+    taking = replace(EXAMPLE2, moment=Moment(topic=True))
+    giving = replace(EXAMPLE2, moment=Moment(value=(0.0, 0.0, 1.0)))
+    assert "~/external_moment" in sheet(taking)
+    assert "~/external_moment" not in sheet(giving)
+    assert "~/external_moment" not in sheet(EXAMPLE2)
+
+
+def test_lag_shows_in_the_size_of_the_state():
+    lagging = replace(EXAMPLE2, actuators=Actuators(time_constant=0.1))
+    assert "right-hand side: 10 states" in sheet(lagging)
+
+
+def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
+    assert cli.main(["scene", "show", "stiff"]) == 0
+    assert capsys.readouterr().out == sheet(load("stiff"))
+    assert cli.main(["scene", "list"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == names()
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("name: 3\nfriction: {}\n", encoding="utf-8")
+    assert cli.main(["scene", "check", str(bad)]) == 1
+    assert "bad.yaml: line 2: friction = None: names no joint" in capsys.readouterr().out
