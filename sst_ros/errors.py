@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from sst_ros.mechanism.kinematics import Assembly
@@ -59,7 +60,10 @@ class AmbiguousAssembly(AssemblyError):
 
     def __init__(self, gamma: NDArray[np.float64], candidates: Sequence[Assembly]) -> None:
         self.candidates = tuple(candidates)
-        super().__init__(f"{len(candidates)} admissible assemblies: choose one", gamma)
+        quaternions = (Rotation.from_matrix(one.rotation).as_quat() for one in candidates)
+        told = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
+        said = f"{len(candidates)} admissible assemblies, with the orientations {told}: name one"
+        super().__init__(said, gamma)
 
 
 class SingularConfiguration(SstError):

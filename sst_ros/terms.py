@@ -176,6 +176,13 @@ class Initial(Section):
     gamma_dot: Vector = number(
         "actuator rates at t = 0", "rad/s", shape=(3,), default=(0.0, 0.0, 0.0)
     )
+    orientation: tuple[float, float, float, float] | None = number(
+        "quaternion (x, y, z, w) of {E} in {B} that says which assembly is meant where gamma has "
+        "several admissible ones; within 0.1 rad",
+        "1",
+        shape=(4,),
+        default=None,
+    )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from models import seeded_samples
 
 from sst_ros.control.torque import sine
 from sst_ros.errors import (
+    AmbiguousAssembly,
     Diverged,
     InputError,
     NoAdmissibleAssembly,
@@ -21,7 +22,7 @@ from sst_ros.errors import (
 from sst_ros.integration.tableaux import DOP853, RK4
 from sst_ros.mechanism import kernel
 from sst_ros.mechanism.energy import kinetic
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
@@ -260,3 +261,16 @@ def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
     assert simulation.within(900 * MILLISECOND).time_ns == 900 * MILLISECOND
     with pytest.raises(InputError, match="time_ns = 1: must lie in the last step"):
         simulation.within(1)
+
+
+def test_a_scene_names_the_assembly_that_it_means():
+    star = replace(EXAMPLE2.star, alpha_deg=(210.0, 75.0, 75.0))
+    initial = Initial(gamma=tuple(np.radians([75.0, 74.0, 71.0])))
+    scene = replace(EXAMPLE2, star=star, initial=initial)
+    with pytest.raises(AmbiguousAssembly, match="with the orientations") as caught:
+        Simulation(scene)
+    for candidate in caught.value.candidates:
+        wanted = tuple(quaternion_of(candidate.rotation).tolist())
+        named = replace(scene, initial=replace(initial, orientation=wanted))
+        found = Simulation(named).state.quaternion
+        np.testing.assert_allclose(found, wanted, atol=1e-15)

@@ -21,6 +21,10 @@ RESIDUAL = 1e-14
 """Largest abs(r_k . t_k) of an assembly that is told to be one."""
 
 
+NEAR = 0.1
+"""How near an assembly must be to the rotation that names it [rad]."""
+
+
 @dataclass(frozen=True)
 class Assembly:
     """One way to assemble the manipulator at given actuator angles. Arrays are read-only.
@@ -142,12 +146,18 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     return Assemblies(configuration, rotation, mu, beta, det_j2, admissible, isolated)
 
 
-def admissible(geometry: Geometry, gamma: ArrayLike) -> Assembly:
+def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None) -> Assembly:
     """Return the one assembly in which the manipulator can be built at gamma, section 4.1.
+
+    Args:
+        geometry: base triangle and star.
+        gamma: actuator angles [rad], shape (3,).
+        near: rotation that says which one is meant where several are admissible: the only one
+            within NEAR of it.
 
     Raises:
         NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k <= beta_max.
-        AmbiguousAssembly: more than one has; the error carries them.
+        AmbiguousAssembly: more than one has, and `near` names none; the error carries them.
         AssemblyError: gamma is not finite, or the assemblies are not isolated.
 
     """
@@ -156,8 +166,17 @@ def admissible(geometry: Geometry, gamma: ArrayLike) -> Assembly:
     if not candidates:
         raise NoAdmissibleAssembly("no admissible assembly", angles)
     if len(candidates) > 1:
+        meant = [one for one in candidates if near is not None and _apart(one, near) < NEAR]
+        if len(meant) == 1:
+            return meant[0]
         raise AmbiguousAssembly(angles, candidates)
     return candidates[0]
+
+
+def _apart(assembly: Assembly, near: ArrayLike) -> float:
+    """Angle of the rotation between an assembly and `near` [rad]."""
+    trace = float(np.sum(assembly.rotation * np.asarray(near, dtype=float)))
+    return float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def described(

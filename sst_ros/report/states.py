@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_ros.mechanism import kernel, kinematics, virtual_work
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.start import initial_state
 from sst_ros.report.recording import Recording
 from sst_ros.scene import Scene
 
@@ -27,12 +28,8 @@ def initial(scene: Scene) -> Vector:
         AssemblyError: the initial gamma has no unique admissible assembly.
 
     """
-    geometry, gamma = Geometry.of(scene), np.array(scene.initial.gamma)
-    rotation = kinematics.admissible(geometry, gamma).rotation
-    posture = virtual_work.posture(geometry, gamma, rotation)
-    rate = rotation.T @ posture.j @ np.array(scene.initial.gamma_dot)
     lagged = (0.0,) * (lags(scene) * 3)
-    return (*quaternion_of(rotation).tolist(), *rate.tolist(), *lagged)
+    return (*initial_state(scene, Geometry.of(scene)), *lagged)
 
 
 def lags(scene: Scene) -> bool:

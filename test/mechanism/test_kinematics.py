@@ -205,7 +205,8 @@ def ambiguous_posture():
 
 def test_ambiguity_is_told_with_all_candidates():
     geometry, gamma = ambiguous_posture()
-    with pytest.raises(AmbiguousAssembly, match="2 admissible assemblies: choose one") as caught:
+    said = "2 admissible assemblies, with the orientations"
+    with pytest.raises(AmbiguousAssembly, match=said) as caught:
         kinematics.admissible(geometry, gamma)
     one, two = caught.value.candidates
     assert one.admissible
@@ -213,6 +214,10 @@ def test_ambiguity_is_told_with_all_candidates():
     assert np.abs(one.rotation - two.rotation).max() > 1e-3
     for candidate in caught.value.candidates:
         assert np.abs(closure(geometry, gamma, candidate.rotation)).max() < 1e-13
+        named = kinematics.admissible(geometry, gamma, near=candidate.rotation)
+        assert np.array_equal(named.rotation, candidate.rotation)
+    with pytest.raises(AmbiguousAssembly):
+        kinematics.admissible(geometry, gamma, near=np.diag([-1.0, -1.0, 1.0]))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state in which a scene begins."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Scene
+
+
+def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
+    """Quaternion (x, y, z, w) and body rate [rad/s] at t = 0, seven numbers.
+
+    Raises:
+        AssemblyError: the initial gamma has no admissible assembly, or several and the scene does
+            not say which.
+        SingularConfiguration: gamma_dot says nothing of the body rate there.
+
+    """
+    initial, gamma = scene.initial, np.array(scene.initial.gamma)
+    meant = None if initial.orientation is None else rotation_matrix(initial.orientation)
+    rotation = kinematics.admissible(geometry, gamma, meant).rotation
+    at = virtual_work.posture(geometry, gamma, rotation)
+    rate = rotation.T @ at.j @ np.array(initial.gamma_dot)
+    return (*quaternion_of(rotation).tolist(), *rate.tolist())
