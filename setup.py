@@ -43,6 +43,7 @@ setup(
         "report": ["rosbags>=0.11", "matplotlib>=3.5"],
         "fast": ["numba>=0.57"],
         "engines": ["mujoco>=4", "pin>=4"],
+        "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
         "test": [
             "colcon-common-extensions",
             "hypothesis",

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one evaluation and one step cost: numba, plain Python, and C from the same traced program.
+
+python -m benchmark.kernel [--scene example2] [--rounds 15] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numba
+import numpy as np
+
+from benchmark import c_floor, machine
+from benchmark.timing import interleaved, ratio
+from sst_ros import scene as scenes
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.trace import Program
+from sst_ros.simulation import Simulation
+
+METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}
+FLAGS = {"C -O3": ("-O3",), "C -O3 -march=native": ("-O3", "-march=native")}
+NUMBA, PLAIN = "numba", "plain Python"
+STEPS, STEP = 1000, 1e-4
+AT_MOST_C, AT_MOST_PLAIN = 1.3, 60e-6
+
+_SLOPES = """
+def slopes(count, y):
+    for i in range(count):
+        {names} = rhs(i * 1e-9, {state})
+        {updates}
+    return y[0]
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.kernel", description=__doc__)
+    parser.add_argument("--scene", default="example2")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    scene = scenes.load(options.scene)
+    system = System(Dynamics(scene), scene.torque)
+    start = Simulation(scene).state
+    y = [*start.quaternion, *start.body_rate]
+    if len(system.state) != 7 or system.drive:
+        parser.error("needs a scene with a torque, without lag or moment from a topic")
+    with_c = c_floor.compiler() is not None
+    if not with_c:
+        print("gcc is missing: NO C FLOOR. Only numba and plain Python are timed.", file=sys.stderr)
+    with tempfile.TemporaryDirectory() as folder:
+        calls = _calls(system, y, Path(folder) if with_c else None)
+        seconds = interleaved(calls, options.rounds, shortest=5e-3)
+    told = machine.described("numpy", "numba", "llvmlite")
+    if with_c:
+        told["gcc"] = c_floor.version()
+    rows = _rows(seconds)
+    _print(rows, told, options, sum(system.program.operations.values()))
+    if options.json:
+        document = {"machine": told, "scene": options.scene, "rows": rows}
+        options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def _calls(
+    system: System, y: list[float], folder: Path | None
+) -> dict[tuple[str, str], Callable[[], Any]]:
+    """What is timed, by (work, who): STEPS evaluations or steps each."""
+    calls: dict[tuple[str, str], Callable[[], Any]] = {}
+    slopes = _numba_slopes(system.program)
+    start = np.array(y)
+    calls["evaluation", NUMBA] = lambda: slopes(STEPS, start.copy())
+    plain_slopes = _plain_slopes(system.program)
+    calls["evaluation", PLAIN] = lambda: plain_slopes(STEPS, list(y))
+    for name, method in METHODS.items():
+        fast = Machine(system, method, compiled=True)
+        plain = Machine(system, method, compiled=False)
+        work = f"{name} step"
+        calls[work, NUMBA] = lambda fast=fast: fast.march(0.0, STEP, STEPS, y, [])
+        calls[work, PLAIN] = lambda plain=plain: plain.march(0.0, STEP, STEPS // 10, y, [])
+        if folder is not None:
+            _add_c(calls, c_floor.source(system.program, method), y, folder, name, fast)
+    return calls
+
+
+def _add_c(calls: Any, text: str, y: list[float], folder: Path, name: str, fast: Machine) -> None:
+    array = ctypes.c_double * len(y)
+    expected = fast.march(0.0, STEP, STEPS, y, [])
+    for index, (who, flags) in enumerate(FLAGS.items()):
+        library = c_floor.built(text, folder, f"{name}_{index}", *flags)
+        state, error = array(*y), array()
+        library.march(0.0, STEP, STEPS, state, error)
+        apart = max(abs(a - b) for a, b in zip(state, expected, strict=True))
+        if not apart < 1e-12:
+            raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
+
+        def march(library: Any = library, error: Any = error) -> Any:
+            return library.march(0.0, STEP, STEPS, array(*y), error)
+
+        def slopes(library: Any = library) -> Any:
+            return library.slopes(STEPS, array(*y))
+
+        calls[f"{name} step", who] = march
+        calls.setdefault(("evaluation", who), slopes)
+
+
+def _numba_slopes(program: Program) -> Callable[..., float]:
+    """A compiled loop of evaluations, each at what the last one gives."""
+    return _chain(program, numba.njit(error_model="numpy"))
+
+
+def _plain_slopes(program: Program) -> Callable[..., float]:
+    return _chain(program, lambda function: function)
+
+
+def _chain(program: Program, compiled: Callable[[Any], Any]) -> Callable[..., float]:
+    size = len(program.outputs)
+    text = _SLOPES.format(
+        names=", ".join(f"k{j}" for j in range(size)),
+        state=", ".join(f"y[{j}]" for j in range(size)),
+        updates="; ".join(f"y[{j}] += 1e-9 * k{j}" for j in range(size)),
+    )
+    names: dict[str, Any] = {}
+    exec("from math import atan2, cos, exp, sin, sqrt, tanh\n" + program.source("rhs"), names)
+    names["rhs"] = compiled(names["rhs"])
+    exec(text, names)
+    function: Callable[..., float] = compiled(names["slopes"])
+    return function
+
+
+def _rows(seconds: dict[tuple[str, str], list[float]]) -> list[dict[str, Any]]:
+    rows = []
+    for work, who in seconds:
+        count = STEPS // 10 if who == PLAIN and work != "evaluation" else STEPS
+        row = {"work": work, "who": who, "ns": 1e9 * median(seconds[work, who]) / count}
+        floor = (work, "C -O3")
+        if floor in seconds and who != PLAIN:
+            row["over_c"] = ratio(seconds, (work, who), floor)
+        rows.append(row)
+    order = list(dict.fromkeys(row["work"] for row in rows))
+    return sorted(rows, key=lambda row: (order.index(row["work"]), row["ns"]))
+
+
+def _print(rows: list[dict[str, Any]], told: dict[str, str], options: Any, size: int) -> None:
+    print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
+    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
+    print(f"{'work':16}{'who':24}{'time':>12}{'over C -O3':>12}")
+    for row in rows:
+        ratio_told = f"{row['over_c']:.2f}" if "over_c" in row else ""
+        time_told = f"{row['ns']:.0f} ns" if row["ns"] < 1e4 else f"{row['ns'] / 1e3:.1f} us"
+        print(f"{row['work']:16}{row['who']:24}{time_told:>12}{ratio_told:>12}")
+    print()
+    for row in rows:
+        if row["who"] == NUMBA and "over_c" in row:
+            met = "met" if row["over_c"] <= AT_MOST_C else "MISSED"
+            print(f"{row['work']}: numba over C {row['over_c']:.2f}, target {AT_MOST_C}: {met}")
+        if row["who"] == PLAIN and row["work"] == "rk4 step":
+            met = "met" if row["ns"] <= 1e9 * AT_MOST_PLAIN else "MISSED"
+            print(f"plain rk4 step {row['ns'] / 1e3:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
+    print("\n" + machine.line(told))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

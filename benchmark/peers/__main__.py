@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Error against wall time on one second of Example 2, for sst_ros and its peers.
+
+python -m benchmark.peers [--quick] [--rounds N] [--only ENGINE ...] [--out FOLDER] [--no-page]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import sys
+import time
+from pathlib import Path
+
+from benchmark.peers import page, picture, reference, results
+from benchmark.peers.series import Series
+from benchmark.peers.study import studied
+from benchmark.peers.task import Task
+from sst_ros.integration.backend import numba_version
+
+MODULES = {
+    "ours": "numba",
+    "mujoco_peer": "mujoco",
+    "pinocchio_peer": "pinocchio",
+    "drake_peer": "pydrake",
+    "exudyn_peer": "exudyn",
+    "scipy_peer": "scipy",
+}
+"""Who brings series, and the module without which it has none."""
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the study; the exit status is 1 where an engine fails its gate."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.peers", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="smaller sweep, 3 rounds")
+    parser.add_argument("--rounds", type=int, help="rounds of timing (9; quick: 3)")
+    parser.add_argument("--only", nargs="+", choices=MODULES, help="these engines and ours")
+    parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md and the rest")
+    parser.add_argument("--no-page", action="store_true", help="table on the terminal only")
+    options = parser.parse_args(arguments)
+    if numba_version() is None:
+        parser.error("needs numba, which compiles our side and MuJoCo's torques: pip install numba")
+    begin = time.monotonic()
+    task = Task()
+    series, missing = collected(task, options.quick, options.only)
+    truth = reference.solved(task, lambda done, of: told("reference", done, of))
+    rounds = options.rounds or (3 if options.quick else 9)
+    curves = studied(task, truth, series, rounds, told)
+    seconds = time.monotonic() - begin
+    result = results.Results(curves, missing, truth.error, rounds, options.quick, seconds)
+    told("", 0, 0)
+    print(results.table(result))
+    if not options.no_page:
+        options.out.mkdir(parents=True, exist_ok=True)
+        results.write(result, options.out)
+        picture.draw(result, options.out / "peers.png")
+        page.write(result, options.out / "peers.md")
+        print(f"\nWritten: {options.out}/peers.md, .png, .csv, .json")
+    return 0 if all(curve.passed for curve in curves) else 1
+
+
+def collected(
+    task: Task, quick: bool, only: list[str] | None = None
+) -> tuple[list[Series], dict[str, str]]:
+    """Series of all engines that are installed, and why the others have none."""
+    found: list[Series] = []
+    missing: dict[str, str] = {}
+    for name, needed in MODULES.items():
+        if only and name not in ("ours", *only):
+            continue
+        module = importlib.import_module(f"benchmark.peers.{name}")
+        if importlib.util.find_spec(needed) is None:
+            missing[module.ENGINE] = f"not installed (pip install {module.PACKAGE})"
+            continue
+        found += module.series(task, quick)
+    return found, missing
+
+
+def told(what: str, done: int, of: int) -> None:
+    """Progress on a terminal; nothing in a pipe."""
+    if not sys.stderr.isatty():
+        return
+    share = f"{done}/{of}" if of else ""
+    print(f"\r\033[K{what} {share}", end="", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

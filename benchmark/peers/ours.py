@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""sst_ros: fixed steps of the explicit methods, compiled and as plain Python."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmark.peers.series import Run, Series, Setting, ladder
+from benchmark.peers.task import DURATION, Moving, Pose, Task
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4, Tableau
+
+ENGINE, PACKAGE = "sst_ros", "numba"
+
+# Ladders end where rounding begins: below 2e-14 rad the doubles of the reference are seen.
+METHODS = {
+    "DOP853": (DOP853, 5, 80),
+    "Dormand-Prince 5": (DORMAND_PRINCE, 6, 500),
+    "RK4": (RK4, 6, 3000),
+}
+
+
+def series(task: Task, quick: bool) -> list[Series]:
+    """Three methods under numba, and DOP853 without."""
+    factor = 1.6 if quick else 1.15
+    found = []
+    for name, (tableau, first, last) in METHODS.items():
+        found.append(_series(task, f"{name}, numba", tableau, True, ladder(first, last, factor)))
+    plain = ladder(5, 80, 2.0 if quick else 1.3)
+    return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
+
+
+def _series(task: Task, name: str, tableau: Tableau, compiled: bool, counts: list[int]) -> Series:
+    machine = Machine(task.system, tableau, compiled=compiled)
+
+    def acceleration(at: Moving) -> np.ndarray:
+        return task.kernel_answer(at.y, at.torque)
+
+    def setting(steps: int) -> Setting:
+        def whole() -> list[float]:
+            return machine.march(0.0, DURATION / steps, steps, task.start, [])
+
+        def poses(pieces: int) -> list[Pose]:
+            y, found = task.start, []
+            for piece in range(pieces):
+                y = machine.march(
+                    piece * DURATION / pieces, DURATION / steps, steps // pieces, y, []
+                )
+                found.append(task.pose_of(y))
+            return found
+
+        return Setting(f"{steps} steps", steps, lambda: Run(whole, poses))
+
+    where = "nowhere" if compiled else "everywhere"
+    return Series(ENGINE, name, where, 1e-12, acceleration, [setting(n) for n in counts])

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the study found, as a table, as CSV and as JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmark import machine
+from benchmark.peers.ours import ENGINE as OURS
+from benchmark.peers.study import TARGETS, Curve, Reached, reached
+
+PACKAGES = ("numpy", "numba", "mujoco", "pin", "drake", "exudyn", "scipy", "mpmath")
+
+CLAIMS = (
+    ("MuJoCo", "MuJoCo's best setting", {1e-6: 1000, 1e-9: 2000}),
+    ("Pinocchio", "Pinocchio in a Python loop", {1e-6: 300, 1e-9: 800}),
+    ("SciPy on the paper's form", "SciPy on the NumPy form", {1e-6: 10000, 1e-9: 10000}),
+)
+"""Engine, what it is called, and how many times sooner we want to be there, by error."""
+
+
+@dataclass
+class Results:
+    """Everything that is told about a study."""
+
+    curves: list[Curve]
+    missing: dict[str, str]
+    reference_error: float
+    rounds: int
+    quick: bool
+    seconds: float
+    machine: dict[str, str] = field(default_factory=lambda: machine.described(*PACKAGES))
+
+    @property
+    def engines(self) -> list[str]:
+        """Names of the engines that passed, ours first."""
+        return list(dict.fromkeys(c.series.engine for c in self.curves if c.passed))
+
+    def best(self, engine: str, target: float) -> Reached:
+        """How soon an engine reaches an error by any of its series."""
+        return reached([c for c in self.curves if c.series.engine == engine], target)
+
+    def ratio(self, other: Reached, target: float) -> float | None:
+        """How many times sooner we reach it: median of the quotients of each round."""
+        ours = self.best(OURS, target).point
+        if ours is None or other.point is None:
+            return None
+        return median(a / b for a, b in zip(other.point.seconds, ours.seconds, strict=True))
+
+    def claims(self) -> list[tuple[str, float, int, float | None]]:
+        """Name, error, wanted and found ratio of each claim on an engine that is here."""
+        return [
+            (name, target, wanted, self.ratio(self.best(engine, target), target))
+            for engine, name, wants in CLAIMS
+            if engine in self.engines
+            for target, wanted in wants.items()
+        ]
+
+
+def rows(results: Results) -> list[list[str]]:
+    """Cells of the table, heads first: one row a series, then one an engine."""
+    heads = ["engine", "method", "Python runs", "gate", *(f"{t:.0e} rad" for t in TARGETS)]
+    found = [heads]
+    for curve in results.curves:
+        series = curve.series
+        gate = f"{curve.gate:.0e}" if curve.passed else f"{curve.gate:.0e} FAILED"
+        cells = [_cell(results, reached([curve], target), target) for target in TARGETS]
+        found.append([series.engine, series.name, series.python, gate, *cells])
+    return found
+
+
+def best_rows(results: Results) -> list[list[str]]:
+    """Heads, then the best of each engine, with the settings that did it."""
+    found = [["engine, best of all settings", *(f"{t:.0e} rad" for t in TARGETS)]]
+    for engine in results.engines:
+        cells = [_cell(results, results.best(engine, target), target) for target in TARGETS]
+        found.append([engine, *cells])
+    found += [[engine, *(["not installed"] * len(TARGETS))] for engine in results.missing]
+    return found
+
+
+def verdicts(results: Results) -> list[str]:
+    """One sentence a claim."""
+    told = []
+    for name, target, wanted, ratio in results.claims():
+        if ratio is None:
+            told.append(
+                f"{target:.0e} rad: {name}: no setting tried gets there (wanted {wanted:,} x)"
+            )
+            continue
+        verdict = "met" if ratio >= wanted else "NOT met"
+        told.append(
+            f"{target:.0e} rad: {_rounded(ratio)} x sooner than {name}"
+            f" (wanted {wanted:,} x: {verdict})"
+        )
+    return told
+
+
+def reference_line(results: Results) -> str:
+    """How well the reference is known."""
+    return (
+        f"Reference: extrapolation in mpmath, two step sizes {results.reference_error:.0e} rad"
+        " apart, kept as doubles (2e-16)"
+    )
+
+
+def table(results: Results) -> str:
+    """Text for the terminal."""
+    parts = [
+        "One second of Example 2. Wall time [ms] to an error of the orientation at the end, and",
+        "how many times that is ours. '-': not reached by any setting tried.",
+        "",
+        _aligned(rows(results)),
+        "",
+        _aligned(best_rows(results)),
+        "",
+        *verdicts(results),
+        "",
+        reference_line(results) + ".",
+        f"{machine.line(results.machine)}; medians of {results.rounds} interleaved rounds;"
+        f" {results.seconds:.0f} s in all.",
+        *(f"{engine}: {why}." for engine, why in results.missing.items()),
+    ]
+    return "\n".join(parts)
+
+
+def write(results: Results, folder: Path) -> None:
+    """Write peers.csv, one row a setting that was timed or failed, and peers.json."""
+    points = [point for curve in results.curves for point in _points(curve)]
+    with (folder / "peers.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(points[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(points)
+    document = {
+        "machine": results.machine,
+        "rounds": results.rounds,
+        "quick": results.quick,
+        "reference_error_rad": results.reference_error,
+        "missing": results.missing,
+        "settings_run": sum(len(curve.points) for curve in results.curves),
+        "gates": {
+            f"{c.series.engine}: {c.series.name}": {
+                "relative_difference": c.gate,
+                "tolerance": c.series.tolerance,
+            }
+            for c in results.curves
+        },
+        "reached": [
+            _reached(engine, "", results.best(engine, target), results, target)
+            for engine in results.engines
+            for target in TARGETS
+        ]
+        + [
+            _reached(c.series.engine, c.series.name, reached([c], target), results, target)
+            for c in results.curves
+            for target in TARGETS
+        ],
+        "verdicts": verdicts(results),
+    }
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    (folder / "peers.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _points(curve: Curve) -> list[dict[str, Any]]:
+    return [
+        {
+            "engine": curve.series.engine,
+            "method": curve.series.name,
+            "setting": point.setting.label,
+            "steps": point.setting.steps or "",
+            "error_at_end_rad": _number(point.error),
+            "largest_error_rad": _number(point.largest),
+            "gamma_error_at_end_rad": _number(point.gamma),
+            "median_ms": _number(1e3 * point.time),
+            "min_ms": _number(1e3 * min(point.seconds)) if point.seconds else "",
+            "failed": point.failed,
+        }
+        for point in curve.points
+        if point.seconds or point.failed
+    ]
+
+
+def _reached(
+    engine: str, method: str, found: Reached, results: Results, target: float
+) -> dict[str, Any]:
+    return {
+        "engine": engine,
+        "method": method or "best of all",
+        "error_rad": target,
+        "ms": None if found.time is None else 1e3 * found.time,
+        "interpolated_ms": None if found.between is None else 1e3 * found.between,
+        "setting": None if found.point is None else found.point.setting.label,
+        "over_ours": results.ratio(found, target),
+    }
+
+
+def _cell(results: Results, found: Reached, target: float) -> str:
+    if found.time is None:
+        return "-"
+    ratio = results.ratio(found, target)
+    told = "" if ratio is None else f" ({_rounded(ratio)} x)"
+    return f"{1e3 * found.time:.3g}{told}"
+
+
+def _rounded(ratio: float) -> str:
+    return f"{ratio:.2g}" if ratio < 10 else f"{float(f'{ratio:.2g}'):,.0f}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else ""
+
+
+def _aligned(cells: list[list[str]]) -> str:
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])

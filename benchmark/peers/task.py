@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The work that every engine gets: seven links, three torques over time, one second from rest."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sst_ros import scene as scenes
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853
+from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.simulation import Simulation
+
+DURATION = 1.0
+JOINTS = ("g0", "m0", "b0", "g1", "m1", "g2", "m2")
+"""Joints of the tree: gamma (g) and mu (m) of each leg; the star hangs on leg 1 by beta (b)."""
+
+KINDS = {"g": 0, "m": 3, "b": 6}
+
+
+class Pose(NamedTuple):
+    """Where an engine has the mechanism: R of the star in {B}, and gamma [rad] of its own."""
+
+    rotation: Array
+    gamma: Array
+
+
+class Moving(NamedTuple):
+    """A state to compare accelerations at; joints as differences to the start.
+
+    Attributes:
+        time: [s].
+        y: quaternion and body rate.
+        position, velocity: of the tree's joints by name [rad, rad/s].
+        torque: at that time [N m].
+        answer: gamma_ddot of the paper's equations [rad/s^2].
+
+    """
+
+    time: float
+    y: list[float]
+    position: dict[str, float]
+    velocity: dict[str, float]
+    torque: Array
+    answer: Array
+
+
+class Task:
+    """Example 2 with its torques as continuous functions of time.
+
+    Attributes:
+        frames: rotations at the start by body: s, a0..a2, i0..i2.
+        tensors: inertias about O in these frames [kg m^2].
+        w, r, t: axes at the start in {B}, rows by leg.
+
+    """
+
+    def __init__(self) -> None:
+        self.scene = scenes.load("example2")
+        assert self.scene.torque is not None
+        self.torque = self.scene.torque
+        self.dynamics = Dynamics(self.scene)
+        self.system = System(self.dynamics, self.torque)
+        self.geometry = geometry = Geometry.of(self.scene)
+        start = Simulation(self.scene).state
+        self.start = [*start.quaternion, *start.body_rate]
+        self.gamma = np.array(self.scene.initial.gamma)
+        rotation = rotation_matrix(np.array(start.quaternion))
+        across = np.cross(geometry.w, geometry.v)
+        self.w, self.t = geometry.w, geometry.e @ rotation.T
+        self.r = np.cos(self.gamma)[:, None] * geometry.v + np.sin(self.gamma)[:, None] * across
+        self.frames = {"s": rotation}
+        self.tensors = {"s": self.scene.star_inertia}
+        for k in range(3):
+            r, w, t = self.r[k], self.w[k], self.t[k]
+            self.frames[f"a{k}"] = np.stack([r, np.cross(w, r), w], 1)
+            self.frames[f"i{k}"] = np.stack([r, np.cross(t, r), t], 1)
+            self.tensors[f"a{k}"] = self.scene.actuated_inertias[k]
+            self.tensors[f"i{k}"] = self.scene.intermediate_inertias[k]
+
+    def tensor(self, body: str) -> Array:
+        """Inertia about O at the start in {B}."""
+        frame = self.frames[body]
+        return np.asarray(frame @ self.tensors[body] @ frame.T)
+
+    def sines(self) -> list[tuple[float, float, float]]:
+        """Amplitude [N m], frequency [rad/s] and phase [rad] of each torque."""
+        torque = self.torque
+        return list(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
+
+    def torque_at(self, time: float) -> list[float]:
+        """Torques [N m]."""
+        return [a * math.sin(f * time + p) for a, f, p in self.sines()]
+
+    def pose_of(self, y: list[float]) -> Pose:
+        """Pose of a state (q, W)."""
+        gamma = np.array(self.dynamics.joints(*y[:7])[:3])
+        return Pose(rotation_matrix(np.array(y[:4])), gamma)
+
+    def kernel_answer(self, y: list[float], torque: Array) -> Array:
+        """gamma_ddot [rad/s^2] of the kernel that sst_ros runs."""
+        rate = np.array(self.dynamics.acceleration(*y, *torque))
+        reach = np.array(self.dynamics.reach(*y))
+        return np.asarray(reach[:9].reshape(3, 3) @ rate + reach[9:])
+
+    def at_once(self, at: Moving, mean: Array, begin: float, end: float) -> Array:
+        """Acceleration at a moving state from its mean over begin .. end after it.
+
+        For engines that only make steps: what the true mean differs from the true acceleration
+        is taken off.
+        """
+        machine = Machine(self.system, DOP853, compiled=False)
+        rates = []
+        for time in (begin, end):
+            y = machine.march(at.time, time, 1, at.y, []) if time else at.y
+            rates.append(np.array(self.dynamics.joints(*y)[9:12]))
+        return np.asarray(mean - (rates[1] - rates[0]) / (end - begin) + at.answer)
+
+    @cached_property
+    def moving(self) -> list[Moving]:
+        """States of the motion itself, well after its start."""
+        machine = Machine(self.system, DOP853, compiled=False)
+        return [self._moving(time, machine.march(0.0, time / 50, 50, self.start, []))
+                for time in (0.21, 0.53, 0.87)]  # fmt: skip
+
+    def _moving(self, time: float, y: list[float]) -> Moving:
+        first, now = (np.array(self.dynamics.joints(*state)) for state in (self.start, y))
+        turn = now[:9] - first[:9]
+        turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+        places = {joint: KINDS[joint[0]] + int(joint[1]) for joint in JOINTS}
+        posture = virtual_work.posture(self.geometry, now[:3], rotation_matrix(np.array(y[:4])))
+        mechanism = virtual_work.Mechanism.of(self.scene)
+        torque = np.array(self.torque_at(time))
+        answer = virtual_work.direct_dynamics(mechanism, posture, now[9:12], torque)
+        return Moving(
+            time,
+            y,
+            {joint: float(turn[place]) for joint, place in places.items()},
+            {joint: float(now[9 + place]) for joint, place in places.items()},
+            torque,
+            answer,
+        )
+
+
+def apart(first: Array, second: Array) -> float:
+    """Angle [rad] between two rotations, accurate when it is small."""
+    e = first @ second.T
+    sine = 0.5 * np.array([e[2, 1] - e[1, 2], e[0, 2] - e[2, 0], e[1, 0] - e[0, 1]])
+    return float(np.arctan2(np.linalg.norm(sine), 0.5 * (np.trace(e) - 1.0)))
+
+
+def relative(found: Array, expected: Array) -> float:
+    """Length of the difference over the length of what is expected."""
+    return float(np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected))

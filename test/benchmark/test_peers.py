@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gates of the peers benchmark: who may be compared, on what, against which truth.
+
+Engines that are not installed are skipped; nothing is timed here.
+"""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = str(Path(__file__).parents[2])
+
+
+@pytest.fixture(scope="module")
+def peers():
+    """Import from benchmark/peers, which is not part of the package."""
+    sys.path.insert(0, ROOT)
+    yield lambda name: importlib.import_module(f"benchmark.peers.{name}")
+    sys.path.remove(ROOT)
+
+
+@pytest.fixture(scope="module")
+def task(peers):
+    return peers("task").Task()
+
+
+def test_kernel_and_paper_agree_where_engines_are_gated(peers, task):
+    for at in task.moving:
+        assert np.linalg.norm(list(at.velocity.values())) > 0.5
+        assert peers("task").relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("module", "needs"),
+    [
+        ("mujoco_peer", ("mujoco", "numba")),
+        ("pinocchio_peer", ("pinocchio",)),
+        ("drake_peer", ("pydrake",)),
+        ("exudyn_peer", ("exudyn",)),
+        ("scipy_peer", ("scipy",)),
+    ],
+)
+def test_gate(peers, task, module, needs):
+    for name in needs:
+        pytest.importorskip(name)
+    for series in peers(module).series(task, quick=True):
+        assert series.gate(task) <= series.tolerance, series.name
+
+
+def test_gate_sees_a_wrong_inertia(peers, task):
+    """One inertia wrong by 1e-3 must not get through."""
+    pytest.importorskip("pinocchio")
+    wrong = peers("task").Task()
+    wrong.tensors["i2"] = 1.001 * wrong.tensors["i2"]
+    series = peers("pinocchio_peer").series(wrong, quick=True)[0]
+    assert series.gate(task) > series.tolerance
+
+
+def test_short_runs_converge_to_each_other(peers, task):
+    """The whole path of one engine and ours: same end to the order of their steps."""
+    pytest.importorskip("numba")
+    pytest.importorskip("pinocchio")
+    ends = []
+    for module in ("ours", "pinocchio_peer"):
+        series = [s for s in peers(module).series(task, quick=True) if s.name.startswith("DOP853")]
+        setting = next(s for s in series[0].settings if s.steps >= 20)
+        ends.append(setting.prepare().poses(1)[0])
+    assert peers("task").apart(ends[0].rotation, ends[1].rotation) < 1e-7
+    assert np.abs(ends[0].gamma - ends[1].gamma).max() < 1e-7
+
+
+def test_extrapolation_reference_has_its_order(peers, task):
+    """Two steps of the reference's method, against the same with half the step."""
+    reference = peers("reference")
+    mp = reference.mp
+    with mp.workdps(reference.DIGITS):
+        slope = reference._slope(task)
+        start = [mp.mpf(number) for number in task.start]
+        h = mp.mpf(1) / 40
+        one = reference._extrapolated(slope, mp.mpf(0), h, start)
+        half = reference._extrapolated(slope, mp.mpf(0), h / 2, start)
+        two = reference._extrapolated(slope, h / 2, h / 2, half)
+        assert max(abs(a - b) for a, b in zip(one, two, strict=True)) < mp.mpf(10) ** -24
