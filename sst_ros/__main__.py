@@ -44,6 +44,20 @@ def _report_run(options: argparse.Namespace) -> None:
     print(table(report(options.bag, options.out or options.bag.parent / "report")))
 
 
+def _report_accuracy(options: argparse.Namespace) -> None:
+    from sst_ros.report.accuracy_run import report
+    from sst_ros.report.precise import EXTENDED, MPMATH
+
+    kind = MPMATH if options.mpmath else EXTENDED
+    report(options.scene or scene.names(), options.out, kind=kind)
+
+
+def _report_stability(options: argparse.Namespace) -> int:
+    from sst_ros.report.stability_run import report
+
+    return 0 if report(options.out) else 1
+
+
 def _scene_list(_: argparse.Namespace) -> None:
     for name in scene.names():
         print(f"{name:<18}{scene.load(name).description}")
@@ -90,11 +104,25 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("demo_out"), help="folder of the results")
     demo.set_defaults(run=_demo)
 
-    report = _group(commands.add_parser("report", help="judge a recorded run"))
+    report = _group(commands.add_parser("report", help="judge a recorded run, or the methods"))
     run = report.add_parser("run", help="error against run time of a bag")
     run.add_argument("bag", type=Path, help="folder of the bag")
     run.add_argument("--out", type=Path, help="folder of the results; default: beside the bag")
     run.set_defaults(run=_report_run)
+    accuracy = report.add_parser("accuracy", help="error against cost of every method and step")
+    accuracy.add_argument(
+        "--scene", nargs="+", metavar="S", help="names, or paths of .yaml files; default: all"
+    )
+    accuracy.add_argument(
+        "--out", type=Path, default=Path("accuracy_out"), help="folder of the results"
+    )
+    accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
+    accuracy.set_defaults(run=_report_accuracy)
+    stability = report.add_parser("stability", help="stiff and extreme cases, largest steps")
+    stability.add_argument(
+        "--out", type=Path, default=Path("stability_out"), help="folder of the results"
+    )
+    stability.set_defaults(run=_report_stability)
 
     scenes = _group(commands.add_parser("scene", help="look at scenes"))
     scenes.add_parser("list", help="the scenes that come with sst_ros").set_defaults(

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from sst_ros import scene
 from sst_ros.errors import SstError
+from sst_ros.integration import backend
 from sst_ros.report.run import report
 from sst_ros.report.table import table
 
@@ -49,7 +50,8 @@ def record(name: str, bag: Path) -> None:
     """
     duration = scene.load(name).duration or 1.0
     with _node("recorder", output=str(bag)) as recorder:
-        run = {"scene": name, "wait_for_command": True, "duration": duration}
+        compiled = backend.numba_version() is not None
+        run = {"scene": name, "wait_for_command": True, "duration": duration, "compiled": compiled}
         with _node("simulator", **run) as simulator:
             _wait_until_ready(recorder)
             with _node("torque_player", scene=name, wait_for_subscribers=2) as player:
@@ -62,7 +64,10 @@ def record(name: str, bag: Path) -> None:
 @contextmanager
 def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
     """Start a node of ours in a domain of this demo; it does not outlive the block."""
-    values = ((key, str(value).lower() if value is True else value) for key, value in given.items())
+    values = (
+        (key, str(value).lower() if isinstance(value, bool) else value)
+        for key, value in given.items()
+    )
     options = [word for key, value in values for word in ("-p", f"{key}:={value}")]
     process = subprocess.Popen(
         [sys.executable, "-m", "sst_ros", command, "--ros-args", *options],

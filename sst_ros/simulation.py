@@ -4,26 +4,30 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from sst_ros.errors import Diverged, InputError, Problem
+from sst_ros.integration.backend import numba_version
 from sst_ros.integration.journey import Journey, Point
 from sst_ros.integration.tableaux import METHODS
 from sst_ros.integration.walk import CannotStep, Change
-from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.kernel import Joints
+from sst_ros.mechanism.start import initial_state
 from sst_ros.scene import Scene
 
 NANOSECONDS = 1_000_000_000
 AUTO = "auto"
 INTEGRATORS = (AUTO, *METHODS)
+
 Triple = tuple[float, float, float]
 Torque: TypeAlias = Triple | Callable[[float], Triple]
 
@@ -57,14 +61,16 @@ class Simulation:
         tolerance: largest local error of a step: of the quaternion, and of the rate relative to
             its length. RK4 has no error estimate; it takes one pair of steps a call.
         compiled: run under numba; the digits are the same, the first step of a new scene takes
-            seconds.
+            seconds. Where there is no numba, a warning says so and plain Python runs.
 
     Attributes:
         geometry: constant vectors of the scene.
         dynamics: traced functions of the scene.
+        compiled: whether numba is used.
 
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
+        SingularConfiguration: it moves from a parallel singularity.
         InputError: the initial gamma lies outside the stroke, or an argument is not allowed.
 
     """
@@ -86,8 +92,12 @@ class Simulation:
         self.scene = scene
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics(scene)
+        self.compiled = compiled and numba_version() is not None
+        if compiled and not self.compiled:
+            said = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"
+            warnings.warn(said, RuntimeWarning, stacklevel=2)
         self._journey = Journey(
-            scene, self.geometry, self.dynamics, integrator, tolerance, compiled=compiled
+            scene, self.geometry, self.dynamics, integrator, tolerance, compiled=self.compiled
         )
         self._start = self._initial()
         self._given: tuple[Torque, tuple[float, ...]] = ((0.0, 0.0, 0.0), ())
@@ -139,15 +149,13 @@ class Simulation:
     @property
     def closure_residual(self) -> float:
         """Largest abs(r_k . t_k): how far the loops are from closed."""
-        r = kinematics.carriage_directions(self.geometry, self._state.joints.gamma)
-        t = self.geometry.e @ rotation_matrix(self._state.quaternion).T
+        r, t = self._directions(self._state.joints.gamma, self._state.quaternion)
         return float(np.abs(np.sum(r * t, axis=1)).max())
 
     @property
     def conditioning(self) -> dict[str, float]:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
-        r = kinematics.carriage_directions(self.geometry, self._state.joints.gamma)
-        t = self.geometry.e @ rotation_matrix(self._state.quaternion).T
+        r, t = self._directions(self._state.joints.gamma, self._state.quaternion)
         determinant = float(np.linalg.det(np.cross(t, r)))
         return {"sin_mu": min(map(math.sin, self._state.joints.mu)), "det_j2": determinant}
 
@@ -231,10 +239,11 @@ class Simulation:
             ends = ", ".join(f"{arc:.6f}" for arc in self.geometry.arc)
             allowed = f"must lie in the stroke, 0 to ({ends}) rad"
             raise InputError(self.scene.name, [Problem("initial.gamma", initial.gamma, allowed)])
-        assembly = kinematics.admissible(self.geometry, gamma)
-        posture = virtual_work.posture(self.geometry, gamma, assembly.rotation)
-        rate = assembly.rotation.T @ posture.j @ np.array(initial.gamma_dot)
-        return self._journey.begin([*quaternion_of(assembly.rotation).tolist(), *rate.tolist()])
+        return self._journey.begin(list(initial_state(self.scene, self.geometry)))
+
+    def _directions(self, gamma: Sequence[float], quaternion: Sequence[float]) -> tuple[Any, Any]:
+        r = kinematics.carriage_directions(self.geometry, np.array(gamma))
+        return r, self.geometry.e @ rotation_matrix(quaternion).T
 
 
 def _refuse_bad_input(torque: Torque, dt_ns: int, moment: Sequence[float]) -> None:

@@ -12,6 +12,7 @@ import hashlib
 import importlib.util
 import inspect
 import os
+import pickletools
 import platform
 import sys
 import tempfile
@@ -63,11 +64,13 @@ def rows(m, n):
 
 
 def numba_version() -> str | None:
-    """Version of numba, None where it is not installed or SST_ROS_NUMBA=0 says not to use it."""
-    if os.environ.get("SST_ROS_NUMBA") == "0" or importlib.util.find_spec("numba") is None:
+    """Version of numba, None where it cannot be imported or SST_ROS_NUMBA=0 says not to use it."""
+    if os.environ.get("SST_ROS_NUMBA") == "0":
         return None
-    import numba
-
+    try:
+        import numba
+    except ImportError:
+        return None
     return str(numba.__version__)
 
 
@@ -136,6 +139,7 @@ def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
 
 
 def _imported(path: Path) -> ModuleType:
+    _drop_damaged(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -143,6 +147,21 @@ def _imported(path: Path) -> ModuleType:
     sys.modules[path.stem] = module
     spec.loader.exec_module(module)
     return module
+
+
+def _drop_damaged(path: Path) -> None:
+    """Remove what numba has cached for a module if any of it is cut off: it would not load."""
+    cached = list((path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"))
+    try:
+        for file in cached:
+            with file.open("rb") as stream:
+                # An index is two pickles. Read, not run: they need modules that are not there yet.
+                for _ in range(2 if file.suffix == ".nbi" else 1):
+                    for _ in pickletools.genops(stream):
+                        pass
+    except Exception:  # what is damaged may raise anything
+        for file in cached:
+            file.unlink(missing_ok=True)
 
 
 def _executed(text: str, name: str) -> ModuleType:
@@ -165,6 +184,8 @@ def _cached_file(text: str) -> Path | None:
             # Two processes may write at once: each its own file, then one atomic rename.
             with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
                 file.write(text)
+            # numba's stamp is this time: the same for all, as the text is.
+            os.utime(file.name, (0, 0))
             Path(file.name).replace(path)
         with tempfile.TemporaryFile(dir=path.parent):
             return path

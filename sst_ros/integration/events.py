@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from scipy.optimize import brentq
+
+from sst_ros.limits import Limit
 
 Signal = Callable[[float], float]
 
 TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 
-_GRAZING = 1e-12
+GRAZING = 1e-12
 
 
 def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
@@ -24,9 +26,10 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
     """
     begin, end = 0.0, h
     rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
-    if margin(0.0) <= _GRAZING:
+    if margin(0.0) <= GRAZING:
         if not rising:
-            return 0.0 if margin(0.0) < -_GRAZING or slope(0.0) < 0.0 else None
+            leaves = slope(0.0) < 0.0 or margin(h) < -GRAZING  # from rest, the latter
+            return 0.0 if margin(0.0) < -GRAZING or leaves else None
         if margin(h) >= 0.0:
             return None
         # It grew first: the crossing lies behind the top.
@@ -38,6 +41,22 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
         if margin(end) >= 0.0:
             return None
     return _root(margin, begin, end)
+
+
+def first_met(
+    limits: Sequence[Limit], joints: Callable[[float], Sequence[float]], h: float
+) -> tuple[float, Limit] | None:
+    """Return the limit that is met first in [0, h], and when; `joints` are those at a time."""
+    met = []
+    for limit in limits:
+        x = first_crossing(
+            lambda x: limit.margin(joints(x)),  # noqa: B023
+            lambda x: limit.slope(joints(x)),  # noqa: B023
+            h,
+        )
+        if x is not None:
+            met.append((x, limit))
+    return min(met, key=lambda pair: pair[0]) if met else None
 
 
 def _root(signal: Signal, begin: float, end: float) -> float:

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sst_ros.errors import ImpactsAccumulate
-from sst_ros.integration.events import first_crossing
+from sst_ros.integration import companion
+from sst_ros.integration.events import first_met
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import METHODS, Rosenbrock
-from sst_ros.integration.walk import Change, Leg, Walk
+from sst_ros.integration.touches import just_beyond, may_touch, touches_of
+from sst_ros.integration.walk import CannotStep, Change, Leg, Mark, Walk
 from sst_ros.limits import Limit, all_far, limits_of, ranges_of
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.compiled import compiled as plain
@@ -23,16 +25,19 @@ if TYPE_CHECKING:
     from sst_ros.simulation import State, Torque, Triple
 
 _IMPACTS_PER_PERIOD = 1000
+_ENDS_PER_PERIOD = 100_000
 _RESTING_RATE = 1e-7
-_ROUNDING = 64 * 2.220446049250313e-16
+
+Book = tuple[tuple[Limit, ...], float, int, Mark, Mark]
 
 
 class Point(NamedTuple):
-    """State y, companion z and joints (nine angles, nine rates) at one instant."""
+    """State y, its companion z by a method of that order, joints: nine angles, nine rates."""
 
     y: list[float]
     z: list[float]
     joints: tuple[float, ...]
+    order: int
 
 
 class Journey:
@@ -52,6 +57,7 @@ class Journey:
         self._dynamics = dynamics
         self._system = System(dynamics, work=True)
         self._limits = tuple(limits_of(scene, geometry))
+        self._kinks = tuple(touches_of(scene, geometry))
         self._ranges = ranges_of(self._limits)
         self._ends = RigidEnds(dynamics)
         self._limit = scene.actuators.torque_limit if scene.actuators else None
@@ -62,16 +68,23 @@ class Journey:
         self._rhs: Callable[..., tuple[float, ...]] | None = None
         self._torque: Callable[[float], Triple] | None = None
         self._start = 0.0
-        self.reset()
+        self._resting: tuple[Limit, ...] = ()
+        self._legs, self._lost = 0, 0.0
+        self._first = self._book = self._mark()
 
     def reset(self) -> None:
         """Forget what has happened."""
-        self._resting: tuple[Limit, ...] = ()
-        self._legs = 0
-        self._lost = 0.0
-        self._order = 99
-        self._book: tuple[tuple[Limit, ...], float, int, int] = ((), 0.0, 0, 99)
-        self._walk.history.clear()
+        self._go_back(self._first)
+        self._book = self._first
+
+    def _mark(self) -> Book:
+        """All that the next steps depend on beside the point at which they begin."""
+        return self._resting, self._lost, self._legs, self._walk.mark(), self._slow.mark()
+
+    def _go_back(self, mark: Book) -> None:
+        self._resting, self._lost, self._legs, fast, slow = mark
+        self._walk.go_back(fast)
+        self._slow.go_back(slow)
 
     @property
     def method(self) -> str:
@@ -86,7 +99,7 @@ class Journey:
     def begin(self, y: list[float]) -> Point:
         """Complete quaternion and body rate to a state; no torque yet, no work done."""
         full = [*y, *(0.0,) * (len(self._system.state) - 7)]
-        return Point(full, list(full), self._dynamics.joints(*full[:7]))
+        return Point(full, list(full), self._dynamics.joints(*full[:7]), self._walk.method.order)
 
     def limited(self, torque: Triple) -> Triple:
         """Clamp torques to the limit of the actuators."""
@@ -97,15 +110,7 @@ class Journey:
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
-        ahead = math.dist(at.y[:4], at.z[:4]), math.dist(at.y[:4], [-x for x in at.z[:4]])
-        apart = (2.0 * min(ahead), math.dist(at.y[4:7], at.z[4:7]))
-        rounding = _ROUNDING * math.sqrt(self._legs + 1.0)
-        share = 1.0 / (2.0**self._order - 1.0)
-        scale = (1.0, max(1.0, math.hypot(*at.y[4:7])))
-        first, second = (
-            max(d * share, min(d, rounding * s)) for d, s in zip(apart, scale, strict=True)
-        )
-        return first, second
+        return companion.errors(at.y, at.z, at.order, self._legs)
 
     def work(self, at: Point) -> float:
         """Work done on the manipulator, less what friction and impacts have taken [J]."""
@@ -127,42 +132,41 @@ class Journey:
             CannotStep: no step resolves the motion.
 
         """
-        kept = self._book = self._resting, self._lost, self._legs, self._order
-        self._start = start
+        kept = self._book = self._mark()
+        self._start = self._walk.origin = start
         self._torque = torque if callable(torque) else None
         drive = (*((0.0,) * 3 if callable(torque) else self.limited(torque)), *more)
         try:
-            x = 0.0
-            for _ in range(_IMPACTS_PER_PERIOD):
+            x, impacts = 0.0, 0
+            for _ in range(_ENDS_PER_PERIOD):
                 at, x, hit = self._until_limit(at, x, h, drive)
                 if hit is None:
                     self._release(at, h, drive)
                     return at
+                if hit in self._kinks:
+                    continue
                 if hit.error is not None:
                     raise hit.error(hit.reason, start + x, state)
-                at, reason = self._strike(at, hit), hit.reason
-            raise ImpactsAccumulate(reason, start + x, state)
+                impacts += 1
+                if impacts > _IMPACTS_PER_PERIOD:
+                    raise ImpactsAccumulate(hit.reason, start + x, state)
+                at = self._strike(at, hit, x, drive)
+            raise CannotStep(f"elastic ends are met {_ENDS_PER_PERIOD} times in one period")
         except Exception:
-            self._resting, self._lost, self._legs, self._order = kept
+            self._go_back(kept)
             raise
 
-    def revisited(
-        self,
-        at: Point,
-        start: float,
-        h: float,
-        torque: Torque,
-        more: tuple[float, ...],
-        state: State,
-    ) -> Point:
-        """Go a part of the last way again, and leave everything as it is now."""
-        now, began = (self._resting, self._lost, self._legs, self._order), self._book
-        self._resting, self._lost, self._legs, self._order = began
+    def revisited(self, *way: Any) -> Point:
+        """`travel` a part of the last way again, and leave everything as it is now."""
+        now, began = self._mark(), self._book
+        history = list(self._walk.history)
+        self._go_back(began)
         try:
-            return self.travel(at, start, h, torque, more, state)
+            return self.travel(*way)
         finally:
+            self._walk.history[:] = history
+            self._go_back(now)
             self._book = began
-            self._resting, self._lost, self._legs, self._order = now
 
     def _until_limit(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
@@ -170,53 +174,49 @@ class Journey:
         """Go on from x to h, or to the first limit that is met before."""
         slow = self._torque is not None or bool(self._resting)
         walk = self._slow if slow else self._walk
-        for leg in walk.legs(x, h, at.y, at.z, drive):
+        for leg in walk.legs(x, h, at.y, at.z, drive, at.order):
             self._legs += 1
-            self._order = min(self._order, walk.method.order)
             joints = self._dynamics.joints(*leg.y[:7])
-            if all_far(self._ranges, at.joints, joints):
-                at = Point(leg.y, leg.z, joints)
+            if not self._kinks and all_far(self._ranges, at.joints, joints):
+                at = Point(leg.y, leg.z, joints, leg.order)
                 continue
             near = [
                 limit
                 for limit in self._limits
                 if limit.may_be_crossed(at.joints, joints) and limit not in self._resting
             ]
-            met = self._first_met(near, walk, leg, at, drive) if near else None
+            near += [kink for kink in self._kinks if may_touch(kink, at.joints, joints)]
+            again = partial(self._part, walk, leg, at, drive)
+            met = first_met(near, lambda x: again(x).joints, leg.h) if near else None  # noqa: B023
             if met is not None:
-                leg = walk.retake(leg.t, met[0], at.y, at.z, drive)
-                return self._point(leg), leg.t + met[0], met[1]
-            at = Point(leg.y, leg.z, joints)
+                x, limit = met
+                if limit in self._kinks:
+                    x = just_beyond(limit, x, again(x).joints, leg.h)
+                return again(x), leg.t + x, limit
+            at = Point(leg.y, leg.z, joints, leg.order)
         return at, h, None
 
-    def _first_met(
-        self, near: list[Limit], walk: Walk, leg: Leg, at: Point, drive: tuple[float, ...]
-    ) -> tuple[float, Limit] | None:
-        def joints(x: float) -> tuple[float, ...]:
-            return self._dynamics.joints(*walk.retake(leg.t, x, at.y, at.z, drive).y[:7])
+    def _part(self, walk: Walk, leg: Leg, at: Point, drive: tuple[float, ...], x: float) -> Point:
+        """Go again from `at`, where a leg began, a part x [s] of it."""
+        y, z, order = walk.retake(leg.t, x, at.y, at.z, drive, at.order)
+        return Point(y, z, self._dynamics.joints(*y[:7]), order)
 
-        met = []
-        for limit in near:
-            x = first_crossing(
-                lambda x: limit.margin(joints(x)),  # noqa: B023
-                lambda x: limit.slope(joints(x)),  # noqa: B023
-                leg.h,
-            )
-            if x is not None:
-                met.append((x, limit))
-        return min(met, key=lambda pair: pair[0]) if met else None
-
-    def _strike(self, at: Point, limit: Limit) -> Point:
+    def _strike(self, at: Point, limit: Limit, x: float, drive: tuple[float, ...]) -> Point:
         """Bounce off a limit, or come to rest where the bounce is not worth the name."""
+        # The companion comes to the end a little earlier or later: go there, bounce, come back.
+        z = at.z
+        late = companion.time_to(limit, self._dynamics.joints(*z[:7]))
+        z = companion.moved(z, self._slope(x, *z, *drive), late)
         restitution = self._scene.stroke.restitution or 0.0
         if abs(limit.slope(at.joints)) * restitution < _RESTING_RATE:
             restitution = 0.0
             self._resting = (*self._resting, limit)
         before = self._kinetic(at.y)
         y = list(self._ends.after_impact(tuple(at.y), limit.leg, restitution))
-        z = list(self._ends.after_impact(tuple(at.z), limit.leg, restitution))
+        z = list(self._ends.after_impact(tuple(z), limit.leg, restitution))
+        z = companion.moved(z, self._slope(x, *z, *drive), -late)
         self._lost += before - self._kinetic(y)
-        return Point(y, z, self._dynamics.joints(*y[:7]))
+        return Point(y, z, self._dynamics.joints(*y[:7]), at.order)
 
     def _release(self, at: Point, h: float, drive: tuple[float, ...]) -> None:
         """Let go of ends that would have to pull."""
@@ -247,6 +247,3 @@ class Journey:
     def _kinetic(self, y: list[float]) -> float:
         size = len(self._dynamics.state)
         return self._dynamics.energies(*y[:size], *(0.0,) * len(self._dynamics.drive))[0]
-
-    def _point(self, leg: Leg) -> Point:
-        return Point(leg.y, leg.z, self._dynamics.joints(*leg.y[:7]))

@@ -25,7 +25,7 @@ class Machine:
     Args:
         system: what is integrated.
         method: how.
-        compiled: by numba; otherwise as plain Python.
+        compiled: by numba; otherwise, or where there is no numba, as plain Python.
         slope: rhs(t, state.., drive..) to use instead of the system's, plain and explicit only.
 
     """
@@ -35,7 +35,7 @@ class Machine:
     ) -> None:
         self.system = system
         self.method = method
-        self.compiled = compiled
+        self.compiled = compiled = compiled and backend.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
         if slope is not None and (implicit or compiled):
             raise ValueError("a slope of its own needs an explicit method and plain Python")

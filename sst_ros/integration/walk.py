@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.integration import companion
 from sst_ros.integration.machine import Machine, Method, Slope, Vector
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
@@ -21,12 +22,13 @@ _STIFF, _EASY = 2.0, 0.5
 
 
 class Leg(NamedTuple):
-    """One accepted step: where it began, its length, and the state and companion at its end."""
+    """One accepted step: where it began, its length, state and companion at its end, its order."""
 
     t: float
     h: float
     y: list[float]
     z: list[float]
+    order: int
 
 
 class CannotStep(ArithmeticError):
@@ -41,6 +43,9 @@ class Change(NamedTuple):
     reason: str
 
 
+Mark = tuple[Machine, float, int, int]
+
+
 class Walk:
     """Chooses methods and step sizes for a system.
 
@@ -51,6 +56,10 @@ class Walk:
             relative to its length.
         compiled: by numba.
         slope: see `Machine`; with it only explicit methods are used.
+
+    Attributes:
+        history: changes of method.
+        origin: time [s] of the run at which the times of `legs` are zero.
 
     """
 
@@ -73,14 +82,26 @@ class Walk:
         self._machine = self._machine_of(DORMAND_PRINCE if self._auto else METHODS[method])
         self._h = float("inf")
         self._since_look = 0
+        self.origin = 0.0
 
     @property
     def method(self) -> Method:
         """The method in use."""
         return self._machine.method
 
-    def legs(self, t: float, end: float, y: Vector, z: Vector, d: Vector) -> Iterator[Leg]:
-        """Step from t to end.
+    def mark(self) -> Mark:
+        """Return what the next steps depend on, to go back to."""
+        return self._machine, self._h, self._since_look, len(self.history)
+
+    def go_back(self, mark: Mark) -> None:
+        """Forget what has happened since `mark`."""
+        self._machine, self._h, self._since_look, changes = mark
+        del self.history[changes:]
+
+    def legs(
+        self, t: float, end: float, y: Vector, z: Vector, d: Vector, order: int
+    ) -> Iterator[Leg]:
+        """Step from t to end; `order` is that of the method that has made the companion z.
 
         Raises:
             CannotStep: steps shrink below the rounding of time, or the budget is used up.
@@ -91,6 +112,8 @@ class Walk:
             h = min(self._h, left)
             if left - h < 1e-3 * h:
                 h = left
+            z = companion.rescaled(y, z, order, self.method.order)
+            order = self.method.order
             new_y, new_z, size = self._machine.pair(t, h, y, z, d)
             factor = self._factor(size / self.tolerance)
             if size > self.tolerance:
@@ -101,17 +124,21 @@ class Walk:
                 continue
             if h < left or factor < 1.0 or self._h < float("inf"):
                 self._h = max(self._h, h * factor) if h == left else h * factor
-            yield Leg(t, h, new_y, new_z)
+            yield Leg(t, h, new_y, new_z, order)
+            if h < left or isinstance(self.method, Rosenbrock):
+                self._look(t + h, h, new_y, d)
             if h == left:
                 return
             t, y, z = t + h, new_y, new_z
-            self._look(t, h, y, d)
         raise CannotStep(f"{STEP_BUDGET} steps do not reach the end of the period")
 
-    def retake(self, leg_start: float, x: float, y: Vector, z: Vector, d: Vector) -> Leg:
-        """Repeat a step that was accepted, with the shorter length x."""
-        new_y, new_z, _ = self._machine.pair(leg_start, x, y, z, d) if x else (list(y), list(z), 0)
-        return Leg(leg_start, x, new_y, new_z)
+    def retake(
+        self, start: float, x: float, y: Vector, z: Vector, d: Vector, order: int
+    ) -> tuple[list[float], list[float], int]:
+        """Repeat a step that was accepted, with the shorter length x; state, companion, order."""
+        z = companion.rescaled(y, z, order, self.method.order)
+        new_y, new_z, _ = self._machine.pair(start, x, y, z, d) if x else (list(y), list(z), 0)
+        return new_y, new_z, self.method.order
 
     def _factor(self, size: float) -> float:
         if size == 0.0:
@@ -143,7 +170,7 @@ class Walk:
 
     def _change(self, t: float, method: Method, reason: str) -> None:
         self._machine = self._machine_of(method)
-        self.history.append(Change(t, method.name, reason))
+        self.history.append(Change(self.origin + t, method.name, reason))
 
     def spectrum(self, t: float, y: Vector, d: Vector) -> np.ndarray:
         """Eigenvalues of the exact Jacobian [1/s]."""

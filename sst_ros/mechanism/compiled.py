@@ -13,6 +13,7 @@ from sst_ros.mechanism.trace import Program, trace, with_jacobian
 from sst_ros.mechanism.triples import rotation_rows
 from sst_ros.scene import Scene
 
+FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
 Function = Callable[..., tuple[float, ...]]
 
 QUATERNION = ("x", "y", "z", "w")
@@ -106,7 +107,7 @@ def compiled(program: Program) -> Function:
 
     The function raises ArithmeticError or ValueError where a float has no value.
     """
-    names: dict[str, Any] = {name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "atan2")}
+    names: dict[str, Any] = {name: getattr(math, name) for name in FUNCTIONS}
     exec(program.source("function"), names)
     function: Function = names["function"]
     return function

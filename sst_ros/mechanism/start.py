@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene import Scene
+
+SINGULAR = 1.5e-5
+"""det J2 below which rounding, over its square, leaves a rate of gamma less than six digits."""
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
@@ -22,7 +26,13 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     """
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
     meant = None if initial.orientation is None else rotation_matrix(initial.orientation)
-    rotation = kinematics.admissible(geometry, gamma, meant).rotation
+    assembly = kinematics.admissible(geometry, gamma, meant)
+    rotation = assembly.rotation
+    if not any(initial.gamma_dot):
+        return (*quaternion_of(rotation).tolist(), 0.0, 0.0, 0.0)
+    if abs(assembly.det_j2) < SINGULAR:
+        said = "gamma_dot does not determine the body rate: parallel singularity, det J2"
+        raise SingularConfiguration(said, assembly.det_j2)
     at = virtual_work.posture(geometry, gamma, rotation)
     rate = rotation.T @ at.j @ np.array(initial.gamma_dot)
     return (*quaternion_of(rotation).tolist(), *rate.tolist())

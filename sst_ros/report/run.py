@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.report import figures, formulation, recording, reference, summary
+from sst_ros.report import figures, formulation, jitter, page, recording, reference, summary
 
-SUMMARY = "summary.json"
+SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
 
 def report(bag: Path, out: Path) -> dict[str, Any]:
-    """Judge a recorded run; write summary.json and the pictures into `out`.
+    """Judge a recorded run; write summary.json, the page and the pictures into `out`.
 
     Returns:
         The summary, as written; `table.table` makes it text.
@@ -29,8 +29,13 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
         out.mkdir(parents=True, exist_ok=True)
         integration, ideal = reference.integration(run), reference.ideal(run)
         result = summary.summarise(run, integration, ideal, formulation.check(run))
+        told = jitter.timing(run)
+        result |= jitter.numbers(told)
         pictures = figures.draw(run, integration, ideal, out)
         result["pictures"] = [path.name for path in pictures]
+        result["page"] = [PAGE, HTML]
+        page.draw(run, integration, told, result, out / PAGE)
+        page.write(result, out / PAGE, pictures, out / HTML)
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(text, encoding="utf-8")
     except OSError as error:

@@ -11,10 +11,12 @@ import math
 import os
 import platform
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sst_ros.integration.backend import numba_version
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report.formulation import Formulation
 from sst_ros.report.recording import Recording
@@ -51,7 +53,7 @@ def summarise(
         "effort_difference_max_N_m": _effort_difference(recording),
         "topics_missing": list(recording.missing),
         "notes": list(_notes(recording, integration, ideal)),
-        "report": _made_on(),
+        "report": made_on(),
     }
     return summary
 
@@ -159,7 +161,8 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
     return notes
 
 
-def _made_on() -> dict[str, Any]:
+def made_on() -> dict[str, Any]:
+    """Tell versions, machine and date of a report."""
     versions = {name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")}
     try:
         own = metadata.version("sst_ros")
@@ -169,10 +172,21 @@ def _made_on() -> dict[str, Any]:
         "sst_ros": own,
         "python": platform.python_version(),
         **versions,
+        "numba": numba_version(),
+        "processor": _processor(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
+
+
+def _processor() -> str:
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8") as file:
+            names = (line.partition(":")[2] for line in file if line.startswith("model name"))
+            return next(names, "").strip() or platform.machine()
+    except OSError:
+        return platform.machine()
 
 
 def _number(told: dict[str, str], key: str) -> float | None:

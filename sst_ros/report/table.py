@@ -39,6 +39,15 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield _row("gaps between stamps", summary["stamp_gaps"], "d", period)
     yield _row("gaps between applied torques", summary["tick_gaps"], "d")
     yield ""
+    for name, key in (
+        ("period of reception", "period"),
+        ("command to its tick", "command_latency"),
+    ):
+        for word in ("min", "mean", "p99", "p99_9", "max"):
+            label = f"{name}, {word.replace('_', '.')}"
+            yield _row(label, summary[f"{key}_{word}_us"], ".1f", "us")
+    yield _row("energy residual, largest", summary["energy_residual_max_J"], ".2e", "J")
+    yield ""
     heads = (f"{name} [{unit.replace('_per_', '/')}]" for name, unit in QUANTITIES.items())
     yield f"{'Largest over the run':{LABEL + 2}}" + "".join(f"{head:>{CELL}}" for head in heads)
     yield _errors("(a) integration error", "integration_error", summary)
@@ -54,9 +63,15 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     if summary["notes"]:
         yield ""
         yield from (f"Note: {note}." for note in summary["notes"])
-    made = summary["report"]
+    yield from (f"Not told: {words}." for words in summary["not_told"])
     yield ""
-    yield (
+    yield made_line(summary)
+
+
+def made_line(summary: dict[str, Any]) -> str:
+    """Tell versions, machine and date in one line."""
+    made = summary["report"]
+    return (
         f"sst_ros {made['sst_ros']}, Python {made['python']}, NumPy {made['numpy']}, "
         f"{made['platform']}, {made['processors']} processors, {made['date']}"
     )

@@ -38,3 +38,11 @@ def test_going_through_an_end_at_once_is_a_crossing_at_once():
 def test_staying_inside_is_no_crossing():
     assert crossing(lambda t: 1.0 + t, lambda t: 1.0, 1.0) is None
     assert crossing(lambda t: 2.0 - t, lambda t: -1.0, 1.0) is None
+
+
+def test_pushed_from_rest_through_an_end_is_a_crossing_at_once():
+    assert crossing(lambda t: -t * t, lambda t: -2.0 * t, 1.0) == 0.0
+
+
+def test_rest_at_an_end_is_no_crossing():
+    assert crossing(lambda t: -1e-16, lambda t: 0.0, 1.0) is None

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time to reach an error on stiff and smooth scenes: every method, plain Python and numba.
+
+Run: python benchmark/integrators.py [--plain]. Steps are fixed and double until the orientation at
+the end is right to the error; the time is the median of repeats, and methods are timed in turn.
+Ratios within one run are what counts. Truth: RODAS4 and DOP853 in many short steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+import statistics
+import sys
+import time
+from dataclasses import replace
+
+import numba
+import numpy as np
+
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import METHODS, RODAS4
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
+from sst_ros.simulation import Simulation
+
+REPEATS = 7
+MOST_STEPS = 2**20
+RESTS = (0.9, 0.7, 0.8)
+
+
+def sprung(stiffness, damping):
+    springs = [Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=RESTS[k]) for k in range(3)]
+    return replace(
+        load("example2"),
+        springs=tuple(springs),
+        friction=JointFriction(gamma=Friction(viscous=damping)),
+        torque=None,
+    )
+
+
+def scenes():
+    free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+    yield "viscous 1e3, 1 s", sprung(500.0, 1e3), 1.0
+    yield "viscous 1e5, 1 s", sprung(500.0, 1e5), 1.0
+    yield "PD 1e6, 1e4, 0.1 s", sprung(1e6, 1e4), 0.1
+    yield "example2, 1 s", replace(load("example2"), **free), 1.0
+
+
+def away(one, other):
+    p, q = np.array(one[:4]), np.array(other[:4])
+    distance = 2.0 * min(np.linalg.norm(p - q), np.linalg.norm(p + q))
+    return distance if math.isfinite(distance) else math.inf
+
+
+def counts_for(machine, arguments, truth, wanted, most):
+    """Smallest power of two of steps that reaches the error; None where none does."""
+    y, drive, span = arguments
+    count = 4
+    while count <= most:
+        try:
+            end = machine.march(0.0, span / count, count, y, drive)
+        except (ArithmeticError, ValueError):
+            end = [math.nan] * 4
+        if away(end, truth) <= wanted:
+            return count
+        count *= 2
+    return None
+
+
+def median_times(runs):
+    """Take turns, so that what disturbs the machine disturbs all."""
+    times = {name: [] for name in runs}
+    for _ in range(REPEATS):
+        for name, run in runs.items():
+            began = time.perf_counter()
+            run()
+            times[name].append(time.perf_counter() - began)
+    return {name: statistics.median(taken) for name, taken in times.items()}
+
+
+def compare(name, scene, span, wanted, compiled):
+    dynamics = Dynamics(scene)
+    system = System(dynamics, scene.torque)
+    state = Simulation(replace(scene, torque=None)).state
+    y = [*state.quaternion, *state.body_rate]
+    drive = (0.0, 0.0, 0.0)[: len(system.drive)]
+    arguments = (y, drive, span)
+    best = Machine(system, RODAS4, compiled=True)
+    truth = best.march(0.0, span / 2**15, 2**15, y, drive)
+    machines = {m.name: Machine(system, m, compiled=compiled) for m in METHODS.values()}
+    most = MOST_STEPS if compiled else 2**13
+    counts = {k: counts_for(m, arguments, truth, wanted, most) for k, m in machines.items()}
+    runs = {
+        k: lambda m=machines[k], n=n: m.march(0.0, span / n, n, y, drive)
+        for k, n in counts.items()
+        if n is not None
+    }
+    times = median_times(runs)
+    how = "numba" if compiled else "plain"
+    for key, count in counts.items():
+        taken = f"{1e3 * times[key]:10.3f} ms" if key in times else f"    > {most} steps"
+        print(f"{name:20} {how:6} {wanted:.0e}  {key:8} {count or '-':>8} steps {taken}")
+    explicit = [times[k] for k in times if k != "rodas4"]
+    if explicit and "rodas4" in times:
+        ratio = min(explicit) / times["rodas4"]
+        print(f"{name:20} {how:6} {wanted:.0e}  best explicit / rodas4 = {ratio:.3g}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plain", action="store_true", help="time plain Python too: minutes")
+    options = parser.parse_args()
+    print(f"{platform.machine()}, Python {sys.version.split()[0]}, ", end="")
+    print(f"numpy {np.__version__}, numba {numba.__version__}, {time.strftime('%Y-%m-%d')}")
+    for compiled in (True, False) if options.plain else (True,):
+        for name, scene, span in scenes():
+            for wanted in (1e-6, 1e-9):
+                compare(name, scene, span, wanted, compiled)
+
+
+if __name__ == "__main__":
+    main()

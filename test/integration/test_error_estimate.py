@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error that a run tells of itself, its energy balance and its closure.
+
+Truth: the same periods by DOP853 at tolerance 1e-14 (RODAS4 for the stiff scene). Its own estimate
+is asserted to be 20 times below the errors it judges; smaller errors are rounding, and only
+bounded.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import pytest
+from loaded_scenes import REST, apart, run
+
+from sst_ros.control.torque import sine
+from sst_ros.scene import load
+from sst_ros.simulation import Simulation
+
+ROUNDING = 1e-12
+PERIOD = 0.01
+SPANS = {
+    "example1": 0.5,
+    "example2": 1.0,
+    "example2_thin": 0.9,
+    "general": 1.0,
+    "friction": 1.0,
+    "fast_spin": 0.1,
+    "gravity_payload": 1.0,
+    "elastic_stops": 1.5,
+    "impacts": 1.5,
+    "stiff": 0.3,
+}
+
+
+def travelled(name, method, tolerance):
+    scene = load(name)
+    torque = sine(scene.torque) if scene.torque else REST
+    return run(Simulation(scene, method, tolerance=tolerance), SPANS[name], PERIOD, torque)
+
+
+@functools.cache
+def truth_of(name):
+    method, tolerance = ("rodas4", 1e-11) if name == "stiff" else ("dop853", 1e-14)
+    return travelled(name, method, tolerance)
+
+
+def slowly(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, "auto") for name in SPANS),
+        *(slowly(name, "dop853") for name in ("friction", "fast_spin", "elastic_stops", "impacts")),
+        *(slowly(name, "rodas4") for name in ("friction", "elastic_stops", "impacts", "general")),
+    ],
+)
+def test_the_estimate_is_within_ten_times_of_the_true_error(name, method, tolerance):
+    simulation, truth = travelled(name, method, tolerance), truth_of(name)
+    estimates = simulation.error_estimate, simulation.rate_error_estimate
+    own = truth.error_estimate, truth.rate_error_estimate
+    for estimate, error, its_own in zip(estimates, apart(simulation, truth), own, strict=True):
+        unsure = max(ROUNDING, 20.0 * its_own)
+        assert estimate > 0.1 * error - unsure
+        assert estimate < 12.0 * error + unsure
+
+
+@pytest.mark.parametrize("name", ["elastic_stops", "impacts"])
+def test_contacts_lose_no_order(name):
+    """Steps end where a force has its kink, so 100 times the accuracy costs few steps more."""
+    loose, tight, truth = (
+        travelled(name, "dop853", 1e-6),
+        travelled(name, "dop853", 1e-10),
+        truth_of(name),
+    )
+    assert apart(tight, truth)[0] < 1e-11
+    assert apart(loose, truth)[0] < 1e-8
+    assert tight._journey._legs < 1.5 * loose._journey._legs
+
+
+@pytest.mark.parametrize("name", list(SPANS))
+def test_energy_balance_and_closure_show_no_loss(name):
+    """The balance is judged at tolerance 1e-10 by the largest energy that turns over."""
+    simulation = travelled(name, "auto", 1e-10)
+    turned_over = max(1.0, simulation._energy)
+    assert abs(simulation.energy_residual) < 1e-8 * turned_over
+    assert simulation.closure_residual < 1e-15 * 8
+
+
+def energy_drift(seconds, *, compiled=False):
+    scene = replace(load("gravity_payload"), friction=None)
+    simulation = Simulation(scene, "dop853", tolerance=1e-14, compiled=compiled)
+    start = abs(simulation._energy)
+    worst = 0.0
+    for _ in range(round(seconds / 0.01)):
+        simulation.step(REST, 10_000_000)
+        worst = max(worst, abs(simulation.energy_residual))
+    return worst / max(start, 1.0)
+
+
+def test_springs_keep_their_energy_for_20_seconds():
+    assert energy_drift(20.0) < 1e-13
+
+
+@pytest.mark.slow
+def test_springs_keep_their_energy_for_1000_seconds():
+    assert energy_drift(1000.0, compiled=True) < 1e-12

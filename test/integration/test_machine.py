@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of every method: the same bits compiled, their order, their Jacobians."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loaded_scenes import IGNORE, loaded, viscous
+from models import seeded_samples
+
+from sst_ros.integration import backend
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.kernel import derivative
+from sst_ros.mechanism.trace import trace, with_jacobian
+from sst_ros.scene import load
+from sst_ros.simulation import Simulation
+
+DRIVE = (3.0, -2.0, 1.0)
+MOMENT = (0.1, 0.2, 0.3)
+EXAMPLE2 = load("example2")
+
+
+def start(scene, size):
+    state = Simulation(scene).state
+    return [*state.quaternion, *state.body_rate, *(0.0,) * (size - 7)]
+
+
+def system_of(scene, torque=None, work=False):
+    return System(Dynamics(scene), torque, work=work)
+
+
+def both(scene, method, cache, monkeypatch):
+    """Two pairs, then a march through contact and sliding, in plain Python and under numba."""
+    monkeypatch.setenv("SST_ROS_CACHE", str(cache))
+    system = system_of(scene, work=True)
+    y, drive = start(scene, len(system.state)), (*DRIVE, *MOMENT)[: len(system.drive)]
+    results = []
+    for by_numba in (False, True):
+        machine = Machine(system, method, compiled=by_numba)
+        assert machine.compiled == by_numba
+        first = machine.pair(0.0, 1e-3, y, y, drive)
+        second = machine.pair(1e-3, 2e-3, first[0], first[1], drive)
+        results.append((first, second, machine.march(0.0, 1e-3, 200, y, drive)))
+    return results
+
+
+needs_numba = pytest.mark.skipif(backend.numba_version() is None, reason="numba is missing")
+
+
+@needs_numba
+def test_numba_gives_the_bits_of_plain_python(tmp_path, monkeypatch):
+    plain, fast = both(loaded(), DORMAND_PRINCE, tmp_path, monkeypatch)
+    assert plain == fast
+    assert max(map(abs, plain[2])) > 0.1
+
+
+class Top(System):
+    """A free rigid body: as small as a system with a quaternion can be."""
+
+    @property
+    def program(self):
+        return trace(self._turn, self._inputs)
+
+    @property
+    def jacobian(self):
+        return with_jacobian(self._turn, self._inputs, ("t", *self.state))
+
+    def _turn(self, t, x, y, z, w, a, b, c, *drive):
+        q = ((w * a + y * c - z * b), (w * b + z * a - x * c), (w * c + x * b - y * a))
+        body = (0.3 * b * c + drive[0], -0.5 * c * a + drive[1], 0.2 * a * b + drive[2])
+        return (*(0.5 * part for part in q), -0.5 * (x * a + y * b + z * c), *body)
+
+
+@needs_numba
+def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method(tmp_path, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    y = [0.0, 0.6, 0.0, 0.8, 1.0, -2.0, 30.0]
+    ends = []
+    for by_numba in (False, True):
+        machine = Machine(Top(Dynamics(EXAMPLE2)), RODAS4, compiled=by_numba)
+        ends.append(machine.pair(0.0, 0.01, y, y, DRIVE))
+    assert ends[0] == ends[1]
+    assert math.dist(ends[0][0], y) > 0.1
+
+
+@needs_numba
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+@pytest.mark.parametrize("name", ["loaded", "general", "friction", "elastic_stops", "fast_spin"])
+def test_numba_gives_the_bits_of_plain_python_everywhere(name, method, tmp_path, monkeypatch):
+    scene = loaded() if name == "loaded" else load(name)
+    plain, fast = both(scene, method, tmp_path, monkeypatch)
+    assert plain == fast
+
+
+SINE = (replace(EXAMPLE2, **IGNORE), 0.4, EXAMPLE2.torque)
+SPIN = (replace(load("fast_spin"), **IGNORE), 0.01, None)
+ORDERS = [
+    *((SINE, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 64), (DOP853, 16))),
+    (SINE, RODAS4, 128),
+    *((SPIN, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 96), (RODAS4, 256))),
+]
+
+
+@functools.cache
+def truth_of(scene, span, torque):
+    """DOP853 in steps that err below rounding, for two lengths of them agree."""
+    system = system_of(scene, torque)
+    y, drive = start(scene, 7), () if torque else (1000.0, -500.0, 700.0)
+    machine = Machine(system, DOP853, compiled=False)
+    few, many = (machine.march(0.0, span / n, n, y, drive) for n in (100, 200))
+    assert math.dist(few[:4], many[:4]) < 2e-14
+    return system, y, drive, many
+
+
+@pytest.mark.parametrize(
+    ("case", "method", "steps"),
+    ORDERS,
+    ids=[f"{'sine' if case[2] else 'spin'}-{method.name}" for case, method, _ in ORDERS],
+)
+def test_measured_order_is_that_of_the_theory(case, method, steps):
+    """Errors stay well above rounding. Under sine torques the d/dt of RODAS4 is at work."""
+    system, y, drive, truth = truth_of(*case)
+    machine = Machine(system, method, compiled=False)
+    errors = []
+    for count in (steps, 2 * steps):
+        end = machine.march(0.0, case[1] / count, count, y, drive)
+        size = 7 if case is SINE else 4  # rates of 100 rad/s have rounding of their own
+        errors.append(math.dist(end[:size], truth[:size]))
+    assert errors[1] > 2e-14
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.1)
+
+
+def linearised(scene, torque, t, y, drive):
+    system = system_of(scene, torque, work=True)
+    machine, size = Machine(system, RODAS4, compiled=False), len(system.state)
+    flat = np.array(machine._module.jacobian(t, *y, *drive[: len(system.drive)]))
+    return flat[:size], flat[size : 2 * size], flat[2 * size :].reshape(size, size).T
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("what", ["inertia", "loaded"])
+def test_jacobians_are_exact(what, seed):
+    """Against the complex step through the kernel itself, which has no difference to cancel.
+
+    At rest of contact: the elastic ends are not in touch, where complex steps have no meaning.
+    """
+    (sample,) = seeded_samples(seed + 80, 1)
+    scene = loaded() if what == "loaded" else sample.scene
+    dynamics = Dynamics(scene)
+    y = [*start(scene, 7)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
+    y = [x + 0.003 * (seed + 1) * (-1) ** i for i, x in enumerate(y)]
+    slope, by_time, matrix = linearised(scene, None, 0.0, [*y, 0.0], (*DRIVE, *MOMENT))
+    moment = MOMENT if dynamics.moved else None
+    size = len(y)
+    truth = np.zeros((size, size))
+    for j in range(size):
+        stepped = [complex(x) for x in y]
+        stepped[j] += 1e-30j
+        truth[:, j] = np.imag(derivative(dynamics.model, tuple(stepped), DRIVE, moment)) / 1e-30
+    assert np.abs(truth).max() > 1.0
+    np.testing.assert_allclose(
+        matrix[:size, :size], truth, rtol=0, atol=1e-12 * np.abs(truth).max()
+    )
+    assert not by_time.any()
+    assert not matrix[:, -1].any()  # nothing depends on the work done
+    assert np.all(np.isfinite(slope))
+
+
+def test_the_derivative_by_time_is_exact():
+    """With M_dot = 0 it is M^-1 J^T tau_dot: linear in tau, so two exact torques give it."""
+    t, torque = 0.13, EXAMPLE2.torque
+    y = [*start(EXAMPLE2, 7)[:4], 0.3, -0.2, 0.4, 0.0]
+    slope, by_time, _ = linearised(EXAMPLE2, torque, t, y, ())
+    rows = list(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
+    model = Dynamics(EXAMPLE2).model
+    now = tuple(a * math.sin(f * t + p) for a, f, p in rows)
+    rate = tuple(a * f * math.cos(f * t + p) for a, f, p in rows)
+    moving, free = (np.array(derivative(model, tuple(y[:7]), tau)) for tau in (rate, (0.0,) * 3))
+    np.testing.assert_allclose(by_time[:7], moving - free, atol=1e-12)
+    np.testing.assert_allclose(slope[:7], derivative(model, tuple(y[:7]), now), atol=1e-12)
+    assert np.abs(by_time).max() > 1.0
+
+
+def test_a_step_without_a_finite_result_has_an_infinite_error():
+    machine = Machine(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
+    y = start(EXAMPLE2, 7)
+    assert machine.pair(0.0, 1e-3, y, y, (1e308, 1e308, 0.0))[2] == math.inf
+
+
+def test_a_slope_of_its_own_needs_an_explicit_method():
+    with pytest.raises(ValueError, match="explicit method"):
+        Machine(system_of(viscous(1.0)), RODAS4, compiled=False, slope=lambda *x: x)

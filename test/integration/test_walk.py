@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choice of method and step: work bounds, switches told, resets and budgets; events in time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loaded_scenes import IGNORE, REST, run, viscous
+from scipy.integrate import solve_ivp
+
+from sst_ros.control.torque import sine
+from sst_ros.errors import Diverged, StrokeExceeded, WorkspaceLeft
+from sst_ros.integration import walk
+from sst_ros.integration.machine import Machine
+from sst_ros.mechanism import kernel
+from sst_ros.scene import Initial, Stroke, Workspace, load
+from sst_ros.simulation import Simulation
+
+EXAMPLE2 = load("example2")
+MILLISECOND = 1_000_000
+
+
+@pytest.fixture
+def pairs(monkeypatch):
+    """Count attempts by method; a pair of RODAS4 makes 3 Jacobians and 18 evaluations."""
+    counts = {}
+    attempt = Machine.pair
+
+    def counted(self, *arguments):
+        counts[self.method.name] = counts.get(self.method.name, 0) + 1
+        return attempt(self, *arguments)
+
+    monkeypatch.setattr(Machine, "pair", counted)
+    return counts
+
+
+@pytest.mark.parametrize("coefficient", [1e3, 1e4, 1e5])
+def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pairs):
+    """Steps that an explicit method would need for stability grow with the coefficient."""
+    simulation = Simulation(viscous(coefficient), tolerance=1e-10)
+    simulation.step(REST, 1_000_000_000)
+    assert simulation.method == "rodas4"
+    fastest = np.abs(simulation._journey._walk.spectrum(0.0, simulation._point.y, REST)).max()
+    explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
+    assert explicit > 0.6 * coefficient
+    assert pairs["rodas4"] < min(350, explicit / 2)
+    assert simulation._journey._legs < (100 if coefficient == 1e5 else 300)
+    assert pairs.get("dopri5", 0) + pairs.get("dop853", 0) < 60
+
+
+def test_auto_turns_to_the_implicit_method_and_tells_when_and_why():
+    scene = replace(
+        EXAMPLE2,
+        friction=viscous(300.0).friction,
+        initial=Initial(gamma=(0.8, 0.8, 0.8), gamma_dot=(0.5, 0.2, -0.3)),
+    )
+    simulation = Simulation(scene, tolerance=1e-9)
+    run(simulation, 0.1, 0.01)
+    assert simulation.method == "rodas4"
+    first = simulation.changes[-1]
+    assert first.reason.startswith("stiff: step times fastest decay is ")
+    assert 0.0 < first.time < 0.1
+    times = [change.time for change in simulation.changes]
+    assert times == sorted(times)
+
+
+def test_auto_returns_to_an_explicit_method_when_accuracy_asks_for_short_steps():
+    """A torque that starts anew every 200 microseconds makes steps shorter than the decay."""
+    simulation = Simulation(viscous(30.0, 5.0), tolerance=1e-9)
+    for _ in range(10):
+        simulation.step(REST, 100 * MILLISECOND)
+    assert simulation.method == "rodas4"
+    for _ in range(80):
+        simulation.step((20.0, -20.0, 5.0), 200_000)
+    last = simulation.changes[-1]
+    assert last.method == "dopri5"
+    assert last.reason.startswith("no longer stiff: step times rate is ")
+    assert 1.0 < last.time < 1.02
+
+
+def test_a_reset_run_repeats_bit_by_bit_after_changes_of_method():
+    simulation = Simulation(load("stiff"), tolerance=1e-9)
+    ends = []
+    for _ in range(2):
+        run(simulation, 0.05, 0.01)
+        ends.append((simulation.state, simulation.changes, simulation.error_estimate))
+        simulation.reset()
+        assert simulation.changes == []
+    assert ends[0] == ends[1]
+    assert ends[0][1]
+
+
+def test_a_refused_step_leaves_no_trace_in_what_follows():
+    one, other = Simulation(EXAMPLE2), Simulation(EXAMPLE2)
+    with pytest.raises(Diverged):
+        one.step((1e308, 0.0, 1e308), MILLISECOND)
+    for simulation in (one, other):
+        simulation.step((1.0, 2.0, 3.0), MILLISECOND)
+    assert one.state == other.state
+    assert one.changes == other.changes
+
+
+def test_a_budget_of_steps_ends_what_would_not_end(monkeypatch):
+    monkeypatch.setattr(walk, "STEP_BUDGET", 50)
+    simulation = Simulation(viscous(1e5), "dopri5")
+    with pytest.raises(Diverged, match="50 steps do not reach the end of the period") as caught:
+        simulation.step(REST, 1_000_000_000)
+    assert caught.value.state is simulation.state
+    assert simulation.state.time_ns == 0
+
+
+def independent(scene, joint, end, span, torque=None):
+    """Time at which a joint's angle reaches `end`: SciPy at its tightest, on the kernel."""
+    model, profile = kernel.model_of(scene), torque or sine(scene.torque)
+    state = Simulation(scene).state
+
+    def angle(t, y):
+        return [x for triple in kernel.joints(model, tuple(y))[:3] for x in triple][joint] - end
+
+    angle.terminal = True
+    found = solve_ivp(
+        lambda t, y: kernel.derivative(model, tuple(y), profile(t)),
+        (0.0, span),
+        (*state.quaternion, *state.body_rate),
+        method="DOP853",
+        rtol=2.3e-14,
+        atol=1e-15,
+        max_step=0.004,
+        events=angle,
+    )
+    # Newton with the true rate from a step that ends beside the event, past SciPy's dense output.
+    t, y = found.t_events[0][0], found.y_events[0][0]
+    before = int(np.searchsorted(found.t, t)) - 1
+    for _ in range(3):
+        y = solve_ivp(
+            lambda t, y: kernel.derivative(model, tuple(y), profile(t)),
+            (found.t[before], t),
+            found.y[:, before],
+            method="DOP853",
+            rtol=2.3e-14,
+            atol=1e-15,
+        ).y[:, -1]
+        rates = [x for triple in kernel.joints(model, tuple(y))[3:] for x in triple]
+        t -= angle(t, y) / rates[joint]
+    return t
+
+
+def stopped(simulation, torque, error, limit=2000):
+    with pytest.raises(error) as caught:
+        for _ in range(limit):
+            simulation.step(torque, MILLISECOND)
+    return caught.value
+
+
+@pytest.mark.parametrize("method", ["dop853", "auto"])
+def test_the_end_of_a_stroke_is_met_within_a_picosecond(method):
+    scene = load("example2_thin")
+    error = stopped(Simulation(scene, method, tolerance=1e-14), sine(scene.torque), StrokeExceeded)
+    assert abs(error.time - independent(scene, 0, math.pi / 2, 0.95)) < 1e-12
+
+
+def test_the_edge_of_the_workspace_is_met_within_a_picosecond():
+    scene = replace(EXAMPLE2, stroke=Stroke(at_end="ignore"))
+    torque = (5.0, -5.0, 0.0)
+    error = stopped(Simulation(scene, "dop853", tolerance=1e-14), torque, WorkspaceLeft)
+    joint = 5 + int(error.reason.removeprefix("beta_")[0])
+    truth = independent(scene, joint, 0.0, error.time + 0.01, lambda t: torque)
+    assert abs(error.time - truth) < 1e-12
+
+
+def test_a_dip_beyond_an_end_inside_one_period_is_not_missed():
+    """Braked so that gamma_1 goes less than a milliradian beyond and is back in the period."""
+    free = Simulation(
+        replace(
+            EXAMPLE2, initial=Initial(gamma=(0.013, 0.5, 0.5), gamma_dot=(-0.5, 0.0, 0.0)), **IGNORE
+        )
+    )
+    angles = []
+    for _ in range(200):
+        angles.append(free.step((3.0, 0.0, 0.0), MILLISECOND).joints.gamma[0])
+    assert min(angles) < -1e-4
+    assert angles[-1] > 0.05
+    stopping = Simulation(
+        replace(free.scene, stroke=Stroke(), workspace=Workspace(at_edge="ignore"))
+    )
+    with pytest.raises(StrokeExceeded, match="gamma_1 < 0") as caught:
+        stopping.step((3.0, 0.0, 0.0), 200 * MILLISECOND)
+    first = next(k for k, angle in enumerate(angles, 1) if angle < 0.0)
+    assert (first - 1) * 1e-3 <= caught.value.time <= first * 1e-3

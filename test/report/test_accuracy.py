@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study of accuracy: it tells the truth about the methods, and it catches lies."""
+
+import csv
+import dataclasses
+import io
+import itertools
+import json
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros import scene
+from sst_ros.bodies import Inertia
+from sst_ros.errors import InputError
+from sst_ros.mechanism import kernel
+from sst_ros.report.accuracy import ABOVE_REFERENCE, study
+from sst_ros.report.accuracy_figure import draw
+from sst_ros.report.accuracy_run import page
+from sst_ros.report.accuracy_table import COLUMNS, advice, as_csv, as_json, text
+from sst_ros.report.precise import EXTENDED, MPMATH, Precise
+from sst_ros.report.trial import Trial
+from sst_ros.report.ways import FIXED, TOLERANCE
+
+SHORT = dataclasses.replace(scene.load("example2"), duration=0.2)
+BRIEF = dataclasses.replace(SHORT, duration=0.1)
+EXACT = np.finfo(np.longdouble).eps < 1e-18
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Study of 0.2 s of Example 2 in plain Python."""
+    return study(SHORT, compiled=False, longest_s=0.02)
+
+
+def _rows(found, method, kind=FIXED):
+    return [row for row in found.rows if (row.method, row.kind) == (method, kind)]
+
+
+@pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
+def test_the_reference_is_better_than_doubles_can_be(short):
+    assert short.reference.own.orientation < 1e-16
+    assert short.floor == ABOVE_REFERENCE * short.reference.own.orientation
+
+
+@pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
+def test_the_reference_is_what_mpmath_finds():
+    """At the same steps, so that only the arithmetic differs."""
+    pytest.importorskip("mpmath")
+    trial = Trial(SHORT)
+    ours, theirs = (
+        Precise(trial.system.program, kind, trial.drive).solve(trial.start, trial.interval, 2, 2)
+        for kind in (EXTENDED, MPMATH)
+    )
+    assert np.abs(ours - theirs).max() < 1e-17
+
+
+def test_methods_show_their_order(short):
+    for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas4", 4)):
+        rows = [row for row in _rows(short, method) if 1e-12 < row.final.orientation < 1e-4]
+        assert len(rows) > 1 or method == "dop853"
+        slopes = [
+            np.log(a.final.orientation / b.final.orientation) / np.log(a.setting / b.setting)
+            for a, b in itertools.pairwise(rows)
+        ]
+        assert not slopes or max(slopes) == pytest.approx(order, abs=1.0), method
+
+
+def test_every_row_is_whole(short):
+    assert {row.kind for row in short.rows} == {FIXED, TOLERANCE}
+    assert not _rows(short, "rk4", TOLERANCE)
+    for row in short.rows:
+        assert not row.failure and 0.0 < row.wall_s[0] <= row.wall_s[1]
+        assert row.final.orientation <= row.largest.orientation
+        assert row.closure < 1e-14 and row.evaluations > 0
+    assert min(abs(row.energy) for row in short.rows) < 1e-14
+    best = short.best(1e-9)
+    assert best.largest.orientation <= 1e-9
+    assert not short.warnings and short.formulation < 1e-13
+
+
+def test_what_it_writes_can_be_read(short, tmp_path):
+    said = text(short)
+    assert advice(short) in said and advice(short).startswith("1e-09 rad over 0.2 s: ")
+    assert all(len(line) < 200 for line in said.splitlines())
+    rows = list(csv.DictReader(io.StringIO(as_csv([short]))))
+    assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
+    document = json.loads(as_json([short]))
+    assert document["studies"][0]["rows"][0]["method"] == "rk4" and "date" in document["report"]
+    assert "accuracy_example2.png" in page([short])
+    draw(short, tmp_path / "picture.png")
+    pixels = image.imread(tmp_path / "picture.png")
+    assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
+
+
+def test_another_inertia_in_the_runs_is_seen():
+    """A part in 1e7 of the star's inertia: no method gets near the reference, and it is said."""
+    inertia = dataclasses.asdict(SHORT.star.inertia)
+    inertia["zz"] *= 1.0 + 1e-7
+    star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
+    solved = dataclasses.replace(BRIEF, star=star)
+    found = study(BRIEF, solved=solved, compiled=False, longest_s=0.005)
+    least = min(row.largest.orientation for row in found.rows if row.largest)
+    assert 1e-10 < least < 1e-6
+    assert any("do not solve what the reference solves" in words for words in found.warnings)
+    assert "WARNING" in text(found)
+
+
+def test_a_kernel_that_is_wrong_everywhere_is_seen(monkeypatch):
+    """Where reference and runs share the fault, the paper's equations do not."""
+    right = kernel.derivative
+
+    def wrong(*arguments):
+        *rest, last = right(*arguments)[:7]
+        return (*rest, last * (1.0 + 1e-7))
+
+    monkeypatch.setattr(kernel, "derivative", wrong)
+    found = study(BRIEF, compiled=False, longest_s=0.001)
+    assert 1e-9 < found.formulation < 1e-6
+    assert any("paper's equations" in words for words in found.warnings)
+
+
+def test_failures_stay_in_sight(tmp_path):
+    stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
+    found = study(stiff, compiled=False, longest_s=0.005)
+    assert not any(row.failure for row in _rows(found, "rodas4"))
+    failed = [row for row in found.rows if row.failure]
+    assert failed and all(row.largest is None for row in failed)
+    assert text(found).count("FAILED") == len(failed)
+    assert as_csv([found]).count("not finite") + as_csv([found]).count("off by") >= len(failed)
+    draw(found, tmp_path / "picture.png")
+
+
+def test_a_run_that_stops_is_compared_up_to_its_end():
+    trial = Trial(scene.load("example2_thin"))
+    assert trial.seconds == pytest.approx(0.9) and "gamma_1 >" in trial.ends
+    trial = Trial(scene.load("impacts"))
+    assert trial.seconds == pytest.approx(0.9) and trial.ends.startswith("impact at 0.91")
+
+
+def test_a_run_that_is_over_at_once_is_refused():
+    start = dataclasses.replace(SHORT.initial, gamma=(0.0, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="over before it can be studied"):
+        Trial(dataclasses.replace(SHORT, initial=start))

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a recorded run: jitter, losses, latency, energy; and lies in the recording."""
+
+import base64
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros import scene
+from sst_ros.control.torque import sine
+from sst_ros.report import jitter, recording, reference
+from sst_ros.report.run import report
+from sst_ros.report.table import table
+
+LATENCY_NS = 250_000
+
+
+@pytest.fixture(scope="module")
+def lively(bags, example2):
+    """Receptions with a known jitter, and the command of every tick a quarter of a ms before it."""
+    entries = []
+    for entry in example2:
+        late = 30_000 if entry.sample > 0 and entry.sample % 10 == 0 else 0
+        entries.append(dataclasses.replace(entry, received_ns=entry.received_ns + late))
+    profile = sine(scene.load("example2").torque)
+    for tick in range(300):
+        command = bags.make(
+            "std_msgs/Float64MultiArray",
+            layout=bags.make("std_msgs/MultiArrayLayout", dim=[], data_offset=0),
+            data=np.array(profile(tick * bags.TICK_NS / 1e9)),
+        )
+        received = bags.START_NS + tick * bags.TICK_NS - LATENCY_NS
+        entries.append(bags.Entry(bags.COMMANDS, received, command))
+    return sorted(entries, key=lambda entry: entry.received_ns)
+
+
+def _timing(bags, folder, entries):
+    return jitter.timing(recording.read(bags.write(folder / "bag", entries)))
+
+
+def test_periods_and_latency_are_what_they_were_made(tmp_path, bags, lively):
+    found = _timing(bags, tmp_path, lively)
+    numbers = jitter.numbers(found)
+    assert found.nominal_us == 2000.0 and len(found.period_us) == 150
+    assert numbers["period_min_us"] == 1970.0 and numbers["period_max_us"] == 2030.0
+    assert numbers["period_mean_us"] == pytest.approx(2000.0, abs=0.5)
+    assert numbers["period_p99_9_us"] == pytest.approx(2030.0)
+    assert numbers["commands_followed"] == 300
+    assert numbers["command_latency_min_us"] == numbers["command_latency_max_us"] == 250.0
+    assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
+    assert numbers["energy_residual_max_J"] < 1e-12
+    assert not len(found.lost_s) and not len(found.gaps_s) and numbers["not_told"] == []
+
+
+def test_lost_samples_and_dropped_ticks_have_their_times(tmp_path, bags, lively):
+    kept = [entry for entry in lively if entry.sample not in (20, 21, 60)]
+    found = _timing(bags, tmp_path, kept)
+    assert found.lost_s == pytest.approx([0.040, 0.042, 0.120])
+    assert found.gaps_s == pytest.approx([0.038, 0.118])
+    assert len(found.period_us) == 145
+    assert jitter.numbers(found)["energy_residual_max_J"] < 1e-12
+
+
+def test_a_dropped_tick_shows(tmp_path, bags, example2):
+    """A tick that the simulator left out: the motion goes on as if it had been, and is caught."""
+
+    def shortened(message):
+        return dataclasses.replace(message, points=message.points[:1])
+
+    entries = bags.edited(example2, bags.APPLIED, 75, shortened)
+    run = recording.read(bags.write(tmp_path / "bag", entries))
+    assert jitter.timing(run).gaps_s == pytest.approx([0.149])
+    assert reference.integration(run).restarts_ns == (150_000_000,)
+
+
+def test_an_altered_effort_shows_when_it_was(tmp_path, bags, example2):
+    """One torque that is not what was applied: error and energy jump at its tick."""
+
+    def altered(message):
+        points = list(message.points)
+        points[0] = dataclasses.replace(points[0], effort=points[0].effort + np.eye(3)[0] * 1e-3)
+        return dataclasses.replace(message, points=points)
+
+    entries = bags.edited(example2, bags.APPLIED, 75, altered)
+    run = recording.read(bags.write(tmp_path / "bag", entries))
+    error = reference.integration(run).error.gamma_dot
+    assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
+    energy = np.abs(jitter.timing(run).energy)
+    assert np.flatnonzero(energy > 1e-9)[0] == 75
+
+
+def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
+    out = tmp_path / "out"
+    kept = bags.without(lively, bags.DIAGNOSTICS, bags.EULER)
+    summary = report(bags.write(tmp_path / "bag", kept), out)
+    assert summary["page"] == ["page.png", "page.html"]
+    pixels = image.imread(out / "page.png")
+    assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 5000
+    text = (out / "page.html").read_text(encoding="utf-8")
+    pictures = re.findall(r"src='data:image/png;base64,([^']+)'", text)
+    assert len(pictures) == 1 + len(summary["pictures"])
+    assert base64.b64decode(pictures[0]) == (out / "page.png").read_bytes()
+    assert "http" not in re.sub(r"base64,[^']+", "", text)
+    assert "command to its tick, mean" in text
+    assert "What the recording does not tell" in text
+    assert "Not told: no diagnostics" in table(summary)
+
+
+def test_what_is_missing_is_said(tmp_path, bags, example2):
+    kept = bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)
+    numbers = jitter.numbers(_timing(bags, tmp_path, kept))
+    assert numbers["command_latency_mean_us"] is None and numbers["commands_followed"] == 0
+    assert any("no commands are recorded" in words for words in numbers["not_told"])
+    assert any("no diagnostics" in words for words in numbers["not_told"])
+
+
+def test_clocks_that_differ_are_not_compared(tmp_path, bags, lively):
+    entries = [dataclasses.replace(e, received_ns=e.received_ns - 10**15) for e in lively]
+    numbers = jitter.numbers(_timing(bags, tmp_path, entries))
+    assert numbers["command_latency_mean_us"] is None and numbers["period_max_us"] == 2030.0
+    assert any("not of the recorder's clock" in words for words in numbers["not_told"])

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue of stiff and extreme cases, and those that need mpmath or singular poses."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from loaded_scenes import IGNORE, REST
+from models import inertia_of
+
+from sst_ros.errors import (
+    AssemblyError,
+    NoAdmissibleAssembly,
+    RunStopped,
+    SingularConfiguration,
+    SstError,
+)
+from sst_ros.mechanism import kernel, kinematics, singularities, workspace
+from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report import catalogue
+from sst_ros.scene import Initial, load
+from sst_ros.simulation import Simulation
+
+CASES = list(catalogue.cases())
+EXAMPLE2 = load("example2")
+LONGEST = 60.0
+"""Seconds for any case on a busy machine: what must not happen is an endless loop."""
+
+
+def finite(state):
+    joints = [x for triple in state.joints for x in triple]
+    return all(map(math.isfinite, (*state.quaternion, *state.body_rate, *joints)))
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name.replace(" ", "-") for case in CASES])
+def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
+    began = time.perf_counter()
+    outcome = catalogue.run(case)
+    assert time.perf_counter() - began < LONGEST
+    if outcome.simulation is not None:
+        assert finite(outcome.simulation.state)
+        assert all(map(math.isfinite, outcome.simulation.conditioning.values()))
+        assert math.isfinite(outcome.simulation.error_estimate)
+    assert type(outcome.error).__name__ == (case.refusal or "NoneType"), str(outcome.error)
+    if case.deviation is not None:
+        assert case.deviation(outcome.simulation) < case.bound
+    if isinstance(outcome.error, RunStopped):
+        assert outcome.error.state is outcome.simulation.state
+    if case.stop_time is not None:
+        assert outcome.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
+
+
+def test_names_of_cases_are_distinct():
+    assert len({case.name for case in CASES}) == len(CASES)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])
+def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
+    """M is a sum of positive terms up to 1e9 apart; what counts is the largest part."""
+    scene = replace(
+        EXAMPLE2,
+        star=replace(EXAMPLE2.star, inertia=inertia_of(np.diag([0.39, 0.39, 0.26]) * scale)),
+    )
+    simulation = Simulation(replace(scene, initial=Initial(gamma=(0.7, 0.8, 0.75))))
+    y = (*simulation.state.quaternion, 0.3, -0.2, 0.4)
+    model, torque = kernel.model_of(scene), (1.0, 2.0, -1.0)
+    got = simulation.dynamics.derivative(*y, *torque)[4:7]
+    with mpmath.workdps(50):
+        exact = tuple(map(mpmath.mpf, y))
+        truth = kernel.derivative(model, exact, tuple(map(mpmath.mpf, torque)))[4:7]
+    wanted = [float(x) for x in truth]
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
+
+
+def edge(beta):
+    """Pose of example2 whose beta_1 is this; E is that near to the arc P_1 P_2."""
+
+    def posed(height):
+        s = np.array([1.0, 0.9, height])
+        rotation = workspace.orientations(s[None] / np.linalg.norm(s), np.array([PSI]))[0]
+        return rotation, kinematics.inverse(Geometry.of(EXAMPLE2), rotation)
+
+    slope = posed(1e-6)[1][2][0] / 1e-6
+    return posed(beta / slope)
+
+
+def admissible_psi():
+    chart = workspace.over_orientations(Geometry.of(EXAMPLE2), [[1.0, 0.9, 1e-3]], turns=60)
+    return chart.psi[np.flatnonzero(chart.measures.admissible[0])[0]]
+
+
+PSI = admissible_psi()
+
+
+@pytest.mark.parametrize("beta", [1e-3, 1e-6, 1e-9])
+def test_a_start_just_inside_the_edge_of_the_workspace_is_taken(beta):
+    rotation, (gamma, _, found) = edge(beta)
+    assert found[0] == pytest.approx(beta, rel=1e-6)
+    simulation = Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
+    assert simulation.state.joints.beta[0] == pytest.approx(beta, rel=1e-5)
+    apart = np.abs(np.abs(simulation.state.quaternion) - np.abs(quaternion_of(rotation))).max()
+    assert apart < 1e-13
+    simulation.step(REST, 1_000_000)
+    assert finite(simulation.state)
+
+
+@pytest.mark.parametrize("beta", [-1e-3, -1e-6, -1e-9])
+def test_a_start_just_outside_the_edge_of_the_workspace_is_refused(beta):
+    _, (gamma, _, found) = edge(beta)
+    assert found[0] == pytest.approx(beta, rel=1e-6)
+    with pytest.raises(NoAdmissibleAssembly):
+        Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
+
+
+def singular_scene():
+    star = replace(EXAMPLE2.star, alpha_deg=(210, 75, 75))
+    return replace(EXAMPLE2, star=star, **IGNORE)
+
+
+@pytest.fixture(scope="module")
+def singular():
+    geometry = Geometry.of(singular_scene())
+    chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
+    poses = singularities.parallel(chart)
+    return geometry, poses.rotation[len(poses) // 2], poses.gamma[len(poses) // 2]
+
+
+def about_e(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def started(geometry, rotation, spin):
+    """Start at a pose with the angular velocity `spin` about E [rad/s]."""
+    gamma, _, _ = kinematics.inverse(geometry, rotation)
+    scene = singular_scene()
+    quaternion = tuple(quaternion_of(rotation).tolist())
+    state = (*quaternion, 0.0, 0.0, spin)
+    rates = kernel.joints(kernel.model_of(scene), state).gamma_dot
+    initial = Initial(gamma=tuple(gamma), gamma_dot=tuple(rates), orientation=quaternion)
+    return Simulation(replace(scene, initial=initial))
+
+
+def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays(singular):
+    """There gamma tells the pose to the root of rounding only, for two assemblies meet."""
+    geometry, rotation, _ = singular
+    simulation = started(geometry, rotation, 0.0)
+    assert abs(simulation.conditioning["det_j2"]) < 1e-7
+    apart = np.abs(np.array(simulation.state.quaternion) - quaternion_of(rotation)).max()
+    assert apart < 1e-7
+    for _ in range(10):
+        simulation.step(REST, 1_000_000)
+    assert simulation.state.body_rate == REST
+
+
+def test_a_moving_start_exactly_at_a_parallel_singularity_is_refused(singular):
+    """From gamma_dot alone the body rate came out as (1, -2.3, 1.9) rad/s, not (0, 0, 1)."""
+    geometry, rotation, _ = singular
+    with pytest.raises(SingularConfiguration, match="does not determine the body rate") as caught:
+        started(geometry, rotation, 1.0)
+    assert abs(caught.value.measure) < 1e-7
+
+
+@pytest.mark.parametrize("distance", [-0.03, 0.08, 0.2])
+def test_a_moving_start_that_is_taken_has_the_rate_that_is_meant(singular, distance):
+    geometry, rotation, _ = singular
+    simulation = started(geometry, rotation @ about_e(distance), 1.0)
+    np.testing.assert_allclose(simulation.state.body_rate, (0.0, 0.0, 1.0), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("spin", [2.0, -2.0])
+def test_a_motion_through_a_parallel_singularity_keeps_its_energy(singular, spin):
+    """In (q, W) the dynamics is regular there; gamma alone could not say which way it goes on."""
+    geometry, rotation, _ = singular
+    back = -0.08 * math.copysign(1.0, spin)
+    simulation = started(geometry, rotation @ about_e(back), spin)
+    determinants = [simulation.conditioning["det_j2"]]
+    kinetic = simulation._stored()
+    for _ in range(80):
+        simulation.step(REST, 1_000_000)
+        determinants.append(simulation.conditioning["det_j2"])
+    assert min(determinants) < 0.0 < max(determinants)
+    assert abs(simulation.energy_residual) < 1e-10 * kinetic
+    assert simulation.closure_residual < 1e-14
+    assert simulation.error_estimate < 1e-8
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
+def test_starts_near_a_parallel_singularity_are_right_or_refused_by_name(singular, distance):
+    geometry, rotation, _ = singular
+    pose = rotation @ about_e(distance)
+    try:
+        simulation = started(geometry, pose, 0.0)
+    except SstError as error:
+        assert isinstance(error, AssemblyError)
+        return
+    # gamma determines the pose to rounding / distance there.
+    apart = np.abs(np.array(simulation.state.quaternion) - quaternion_of(pose)).max()
+    assert apart < 1e-14 / distance
