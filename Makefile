@@ -2,7 +2,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 RUN = $(VENV)/bin/python
-EXTRAS = ros,record,report,fast
+# The ROS wheels: kilted (extra `ros`) or jazzy.
+ROS ?= ros
+EXTRAS = $(ROS),record,report,fast
+# Nodes share the machine's clock with nobody; the rest runs on all cores.
+PYTEST = $(RUN) -m pytest
 
 .PHONY: demo test test-all lint format clean
 
@@ -10,10 +14,12 @@ demo: $(VENV)/.demo
 	$(RUN) -m sst_ros demo
 
 test: $(VENV)/.test lint
-	$(RUN) -m pytest -m "not slow"
+	$(PYTEST) --numprocesses auto --dist loadfile -m "not slow" --ignore test/ros
+	$(PYTEST) -m "not slow" test/ros
 
 test-all: $(VENV)/.test lint
-	$(RUN) -m pytest
+	$(PYTEST) --numprocesses auto --dist loadfile --ignore test/ros --timeout 600
+	$(PYTEST) test/ros --timeout 600
 
 lint: $(VENV)/.test
 	$(VENV)/bin/ruff check .

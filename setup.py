@@ -7,7 +7,17 @@ from setuptools import find_packages, setup
 
 NAME = "sst_ros"
 NODES = ("simulator", "torque_player", "recorder")
-ROS_MESSAGES = ("std", "sensor", "geometry", "trajectory", "diagnostic")
+ROS_MESSAGES = ("std", "sensor", "geometry", "trajectory", "diagnostic", "rosgraph")
+
+
+def wheels(distribution: str) -> list[str]:
+    """Name the wheels of a ROS 2 distribution that the nodes need."""
+    return [
+        f"ros-{distribution}-rclpy[fastrtps]",
+        f"ros-{distribution}-rmw-fastrtps-cpp",
+        f"ros-{distribution}-std-srvs",
+        *(f"ros-{distribution}-{kind}-msgs" for kind in ROS_MESSAGES),
+    ]
 
 
 def files(pattern: str) -> list[str]:
@@ -30,15 +40,13 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", files("config/*.*")),
         (f"share/{NAME}/config/scenes", files("config/scenes/*.yaml")),
+        (f"share/{NAME}/config/sros2", files("config/sros2/*.xml")),
         (f"share/{NAME}/launch", files("launch/*.launch.py")),
     ],
     install_requires=["numpy>=1.21", "scipy>=1.8", "PyYAML>=5.4"],
     extras_require={
-        "ros": [
-            "ros-kilted-rclpy[fastrtps]",
-            "ros-kilted-rmw-fastrtps-cpp",
-            *(f"ros-kilted-{kind}-msgs" for kind in ROS_MESSAGES),
-        ],
+        "ros": wheels("kilted"),
+        "jazzy": wheels("jazzy"),
         "record": ["rosbags>=0.11"],
         "report": ["rosbags>=0.11", "matplotlib>=3.5"],
         "fast": ["numba>=0.57"],
@@ -52,6 +60,7 @@ setup(
             "mypy",
             "pytest",
             "pytest-timeout",
+            "pytest-xdist",
             "ruff",
             "types-PyYAML",
         ],
