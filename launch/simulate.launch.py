@@ -4,7 +4,7 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -14,6 +14,9 @@ ARGUMENTS = {
     "rate": ("1000", "steps per second of simulated time [Hz]"),
     "publish_rate": ("500", "published samples per second [Hz]"),
     "duration": ("0.0", "length of the run [s]; 0 for no end"),
+    "real_time_factor": ("1.0", "simulated time per time of the clock; 0 for as fast as possible"),
+    "publish_clock": ("false", "publish the simulated time on /clock"),
+    "sync": ("free", "free, or lockstep with the commands"),
     "play": ("false", "also play the scene's torques, from the beginning of the run"),
 }
 
@@ -33,6 +36,9 @@ def generate_launch_description() -> LaunchDescription:
                 "publish_rate": ParameterValue(value["publish_rate"], value_type=int),
                 "duration": ParameterValue(value["duration"], value_type=float),
                 "wait_for_command": ParameterValue(value["play"], value_type=bool),
+                "real_time_factor": ParameterValue(value["real_time_factor"], value_type=float),
+                "publish_clock": ParameterValue(value["publish_clock"], value_type=bool),
+                "sync": ParameterValue(value["sync"], value_type=str),
             }
         ],
     )
@@ -41,7 +47,14 @@ def generate_launch_description() -> LaunchDescription:
         executable="torque_player",
         namespace=value["namespace"],
         output="screen",
-        parameters=[{"scene": ParameterValue(value["scene"], value_type=str)}],
+        parameters=[
+            {
+                "scene": ParameterValue(value["scene"], value_type=str),
+                "stamped": ParameterValue(
+                    PythonExpression(["'", value["sync"], "' == 'lockstep'"]), value_type=bool
+                ),
+            }
+        ],
         condition=IfCondition(value["play"]),
     )
     declared = [

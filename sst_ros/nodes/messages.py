@@ -13,10 +13,11 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.nodes.commands import ACTUATORS
 from sst_ros.simulation import NANOSECONDS, State
 
-ACTUATORS = ["gamma_1", "gamma_2", "gamma_3"]
 JOINTS = [*ACTUATORS, "mu_1", "mu_2", "mu_3", "beta_1", "beta_2", "beta_3"]
+MOMENTS = ["moment_x", "moment_y", "moment_z"]
 BASE_FRAME = "base"
 
 
@@ -49,19 +50,26 @@ class StateMessages:
         theta, phi, psi = zyz_angles(rotation_matrix(state.quaternion)).tolist()
         vector.x, vector.y, vector.z = theta, phi, psi
 
+    def still(self) -> None:
+        """Set all rates and efforts to zero: a state that is held."""
+        for k in range(len(JOINTS)):
+            self.joint_states.velocity[k] = self.joint_states.effort[k] = 0.0
+
 
 class TorqueLog:
-    """applied_torques: the torque of every tick since the last publication.
+    """applied_torques: what acted over every tick since the last publication.
 
     Point i holds over tick i and says when that tick ends, relative to the header's stamp.
     """
 
-    def __init__(self, ticks: int, period_ns: int) -> None:
-        self.message = JointTrajectory(joint_names=ACTUATORS)
+    def __init__(self, ticks: int, period_ns: int, *, moments: bool = False) -> None:
+        names = [*ACTUATORS, *(MOMENTS if moments else ())]
+        self.message = JointTrajectory(joint_names=names)
         self.message.header.frame_id = BASE_FRAME
+        self._moments = moments
         self._points = [
             JointTrajectoryPoint(
-                effort=array("d", [0.0] * 3),
+                effort=array("d", [0.0] * len(names)),
                 time_from_start=Duration(
                     sec=(i + 1) * period_ns // NANOSECONDS,
                     nanosec=(i + 1) * period_ns % NANOSECONDS,
@@ -71,10 +79,12 @@ class TorqueLog:
         ]
         self.count = 0
 
-    def append(self, torque: Sequence[float]) -> None:
-        """Note the torque of one tick."""
+    def append(self, torque: Sequence[float], moment: Sequence[float]) -> None:
+        """Note the torque and the moment of one tick."""
         effort = self._points[self.count].effort
         effort[0], effort[1], effort[2] = torque
+        if self._moments:
+            effort[3], effort[4], effort[5] = moment
         self.count += 1
 
     def take(self, stamp_ns: int) -> JointTrajectory:
@@ -99,3 +109,8 @@ def diagnostics(
 def set_time(stamp: Time, nanoseconds: int) -> None:
     """Write integer nanoseconds into a message's time."""
     stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
+
+
+def nanoseconds(stamp: Time) -> int:
+    """Read a message's time as integer nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -1,32 +1,92 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks at absolute deadlines of the monotonic clock; late ones are counted, never made up for."""
+"""Ticks at absolute deadlines; late ones are counted, never made up for. No ROS in here."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import Protocol
+
+_LONGEST_SLEEP_NS = 50_000_000
+
+
+class TimeSource(Protocol):
+    """What deadlines are measured by."""
+
+    def now_ns(self) -> int:
+        """Tell the time [ns]."""
+
+    def sleep(self, ns: int) -> None:
+        """Wait about so long [ns]; may return early."""
+
+
+class SteadyTime:
+    """The monotonic clock of the machine."""
+
+    def now_ns(self) -> int:
+        """Tell the time [ns]."""
+        return time.monotonic_ns()
+
+    def sleep(self, ns: int) -> None:
+        """Wait so long [ns]."""
+        time.sleep(ns / 1e9)
 
 
 class Pacer:
-    """Deadlines start + k * period. After an overrun of whole periods they are dropped."""
+    """Deadlines anchor + k period / speed. After an overrun the whole periods in it are dropped.
 
-    def __init__(self, period_ns: int) -> None:
-        self.period_ns = period_ns
-        self.missed = 0
-        self._next = 0
-        self.started_ns = 0
+    Attributes:
+        speed: real-time factor; 0 for deadlines that have always come.
+        missed: ticks dropped.
+        overruns: how often some were.
+        jumps: how often the clock went back.
+        late_ns: how late the last tick began [ns].
+
+    """
+
+    def __init__(
+        self, period_ns: int, speed: float, source: TimeSource, tolerance_ns: int = 0
+    ) -> None:
+        """Lateness up to `tolerance_ns` is made up for: the grain of a clock that is heard."""
+        self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
+        self._anchor = self._count = self._seen = 0
+        self.speed = speed
+        self.missed = self.overruns = self.jumps = self.late_ns = 0
 
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
-        self.started_ns = time.monotonic_ns()
-        self._next = self.started_ns + self.period_ns
+        self._anchor = self._seen = self._source.now_ns()
+        self._count = 1
 
-    def wait(self) -> None:
-        """Sleep until the next deadline, or return at once and count what was missed."""
-        late = time.monotonic_ns() - self._next
-        if late < 0:
-            time.sleep(-late / 1e9)
-        else:
-            dropped = late // self.period_ns
+    def change(self, speed: float) -> None:
+        """Go on at another speed, without a burst."""
+        self.speed = speed
+        self.start()
+
+    def wait(self, interrupted: Callable[[], bool]) -> bool:
+        """Wait for the next deadline; False if interrupted before it came."""
+        if self.speed == 0.0:
+            self.late_ns = 0
+            return not interrupted()
+        interval = self._period_ns / self.speed
+        while True:
+            now = self._source.now_ns()
+            if now < self._seen:
+                self.jumps += 1
+                self.start()
+                now = self._anchor
+            self._seen = now
+            late = now - self._anchor - round(self._count * interval)
+            if late >= 0:
+                break
+            if interrupted():
+                return False
+            self._source.sleep(min(-late, _LONGEST_SLEEP_NS))
+        if late >= max(interval, self._tolerance_ns):
+            dropped = int(late // interval)
             self.missed += dropped
-            self._next += dropped * self.period_ns
-        self._next += self.period_ns
+            self.overruns += 1
+            self._count += dropped
+        self._count += 1
+        self.late_ns = late
+        return True

@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Callable
 from typing import TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -27,8 +34,11 @@ _TYPES = {
 _WIDEST = 1e300
 
 
-def declare(node: Node, cls: type[P]) -> P:
-    """Declare every field of `cls` on the node, read-only, and return the values.
+def declare(node: Node, cls: type[P], changed: Callable[[P], None] | None = None) -> P:
+    """Declare every field of `cls` on the node and return the values.
+
+    Fields are read-only, but those that `cls.CHANGEABLE` names. When one of them is set, `changed`
+    gets all values anew, checked as at the start.
 
     Raises:
         InputError: values given at start are refused; lists all of them.
@@ -37,6 +47,7 @@ def declare(node: Node, cls: type[P]) -> P:
     defaults = cls()
     # rclpy has no public way to what was given; it is the same on Jazzy and Kilted.
     given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    changeable = getattr(cls, "CHANGEABLE", ())
     values, problems = {}, []
     for name, spec in specs(cls).items():
         default = getattr(defaults, name)
@@ -44,7 +55,9 @@ def declare(node: Node, cls: type[P]) -> P:
         if spec.kind == "number" and type(value) is int:
             value = float(value)  # "-p duration:=1" means 1.0
         try:
-            node.declare_parameter(name, value, _descriptor(name, spec), ignore_override=True)
+            node.declare_parameter(
+                name, value, _descriptor(name, spec, name not in changeable), ignore_override=True
+            )
         except (InvalidParameterTypeException, InvalidParameterValueException):
             problems.append(Problem(name, value, spec.allowed()))
         values[name] = value
@@ -54,19 +67,44 @@ def declare(node: Node, cls: type[P]) -> P:
     if problems:
         raise InputError(node.get_fully_qualified_name(), problems)
     try:
-        return cls(**values)
+        result = cls(**values)
     except InputError as error:
         raise InputError(node.get_fully_qualified_name(), error.problems) from None
+    _watch(node, result, changed)
+    return result
 
 
-def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
+def _watch(node: Node, start: P, changed: Callable[[P], None] | None) -> None:
+    """Check what is set at run time, and pass it on."""
+    held = [start]
+
+    def check(given: list[Parameter]) -> SetParametersResult:
+        known = specs(type(start))
+        values = {parameter.name: parameter.value for parameter in given}
+        if "use_sim_time" in values:
+            reason = "use_sim_time is read when the node starts, and cannot be changed"
+            return SetParametersResult(successful=False, reason=reason)
+        mine = {name: value for name, value in values.items() if name in known}
+        try:
+            result = dataclasses.replace(held[0], **mine)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if mine and changed is not None:
+            held[0] = result
+            changed(result)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+
+
+def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
     unit = f" [{spec.unit}]" if spec.unit else ""
     descriptor = ParameterDescriptor(
         name=name,
         type=_TYPES[spec.kind].value,
         description=spec.doc + unit,
         additional_constraints=spec.allowed(),
-        read_only=True,
+        read_only=read_only,
     )
     low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
     if spec.kind == "number":

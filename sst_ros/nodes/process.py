@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -37,20 +38,31 @@ def run(name: str, build: Callable[[], Worker], args: list[str] | None = None) -
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    worker = None
     try:
-        worker = build()
-        executor = SingleThreadedExecutor()
-        executor.add_node(worker.node)
-        while not stop.is_set() and not worker.done.is_set():
-            executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
-    except SstError as error:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except (RuntimeError, ValueError) as error:  # what rcl makes of bad --ros-args
+        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
+    try:
+        return _spin(build, stop)
+    except (SstError, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     finally:
-        if worker is not None:
-            worker.close()
-            worker.node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _spin(build: Callable[[], Worker], stop: threading.Event) -> int:
+    worker = build()
+    executor = SingleThreadedExecutor()
+    executor.add_node(worker.node)
+    try:
+        while not stop.is_set() and not worker.done.is_set():
+            executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
+    finally:
+        try:
+            worker.close()
+        finally:
+            executor.shutdown()
+            worker.node.destroy_node()
     return 0

@@ -10,13 +10,10 @@ from __future__ import annotations
 import importlib
 import sys
 import threading
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -29,46 +26,16 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.typesys import Stores, get_typestore
 
-from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import parameters, process
-from sst_ros.scene import share_directory
-from sst_ros.schema import Section, text, texts
+from sst_ros.nodes.bag_file import BagFile
+from sst_ros.nodes.clocks import STEADY
+from sst_ros.nodes.readers import NeverSpun, take
+from sst_ros.nodes.settings import RecorderParameters
 
-_BAG_VERSION = 9
 _DEPTH = 10000
 _DRAIN_PERIOD_S = 0.02
 _LOOK_PERIOD_S = 0.2
-
-
-def default_topics() -> tuple[str, ...]:
-    """Topics in config/topics.txt, the list that `ros2 bag record` takes as well."""
-    return tuple((share_directory() / "config" / "topics.txt").read_text().split())
-
-
-@dataclass(frozen=True)
-class RecorderParameters(Section):
-    """Parameters of sst_recorder."""
-
-    output: str = text(
-        "folder of the bag, which must not exist yet; - for a dated name", default="-"
-    )
-    topics: tuple[str, ...] = texts("topics to record", default=default_topics())
-
-
-class _NeverSpun(CallbackGroup):
-    """Keeps the readers out of the executor: `Recorder._drain` takes their messages."""
-
-    def can_execute(self, entity: object) -> bool:
-        return False
-
-    def beginning_execution(self, entity: object) -> bool:
-        return False
-
-    def ending_execution(self, entity: object) -> None:
-        return None
 
 
 class Recorder:
@@ -82,27 +49,19 @@ class Recorder:
         self._readers: dict[str, tuple[Subscription, Connection]] = {}
         self._heard: dict[str, int] = {}
         self._ready = False
-        self._aside = _NeverSpun()
-        self._typestore = get_typestore(Stores.ROS2_KILTED)
+        self._aside = NeverSpun()
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
-        path = Path(dated if given.output == "-" else given.output)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._bag = Writer(path, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
-            self._bag.open()
-        except (WriterError, OSError) as error:
-            allowed = f"must be a new folder ({error})"
-            raise InputError("recorder", [Problem("output", str(path), allowed)]) from None
-        self.node.get_logger().info(f"recording to {path}")
-        self.node.create_timer(_LOOK_PERIOD_S, self._look)
-        self.node.create_timer(_DRAIN_PERIOD_S, self._drain)
+        self._bag = BagFile(Path(dated if given.output == "-" else given.output))
+        self.node.get_logger().info(f"recording to {self._bag.path}")
+        self.node.create_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
+        self.node.create_timer(_DRAIN_PERIOD_S, self._drain, clock=STEADY)
 
     def close(self) -> None:
         """Take what has arrived and close the bag."""
         self._drain()
         self._bag.close()
-        total = sum(self._heard.values())
-        self.node.get_logger().info(f"{total} messages of {len(self._heard)} topics recorded")
+        said = f"{self._bag.messages} messages of {len(self._heard)} topics recorded"
+        self.node.get_logger().info(said)
 
     def _look(self) -> None:
         """Subscribe to wanted topics as they appear; say once when all that speak were heard."""
@@ -115,6 +74,10 @@ class Recorder:
             print(f"ready: {len(self._readers)} topics", flush=True)
 
     def _subscribe(self, topic: str, kind: str) -> None:
+        if not self._bag.knows(kind):  # also keeps names that others chose away from the import
+            self.node.get_logger().error(f"{topic} is not recorded: its type {kind} is unknown")
+            self._wanted.discard(topic)
+            return
         package, _, name = kind.split("/")
         message_type = getattr(importlib.import_module(f"{package}.msg"), name)
         offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
@@ -127,9 +90,7 @@ class Recorder:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         )
-        connection = self._bag.add_connection(
-            topic, kind, typestore=self._typestore, offered_qos_profiles=[_offered(asked)]
-        )
+        connection = self._bag.connect(topic, kind, [_offered(asked)])
         reader = self.node.create_subscription(
             message_type, topic, lambda _: None, asked, callback_group=self._aside, raw=True
         )
@@ -140,14 +101,11 @@ class Recorder:
             for data, received_ns in _taken(reader):
                 self._bag.write(connection, received_ns, data)
                 self._heard[topic] = self._heard.get(topic, 0) + 1
+        self._bag.save()
 
 
-def _taken(reader: Subscription) -> Iterable[tuple[bytes, int]]:
-    while True:
-        with reader.handle:
-            result: Any = reader.handle.take_message(reader.msg_type, True)
-        if result is None:
-            return
+def _taken(reader: Subscription) -> Iterator[tuple[bytes, int]]:
+    while (result := take(reader, raw=True)) is not None:
         data, info = result
         yield data, info["received_timestamp"]
 

@@ -7,34 +7,23 @@ import sys
 import threading
 import time
 from array import array
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 
 from sst_ros import scene
 from sst_ros.control import torque
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.nodes import parameters, process
-from sst_ros.schema import Section, integer, number, text
+from sst_ros.nodes.clocks import STEADY
+from sst_ros.nodes.commands import ACTUATORS, ZERO
+from sst_ros.nodes.messages import nanoseconds
+from sst_ros.nodes.settings import PlayerParameters
 from sst_ros.simulation import NANOSECONDS
-
-
-@dataclass(frozen=True)
-class PlayerParameters(Section):
-    """Parameters of sst_torque_player."""
-
-    scene: str = text("scene whose torque is played, by name or by path", default="example2")
-    csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
-    simulator: str = text("name of the simulator's node", default="sst_simulator")
-    wait_for_subscribers: int = integer(
-        "readers of the commands to wait for", "1", default=1, least=1, most=100
-    )
-    timeout: float = number(
-        "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6
-    )
 
 
 class TorquePlayer:
@@ -45,18 +34,28 @@ class TorquePlayer:
         self.done = threading.Event()
         self._parameters = parameters.declare(self.node, PlayerParameters)
         self._profile, self._duration = self._load()
-        topic = f"{self._parameters.simulator}/commands"
-        self._commands = self.node.create_publisher(Float64MultiArray, topic, 10)
-        self._message = Float64MultiArray(data=array("d", [0.0] * 3))
+        simulator, stamped = self._parameters.simulator, self._parameters.stamped
+        if stamped:
+            topic = f"{simulator}/commands_stamped"
+            self._message: Any = JointState(name=ACTUATORS, effort=array("d", ZERO))
+            self._torques = self._message.effort
+        else:
+            topic = f"{simulator}/commands"
+            self._message = Float64MultiArray(data=array("d", ZERO))
+            self._torques = self._message.data
+        self._commands = self.node.create_publisher(type(self._message), topic, 10)
         self._start_ns: int | None = None
         self._heard = time.monotonic()
+        self._phase = ""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(String, f"{simulator}/phase", self._hear, latched)
         self.node.create_subscription(JointState, "joint_states", self._answer, 10)
-        self.node.create_timer(0.5, self._watch)
+        self.node.create_timer(0.5, self._watch, clock=STEADY)
 
     def close(self) -> None:
         """Leave the actuators without torque if the profile was cut short."""
         if self._start_ns is not None and not self.done.is_set():
-            self._send((0.0, 0.0, 0.0))
+            self._send(ZERO)
 
     def _load(self) -> tuple[torque.Profile, float]:
         if self._parameters.csv != "-":
@@ -67,14 +66,22 @@ class TorquePlayer:
             raise InputError("torque_player", [Problem("scene", played.name, allowed)])
         return torque.sine(played.torque), played.duration
 
+    def _hear(self, phase: String) -> None:
+        self._phase = phase.data
+        if self._start_ns is not None and phase.data.startswith("fault"):
+            raise SstError(f"the simulator stopped: {phase.data}")
+
     def _answer(self, state: JointState) -> None:
-        """Play the torque of the state's instant; stamp zero means that no run has begun."""
+        """Play the torque of the state's instant; stamp zero means that it is of no run."""
         self._heard = time.monotonic()
         if self._commands.get_subscription_count() < self._parameters.wait_for_subscribers:
             return
-        stamp_ns = state.header.stamp.sec * NANOSECONDS + state.header.stamp.nanosec
+        stamp_ns = nanoseconds(state.header.stamp)
+        if self._parameters.stamped:
+            self._message.header.stamp = state.header.stamp
         if stamp_ns == 0:
-            self._send(self._profile(0.0))
+            if self._start_ns is None:
+                self._send(self._profile(0.0))
             return
         if self._start_ns is None:
             self._start_ns = stamp_ns
@@ -82,13 +89,12 @@ class TorquePlayer:
         if elapsed < self._duration:
             self._send(self._profile(elapsed))
         else:
-            self._send((0.0, 0.0, 0.0))
+            self._send(ZERO)
             self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
             self.done.set()
 
     def _send(self, torques: torque.Torque) -> None:
-        data = self._message.data
-        data[0], data[1], data[2] = torques
+        self._torques[0], self._torques[1], self._torques[2] = torques
         self._commands.publish(self._message)
 
     def _watch(self) -> None:

@@ -13,7 +13,10 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
 DOMAINS = itertools.cycle(range(1 + os.getpid() % 50, 101))
@@ -90,9 +93,9 @@ class Observer:
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def publisher(self, kind, topic):
+    def publisher(self, kind, topic, readers=1):
         publisher = self.node.create_publisher(kind, topic, 10)
-        self.until(lambda: publisher.get_subscription_count() > 0, f"a reader of {topic}")
+        self.until(lambda: publisher.get_subscription_count() >= readers, f"readers of {topic}")
         return publisher
 
     def until(self, condition, what, timeout=20.0):
@@ -100,6 +103,36 @@ class Observer:
         while not condition():
             assert time.monotonic() < deadline, f"no {what} within {timeout} s"
             self.executor.spin_once(timeout_sec=0.05)
+
+    def call(self, kind, name, **fields):
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready, f"service {name}")
+        future = client.call_async(kind.Request(**fields))
+        self.until(future.done, f"reply of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameter(self, node, name, value):
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        reply = self.call(SetParameters, f"{node}/set_parameters", parameters=[parameter])
+        return reply.results[0]
+
+    def told(self, key, value, timeout=20.0):
+        """Wait until the diagnostics say so; return all that they say then."""
+        heard = self.heard.get("/diagnostics")
+        if heard is None:
+            heard = self.listen(DiagnosticArray, "/diagnostics")
+
+        def last():
+            return {pair.key: pair.value for pair in heard[-1].status[0].values}
+
+        meets = value if callable(value) else lambda said: said == str(value)
+        self.until(lambda: heard and meets(last()[key]), f"{key} in the diagnostics", timeout)
+        return {**last(), "level": heard[-1].status[0].level, "said": heard[-1].status[0].message}
+
+    @staticmethod
+    def stamp(message):
+        return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
     def close(self):
         self.executor.shutdown()

@@ -9,12 +9,14 @@ from std_msgs.msg import Float64MultiArray
 pytestmark = pytest.mark.ros
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path, number):
     recorder = nodes.run("recorder", output=tmp_path / "bag")
     simulator = nodes.run("simulator", wait_for_command=True, duration=0.3)
-    assert nodes.line(recorder) == "ready: 7 topics\n"
-    commands = observer.publisher(Float64MultiArray, "/sst_simulator/commands")
+    assert nodes.line(recorder) == "ready: 9 topics\n"
+    commands = observer.publisher(Float64MultiArray, "/sst_simulator/commands", readers=2)
     commands.publish(Float64MultiArray(data=[0.0, 0.0, 0.0]))
     assert simulator.wait(timeout=20) == 0
     status, _, err = nodes.stop(recorder, number)

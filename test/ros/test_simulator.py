@@ -82,7 +82,7 @@ def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes,
 def test_bad_commands_are_dropped_whole_and_counted(nodes, observer):
     told = observer.listen(DiagnosticArray, "/diagnostics")
     states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", wait_for_command=True)
+    process = nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
     commands = observer.publisher(Float64MultiArray, COMMANDS)
     commands.publish(Float64MultiArray(data=[0.1, 0.2, 0.3]))
     bad = [[1.0, 2.0], [1.0] * 4, [], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]]
@@ -102,7 +102,7 @@ def test_bad_commands_are_dropped_whole_and_counted(nodes, observer):
 
 def test_without_a_command_the_torque_is_zero(nodes, observer):
     states = observer.listen(JointState, "/joint_states")
-    nodes.run("simulator", scene="example1")
+    nodes.run("simulator", scene="example1", real_time_factor=0.1)
     observer.until(lambda: len(states) > 20, "states")
     assert {tuple(state.effort) for state in states} == {(0.0,) * 9}
     assert states[-1].position[0] != states[0].position[0]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every topic and service of every node, declared once: nodes open them, docs and tests list them.
+
+Names are as in the node: ~ stands for the node's own name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped, WrenchStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+PUBLISHES, SUBSCRIBES, SERVES = "publishes", "subscribes", "serves"
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """One topic or service of a node.
+
+    Attributes:
+        use: PUBLISHES, SUBSCRIBES or SERVES.
+        name: its name; {simulator} stands for the player's parameter.
+        kind: type of its messages.
+        doc: what it carries.
+        depth: messages kept for slow readers; 0 for two seconds of them.
+        latched: the last message is kept for late joiners.
+        when: the condition under which it exists; always where empty.
+
+    """
+
+    use: str
+    name: str
+    kind: Any
+    doc: str
+    depth: int = 10
+    latched: bool = False
+    when: str = ""
+
+    @property
+    def type_name(self) -> str:
+        """The type as ROS writes it."""
+        package, form, *_ = self.kind.__module__.split(".")
+        return f"{package}/{form}/{self.kind.__name__}"
+
+    def publisher(self, node: Node, depth: int = 0) -> Publisher:
+        """Open it for publishing."""
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=self.depth or depth, durability=durability)
+        return node.create_publisher(self.kind, self.name, qos)
+
+
+JOINT_STATES = Endpoint(
+    PUBLISHES,
+    "joint_states",
+    JointState,
+    "gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the "
+    "step that ended [N m]",
+    depth=0,
+)
+ORIENTATION = Endpoint(
+    PUBLISHES, "~/orientation", QuaternionStamped, "orientation of {E} in {B}", depth=0
+)
+EULER_ZYZ = Endpoint(
+    PUBLISHES, "~/euler_zyz", Vector3Stamped, "the same as ZYZ angles theta, phi, psi [rad]", 0
+)
+APPLIED_TORQUES = Endpoint(
+    PUBLISHES,
+    "~/applied_torques",
+    JointTrajectory,
+    "what acted over every step since the last message [N m]; where the scene takes a moment from "
+    "a topic also moment_x, moment_y, moment_z in {B}",
+    depth=0,
+)
+SCENE = Endpoint(PUBLISHES, "~/scene", String, "the scene, as YAML", 1, latched=True)
+PHASE = Endpoint(
+    PUBLISHES,
+    "~/phase",
+    String,
+    "waiting, running, paused, finished, or `fault: ` and the reason",
+    depth=1,
+    latched=True,
+)
+DIAGNOSTICS = Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of the run, at 1 Hz")
+CLOCK = Endpoint(
+    PUBLISHES, "/clock", Clock, "simulated time", depth=1, when="publish_clock is true"
+)
+COMMANDS = Endpoint(
+    SUBSCRIBES, "~/commands", Float64MultiArray, "torques of gamma_1..3 [N m], held until the next"
+)
+COMMANDS_STAMPED = Endpoint(
+    SUBSCRIBES,
+    "~/commands_stamped",
+    JointState,
+    "the same by name, in effort [N m]; the stamp is that of the joint_states it answers",
+)
+EXTERNAL_MOMENT = Endpoint(
+    SUBSCRIBES,
+    "~/external_moment",
+    WrenchStamped,
+    "moment on the star, torque in {B} [N m]; the force is not used",
+    when="the scene has moment: {topic: true}",
+)
+SET_STATE = Endpoint(
+    SUBSCRIBES,
+    "~/set_state",
+    JointState,
+    "state to go on from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3; "
+    "refused while running, in fault, and where it is not admissible",
+)
+PAUSE = Endpoint(SERVES, "~/pause", SetBool, "hold the run, or let it go on; idempotent")
+STEP = Endpoint(
+    SERVES, "~/step", Trigger, "advance a paused run by one sample; refused while running"
+)
+RESET = Endpoint(
+    SERVES, "~/reset", Trigger, "back to the initial state, also out of a fault; stamps go on"
+)
+
+SIMULATOR = (
+    JOINT_STATES,
+    ORIENTATION,
+    EULER_ZYZ,
+    APPLIED_TORQUES,
+    SCENE,
+    PHASE,
+    DIAGNOSTICS,
+    CLOCK,
+    COMMANDS,
+    COMMANDS_STAMPED,
+    EXTERNAL_MOMENT,
+    SET_STATE,
+    PAUSE,
+    STEP,
+    RESET,
+)
+
+PLAYER = (
+    Endpoint(
+        PUBLISHES,
+        "{simulator}/commands",
+        Float64MultiArray,
+        "the profile's torques [N m] at the stamp of each joint_states",
+        when="stamped is false",
+    ),
+    Endpoint(
+        PUBLISHES,
+        "{simulator}/commands_stamped",
+        JointState,
+        "the same, by name and stamp",
+        when="stamped is true",
+    ),
+    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered"),
+    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
+)
+
+RECORDER: tuple[Endpoint, ...] = ()
+"""The recorder subscribes to the topics of its parameter `topics`, and to nothing else."""

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulator publishes: the run loop's audience.
+
+Publishing happens in the run's thread, after the step, in the slack before the next deadline.
+rclpy holds the interpreter's lock while it publishes (measured: 200 publications beside a busy
+thread are never interrupted), so a thread of its own could not work beside the next step; it would
+only add switches between threads.
+"""
+
+from __future__ import annotations
+
+import time
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from sst_ros.document import dump
+from sst_ros.nodes import endpoints
+from sst_ros.nodes.clocks import OwnClock
+from sst_ros.nodes.commands import Settings
+from sst_ros.nodes.messages import StateMessages, TorqueLog
+from sst_ros.scene import Scene
+from sst_ros.simulation import State, Triple
+
+_HISTORY_S = 2
+_FAST = 10
+_LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
+_ACKNOWLEDGE_S = 2.0
+
+
+class Publications:
+    """Publishers of the simulator."""
+
+    def __init__(self, node: Node, scene: Scene, settings: Settings) -> None:
+        given = settings.parameters
+        self._node = node
+        self._clock = OwnClock(node) if given.publish_clock else None
+        samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
+        depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
+        self._joint_states = endpoints.JOINT_STATES.publisher(node, depth)
+        self._orientation = endpoints.ORIENTATION.publisher(node, depth)
+        self._euler_zyz = endpoints.EULER_ZYZ.publisher(node, depth)
+        self._applied = endpoints.APPLIED_TORQUES.publisher(node, depth)
+        self._phase = endpoints.PHASE.publisher(node)
+        self._scene = endpoints.SCENE.publisher(node)
+        self._scene.publish(String(data=dump(scene)))
+        self._messages = StateMessages()
+        moments = scene.moment is not None and scene.moment.topic
+        self._log = TorqueLog(given.ticks_per_sample, given.period_ns, moments=moments)
+        self._period_ns = given.period_ns
+
+    def begin_ns(self, earliest_ns: int) -> int:
+        """Give the stamp of a new start; 0 as long as the clock that is followed has no time."""
+        self._log.count = 0
+        if self._clock is not None:
+            return max(self._clock.now_ns, earliest_ns)
+        now = self._node.get_clock().now().nanoseconds
+        return max(now, earliest_ns) if now else 0
+
+    def tick(self, torque: Triple, moment: Triple) -> None:
+        """Note what acts over a tick."""
+        self._log.append(torque, moment)
+
+    def sample(self, state: State, stamp_ns: int) -> None:
+        """Publish a sample of the run and the torques that led to it."""
+        if self._clock is not None:
+            self._clock.tell(stamp_ns)
+        if self._log.count:
+            self._applied.publish(self._log.take(stamp_ns - self._log.count * self._period_ns))
+        self._messages.fill(state, stamp_ns)
+        self._publish_state()
+
+    def idle(self, state: State, *, still: bool) -> None:
+        """Show a state that is no sample: stamped zero, `still` with zero rates."""
+        if self._clock is not None:
+            self._clock.repeat()
+        self._log.count = 0
+        self._applied.publish(self._log.take(0))
+        self._messages.fill(state, 0)
+        if still:
+            self._messages.still()
+        self._publish_state()
+
+    def changed(self, phase: str) -> None:
+        """Tell a change of the phase."""
+        self._phase.publish(String(data=phase))
+        log = self._node.get_logger()
+        if phase.startswith("fault"):
+            log.error(f"{phase}; the last valid state is held until ~/reset")
+        else:
+            log.info(phase)
+
+    def rivals(self) -> list[str]:
+        """Names of other nodes that publish /clock while this one does."""
+        return [] if self._clock is None else self._clock.rivals()
+
+    def finish(self) -> None:
+        """Wait until readers have it all.
+
+        Fast DDS asks them every 3 s only, unless there is much to send: so this may take all of
+        its time where nothing is missing.
+        """
+        deadline = time.monotonic() + _ACKNOWLEDGE_S
+        for publisher in self._node.publishers:
+            left = max(0.0, deadline - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+    def _publish_state(self) -> None:
+        self._joint_states.publish(self._messages.joint_states)
+        self._orientation.publish(self._messages.orientation)
+        self._euler_zyz.publish(self._messages.euler_zyz)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Control of the run from outside: pause, step, reset, set_state. Thin: the run loop decides."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+from sst_ros.nodes import endpoints
+from sst_ros.nodes.commands import ZERO, Refused, named
+from sst_ros.nodes.run_loop import RunLoop
+
+
+class Services:
+    """The services and the topic by which a run is controlled."""
+
+    def __init__(self, node: Node, loop: RunLoop) -> None:
+        self._node, self._loop = node, loop
+        for endpoint, answer in (
+            (endpoints.PAUSE, self._pause),
+            (endpoints.STEP, self._step),
+            (endpoints.RESET, self._reset),
+        ):
+            node.create_service(endpoint.kind, endpoint.name, answer)
+        topic = endpoints.SET_STATE
+        node.create_subscription(topic.kind, topic.name, self._set_state, topic.depth)
+
+    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        reply = self._loop.ask(partial(self._loop.pause, request.data))
+        response.success, response.message = reply
+        return response
+
+    def _step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = self._loop.ask(self._loop.step)
+        return response
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = self._loop.ask(self._loop.reset)
+        return response
+
+    def _set_state(self, message: JointState) -> None:
+        """Take the angles and rates of the actuators; a topic has no reply, the log has."""
+        try:
+            gamma = named(message.name, message.position, "angles [rad] in position")
+            gamma_dot = ZERO
+            if len(message.velocity):
+                gamma_dot = named(message.name, message.velocity, "rates [rad/s] in velocity")
+        except Refused as refused:
+            self._node.get_logger().warning(f"set_state refused: {refused}")
+            return
+        reply = self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot))
+        said = f"set_state: {reply.message}"
+        if reply.success:  # rclpy refuses two severities from one line
+            self._node.get_logger().info(said)
+        else:
+            self._node.get_logger().warning(said)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command board: what is used, dropped, clamped and let go of."""
+
+import math
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from sst_ros import load_scene
+from sst_ros.nodes.commands import ZERO, CommandBoard, Refused, named
+from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.simulation import Simulation
+
+
+def array(*data):
+    return SimpleNamespace(data=data)
+
+
+def stamped(stamp_ns, effort, names=("gamma_1", "gamma_2", "gamma_3")):
+    stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = SimpleNamespace(stamp=stamp)
+    return SimpleNamespace(header=header, name=list(names), effort=list(effort))
+
+
+class Bench:
+    def __init__(self, limit=None, **given):
+        self.parameters = SimulatorParameters(**given)
+        self.commands, self.stamped, self.moments = [], [], []
+        takes = [
+            lambda queue=queue: queue.pop(0) if queue else None
+            for queue in (self.commands, self.stamped, self.moments)
+        ]
+        self.board = CommandBoard(self, limit, *takes)
+        self.state = Simulation(load_scene("example1")).state
+
+    def torque(self):
+        return self.board.torque(self.state)
+
+
+def test_the_last_good_command_is_held():
+    bench = Bench()
+    assert bench.torque() == ZERO and not bench.board.begun
+    bench.commands += [array(1.0, 2.0, 3.0), array(math.nan, 0, 0), array(1.0), array(*[0] * 4)]
+    assert bench.torque() == (1.0, 2.0, 3.0)
+    assert (bench.board.received, bench.board.dropped) == (1, 3)
+    assert bench.board.reasons == {"not finite": 1, "wrong size": 2}
+    assert "must be 3 finite torques [N m]" in bench.board.last_refusal
+
+
+def test_names_may_come_in_any_order():
+    bench = Bench()
+    bench.stamped.append(stamped(5, [3.0, 1.0, 2.0], ["gamma_3", "gamma_1", "gamma_2"]))
+    assert bench.torque() == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "effort", "kind"),
+    [
+        (["gamma_1", "gamma_2"], [1, 2], "wrong names"),
+        (["gamma_1", "gamma_2", "elbow"], [1, 2, 3], "wrong names"),
+        (["gamma_1", "gamma_2", "gamma_2"], [1, 2, 3], "wrong names"),
+        ([], [], "wrong names"),
+        (["gamma_1", "gamma_2", "gamma_3"], [1, 2], "wrong size"),
+        (["gamma_1", "gamma_2", "gamma_3"], [1, 2, math.inf], "not finite"),
+    ],
+)
+def test_wrong_names_sizes_and_values_are_refused(names, effort, kind):
+    with pytest.raises(Refused) as caught:
+        named(names, effort, "torques [N m] in effort")
+    assert caught.value.kind == kind
+
+
+def test_a_stale_command_is_let_go_of_and_a_fresh_one_held_again():
+    bench = Bench(command_timeout=0.05)
+    bench.commands.append(array(1.0, 2.0, 3.0))
+    assert bench.torque() == (1.0, 2.0, 3.0)
+    until = time.monotonic() + 0.06
+    while time.monotonic() < until:
+        pass
+    assert bench.torque() == ZERO and bench.torque() == ZERO
+    assert (bench.board.timeouts, bench.board.stale) == (1, True)
+    bench.board.refresh()
+    assert bench.torque() == (1.0, 2.0, 3.0)
+    bench.commands.append(array(0.0, 0.0, 1.0))
+    assert bench.torque() == (0.0, 0.0, 1.0) and not bench.board.stale
+
+
+def test_zero_timeout_holds_for_ever():
+    bench = Bench(command_timeout=0.0)
+    bench.commands.append(array(1.0, 2.0, 3.0))
+    bench.torque()
+    bench.board._since -= 1e6
+    assert bench.torque() == (1.0, 2.0, 3.0)
+
+
+def test_damping_takes_over_within_the_limit():
+    bench = Bench(limit=0.5, command_timeout=0.5, timeout_damping=2.0)
+    bench.commands.append(array(0.1, 0.1, 0.1))
+    bench.torque()
+    bench.board._since -= 1.0
+    rates = bench.state.joints.gamma_dot
+    expected = tuple(min(max(-2.0 * rate, -0.5), 0.5) for rate in rates)
+    assert any(rates) and bench.torque() == expected
+
+
+def test_limits_clamp_and_count():
+    bench = Bench(limit=2.0)
+    bench.commands.append(array(1.0, -5.0, 2.5))
+    assert bench.torque() == (1.0, -2.0, 2.0)
+    assert bench.board.clamped == 1
+
+
+def test_a_flood_is_taken_in_turns():
+    bench = Bench()
+    bench.commands += [array(float(k), 0.0, 0.0) for k in range(1000)]
+    assert bench.torque() == (9.0, 0.0, 0.0)
+    assert len(bench.commands) == 990
+
+
+def test_lockstep_wants_the_stamp():
+    bench = Bench(sync="lockstep")
+    bench.commands.append(array(9.0, 9.0, 9.0))
+    bench.stamped += [stamped(0, [7, 7, 7]), stamped(4, [8, 8, 8])]
+    assert bench.board.answer(5) is None
+    assert bench.board.reasons == {"no stamp": 1, "stamp": 1}
+    bench.stamped += [stamped(5, [1, 2, 3]), stamped(5, [4, 5, 6])]
+    assert bench.board.answer(5) == (1.0, 2.0, 3.0)  # the first answer counts
+    assert bench.board.reasons["stamp"] == 2
+
+
+def test_lockstep_begins_at_the_answer_to_a_preview():
+    bench = Bench(sync="lockstep")
+    assert not bench.board.look()
+    bench.stamped.append(stamped(0, [0, 0, 0]))
+    assert bench.board.look()
+
+
+def test_clear_forgets_what_has_arrived():
+    bench = Bench()
+    bench.commands.append(array(1.0, 2.0, 3.0))
+    bench.board.clear()
+    assert bench.torque() == ZERO and not bench.board.begun
+
+
+def test_moments_are_checked_and_let_go_of():
+    bench = Bench(command_timeout=0.5)
+
+    def wrench(x):
+        torque = SimpleNamespace(x=x, y=0.0, z=0.0)
+        return SimpleNamespace(wrench=SimpleNamespace(torque=torque))
+
+    bench.moments += [wrench(1.5), wrench(math.nan)]
+    bench.torque()
+    assert bench.board.moment == (1.5, 0.0, 0.0)
+    assert bench.board.reasons == {"not finite": 1}
+    bench.board._moment_since -= 1.0
+    bench.torque()
+    assert bench.board.moment == ZERO

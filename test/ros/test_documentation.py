@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Docs and SROS2 policies against the declarations, and these against running nodes."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from sst_ros.nodes import documentation, health
+from sst_ros.nodes.documentation import NODES, SIMULATION_INTERFACES, policy
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).parents[2]
+IDS = [node.command for node in NODES]
+WITHOUT_REASON = {"/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"}
+"""Topics that exist under conditions only: a parameter, or the scene."""
+
+
+def test_the_docs_are_those_of_the_declarations():
+    page = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
+    assert documentation.filled(page) == page, "run python -m sst_ros.nodes.documentation"
+
+
+@pytest.mark.parametrize("node", NODES, ids=IDS)
+def test_the_policies_are_those_of_the_declarations(node):
+    path = ROOT / "config" / "sros2" / f"{node.command}.policy.xml"
+    assert path.read_text(encoding="utf-8") == policy(node)
+
+
+@pytest.mark.parametrize("node", NODES, ids=IDS)
+def test_the_policies_have_the_form_of_sros2(node):
+    """As in sros2's policy.xsd, version 0.2.0."""
+    root = ElementTree.fromstring(policy(node).encode())
+    assert (root.tag, root.attrib) == ("policy", {"version": "0.2.0"})
+    (enclaves,) = root
+    (enclave,) = enclaves
+    assert (enclaves.tag, enclave.tag) == ("enclaves", "enclave")
+    assert enclave.attrib["path"].startswith("/")
+    (profiles,) = enclave
+    (profile,) = profiles
+    assert (profiles.tag, profile.tag) == ("profiles", "profile")
+    assert profile.attrib == {"ns": "/", "node": node.name}
+    rights = {"topics": {"publish", "subscribe"}, "services": {"reply", "request"}}
+    for group in profile:
+        assert set(group.attrib) <= rights[group.tag]
+        assert set(group.attrib.values()) == {"ALLOW"}
+        assert len(group) and {entry.tag for entry in group} == {group.tag[:-1]}
+        assert all(entry.text.startswith("/") and not entry.attrib for entry in group)
+
+
+def allowed(node):
+    result = {}
+    for group in ElementTree.fromstring(policy(node).encode()).iter():
+        for right in ("publish", "subscribe", "reply", "request"):
+            if group.get(right) == "ALLOW":
+                result.setdefault(right, set()).update(entry.text for entry in group)
+    return result
+
+
+def used(observer, name):
+    graph, at = observer.node, (name, "/")
+    return {
+        "publish": {topic for topic, _ in graph.get_publisher_names_and_types_by_node(*at)},
+        "subscribe": {topic for topic, _ in graph.get_subscriber_names_and_types_by_node(*at)},
+        "reply": {topic for topic, _ in graph.get_service_names_and_types_by_node(*at)},
+        "request": {topic for topic, _ in graph.get_client_names_and_types_by_node(*at)},
+    }
+
+
+def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, tmp_path):
+    nodes.run("simulator", wait_for_command=True)
+    observer.told("phase", "waiting")
+    recorder = nodes.run("recorder", output=tmp_path / "bag")
+    assert nodes.line(recorder).startswith("ready")
+    nodes.run("torque_player", wait_for_subscribers=100)
+    player = NODES[1]
+    observer.until(
+        lambda: (
+            player.name in observer.node.get_node_names()
+            and "/joint_states" in used(observer, player.name)["subscribe"]
+        ),
+        "the player",
+    )
+    for node in NODES:
+        expected = allowed(node)
+
+        def missing(node=node, expected=expected):
+            real = used(observer, node.name)
+            return [
+                (right, name)
+                for right in ("publish", "subscribe", "reply", "request")
+                for name in expected.get(right, set()) - real[right] - WITHOUT_REASON
+                if name.rpartition("/")[2] not in SIMULATION_INTERFACES
+            ]
+
+        observer.until(lambda missing=missing: not missing(), f"all of {node.name}")
+        real = used(observer, node.name)
+        for right, names in real.items():
+            assert names <= expected.get(right, set()), (node.name, right)
+
+
+def test_the_diagnostics_say_what_the_docs_say(nodes, observer):
+    nodes.run("simulator")
+    said = observer.told("phase", "running")
+    said = observer.told("error_estimate", lambda value: True)
+    assert list(said)[:-2] == list(health.KEYS)

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fault table, case by case, in real processes: nothing crashes, nothing is in doubt."""
+
+import math
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
+
+from sst_ros import load_scene
+from sst_ros.document import dump
+
+pytestmark = pytest.mark.ros
+NODE = "/sst_simulator"
+NAMES = ["gamma_1", "gamma_2", "gamma_3"]
+
+
+@pytest.fixture
+def variant(tmp_path):
+    """Write a scene with sections of another kind; give its path."""
+
+    def write(**sections):
+        path = tmp_path / "variant.yaml"
+        path.write_text(dump(load_scene("example2")) + "".join(sections.values()))
+        return path
+
+    return write
+
+
+def torques(states):
+    return [tuple(state.effort[:3]) for state in states]
+
+
+def test_bad_stamped_commands_are_dropped_by_reason(nodes, observer):
+    nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
+    states = observer.listen(JointState, "/joint_states")
+    commands = observer.publisher(JointState, f"{NODE}/commands_stamped")
+    commands.publish(JointState(name=NAMES[::-1], effort=[0.3, 0.2, 0.1]))
+    observer.until(lambda: (0.1, 0.2, 0.3) in torques(states), "the command")
+    for names, effort in (
+        (NAMES, [math.nan, 0.0, 0.0]),
+        (NAMES, [0.0, -math.inf, 0.0]),
+        (NAMES, [0.0, 0.0]),
+        ([*NAMES[:2], "elbow"], [0.0] * 3),
+        (NAMES[:2], [0.0] * 2),
+    ):
+        commands.publish(JointState(name=names, effort=effort))
+    said = observer.told("commands_dropped", 5)
+    assert said["commands_dropped_because"] == "not finite 2, wrong size 1, wrong names 2"
+    assert said["level"] == b"\x01" and "names" in said["said"]
+    assert torques(states)[-1] == (0.1, 0.2, 0.3)
+
+
+def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
+    process = nodes.run("simulator")
+    assert "no command yet: zero torque" in observer.told("phase", "running")["said"]
+    states = observer.listen(JointState, "/joint_states")
+    commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    commands.publish(Float64MultiArray(data=[0.1, 0.1, 0.1]))
+    sent = time.monotonic()
+    observer.until(lambda: (0.1, 0.1, 0.1) in torques(states), "the command")
+    observer.until(lambda: torques(states)[-1] == (0.0, 0.0, 0.0), "its end")
+    assert time.monotonic() - sent > 0.45
+    said = observer.told("command_timeouts", 1)
+    assert said["level"] == b"\x01" and float(said["command_age_s"]) > 0.5
+    commands.publish(Float64MultiArray(data=[0.2, 0.1, 0.1]))
+    observer.until(lambda: torques(states)[-1] == (0.2, 0.1, 0.1), "a fresh command")
+    _, _, err = nodes.stop(process)
+    assert "no command within command_timeout" in err
+
+
+def test_beyond_the_limit_is_clamped_and_a_stale_command_damped(nodes, observer, variant):
+    path = variant(actuators="actuators: {torque_limit: 0.5}\n")
+    nodes.run("simulator", scene=path, timeout_damping=2.0, command_timeout=0.2)
+    states = observer.listen(JointState, "/joint_states")
+    commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    commands.publish(Float64MultiArray(data=[7.0, -7.0, 0.1]))
+    observer.until(lambda: (0.5, -0.5, 0.1) in torques(states), "the clamped command")
+    said = observer.told("commands_clamped", 1)
+    commands.publish(Float64MultiArray(data=[7.0, -7.0, 0.1]))
+    said = observer.told("commands_clamped", 2)
+    assert said["level"] == b"\x01" and "clamped to the scene's torque limit" in said["said"]
+
+    def damped(state):
+        # held over the step that ended: from the rates at its start
+        wanted = [-2.0 * rate for rate in state.velocity[:3]]
+        return any(wanted) and list(state.effort[:3]) == pytest.approx(wanted, abs=0.05)
+
+    observer.until(lambda: damped(states[-1]), "damping")
+
+
+def test_an_external_moment_where_the_scene_takes_one(nodes, observer, variant):
+    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
+    nodes.run("simulator", scene=variant(moment="moment: {topic: true}\n"))
+    moments = observer.publisher(WrenchStamped, f"{NODE}/external_moment")
+    message = WrenchStamped()
+    message.wrench.torque.z = 0.25
+    moments.publish(message)
+    observer.until(
+        lambda: any(p.effort[5] == 0.25 for m in applied for p in m.points), "the moment"
+    )
+    assert applied[-1].joint_names == [*NAMES, "moment_x", "moment_y", "moment_z"]
+    message.wrench.torque.z = math.nan
+    moments.publish(message)
+    observer.told("commands_dropped_because", "not finite 1")
+
+
+@pytest.mark.slow
+def test_no_external_moment_where_the_scene_has_none(nodes, observer):
+    nodes.run("simulator")
+    observer.told("phase", "running")
+    assert observer.node.count_subscribers(f"{NODE}/external_moment") == 0
+
+
+def test_two_publishers_are_told(nodes, observer):
+    process = nodes.run("simulator")
+    observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    observer.publisher(JointState, f"{NODE}/commands_stamped")
+    said = observer.told("command_publishers", 2)
+    assert "2 publishers of commands" in said["said"] and said["level"] == b"\x01"
+    _, _, err = nodes.stop(process)
+    assert "2 publishers of commands" in err
+
+
+def test_a_flood_of_commands_is_bounded(nodes, observer):
+    """20 kHz for 2 s: no crash, no growth, samples go on."""
+    process = nodes.run("simulator")
+    commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    observer.told("phase", "running")
+    before, stop = _memory(process.pid), threading.Event()
+    good, bad = ([0.0] * 3, [math.nan] * 3)
+    messages = [Float64MultiArray(data=data) for data in (good, bad)]
+    sent = [0]
+
+    def flood():
+        start = time.monotonic()
+        while not stop.is_set() and time.monotonic() - start < 2.0:
+            for _ in range(20):
+                commands.publish(messages[sent[0] % 2])
+                sent[0] += 1
+            time.sleep(max(0.0, start + sent[0] / 20000 - time.monotonic()))
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    thread.join()
+    ticks = int(observer.told("commands_dropped", lambda n: int(n) > 100)["ticks"])
+    said = observer.told("ticks", lambda n: int(n) > ticks + 500)
+    taken = int(said["commands_received"]) + int(said["commands_dropped"])
+    assert sent[0] > 10000 and taken <= 10 * int(said["ticks"])
+    assert said["phase"] == "running" and said["fault"] == ""
+    assert _memory(process.pid) - before < 20_000  # kB
+    status, _, err = nodes.stop(process)
+    assert status == 0 and err.count("command dropped") <= 6
+
+
+def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer):
+    nodes.run("simulator")
+    observer.told("phase", "running")
+    scene = observer.listen(String, f"{NODE}/scene", latched=True)
+    phase = observer.listen(String, f"{NODE}/phase", latched=True)
+    observer.until(lambda: scene and phase, "latched messages")
+    assert phase[-1].data == "running"
+
+
+def test_kill_of_the_controller_ends_in_zero_torque(nodes, observer, tmp_path):
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
+    states = observer.listen(JointState, "/joint_states")
+    nodes.run("simulator")
+    player = nodes.run("torque_player", csv=table)
+    observer.until(lambda: (0.01, 0.0, 0.0) in torques(states), "torque")
+    player.kill()
+    observer.until(lambda: torques(states)[-1] == (0.0, 0.0, 0.0), "zero torque")
+    observer.told("command_timeouts", lambda n: int(n) >= 1)
+
+
+def test_the_player_ends_by_the_simulators_fault(nodes, observer, tmp_path):
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,50,0,0\n60,0,0,0\n")
+    nodes.run("simulator")
+    player = nodes.run("torque_player", csv=table)
+    _, err = player.communicate(timeout=20)
+    assert player.returncode == 1
+    assert "the simulator stopped: fault: stopped at" in err and "Traceback" not in err
+
+
+@pytest.mark.parametrize("command", ["simulator", "recorder", "torque_player"])
+def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
+    given = {"recorder": {"output": tmp_path / "bag"}}.get(command, {})
+    process = nodes.run(command, **given)
+    name = {"simulator": "sst_simulator"}.get(command, f"sst_{command}")
+    observer.until(lambda: name in observer.node.get_node_names(), "the node")
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
+    status, _, err = nodes.stop(process, signal.SIGTERM)
+    assert status == 0, err
+    assert "Traceback" not in err
+
+
+def test_bad_ros_arguments_are_refused_in_words(nodes):
+    process = nodes.start("simulator", "--ros-args", "-p", "nonsense")
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "nonsense" in err and "Traceback" not in err
+
+
+def _memory(pid):
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))

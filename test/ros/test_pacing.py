@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deadlines against a clock that the test moves."""
+
+import pytest
+
+from sst_ros.nodes.pacing import Pacer
+
+MS = 1_000_000
+
+
+class Hand:
+    """A clock that a sleeper moves on, to the nanosecond."""
+
+    def __init__(self):
+        self.now, self.slept = 5 * MS, []
+
+    def now_ns(self):
+        return self.now
+
+    def sleep(self, ns):
+        self.slept.append(ns)
+        self.now += ns
+
+
+@pytest.fixture
+def hand():
+    return Hand()
+
+
+def never():
+    return False
+
+
+def test_deadlines_are_absolute(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    for k in range(1, 200):
+        hand.now += 300_000  # the work of a tick
+        assert pacer.wait(never)
+        assert hand.now == 5 * MS + k * MS
+    assert pacer.missed == 0
+
+
+def test_an_overrun_drops_time_without_a_burst(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    pacer.wait(never)
+    hand.now += 4 * MS + 400_000
+    assert pacer.wait(never)
+    assert (pacer.missed, pacer.overruns) == (3, 1)
+    before = hand.now
+    pacer.wait(never)
+    assert hand.now == before + 600_000  # on the old grid, at once a whole wait
+    assert pacer.missed == 3
+
+
+def test_lateness_below_a_period_is_no_miss(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    hand.now += 1_900_000
+    assert pacer.wait(never)
+    assert (pacer.missed, pacer.late_ns) == (0, 900_000)
+
+
+@pytest.mark.parametrize("speed", [0.5, 3.0, 7.0])
+def test_speed_stretches_the_periods_without_drift(hand, speed):
+    pacer = Pacer(MS, speed, hand)
+    pacer.start()
+    for _ in range(7000):
+        pacer.wait(never)
+    assert hand.now == 5 * MS + round(7000 * MS / speed)
+
+
+def test_as_fast_as_possible_never_sleeps(hand):
+    pacer = Pacer(MS, 0.0, hand)
+    pacer.start()
+    assert all(pacer.wait(never) for _ in range(100))
+    assert hand.slept == []
+    assert not pacer.wait(lambda: True)
+
+
+def test_a_long_wait_can_be_interrupted(hand):
+    pacer = Pacer(10_000 * MS, 1.0, hand)
+    pacer.start()
+    assert not pacer.wait(lambda: hand.now > 105 * MS)
+    assert hand.now <= 155 * MS
+
+
+def test_a_change_of_speed_makes_no_burst(hand):
+    pacer = Pacer(MS, 0.001, hand)
+    pacer.start()
+    hand.now += 999 * MS
+    pacer.change(1.0)
+    before = hand.now
+    pacer.wait(never)
+    assert hand.now == before + MS and pacer.missed == 0
+
+
+def test_a_coarse_clock_is_run_through_and_a_leap_dropped(hand):
+    pacer = Pacer(MS, 1.0, hand, tolerance_ns=200 * MS)
+    pacer.start()
+    hand.now += 10 * MS
+    for _ in range(10):
+        pacer.wait(never)
+    assert (pacer.missed, hand.slept) == (0, [])
+    hand.now += 1000 * MS
+    pacer.wait(never)
+    assert pacer.missed == 999
+
+
+def test_a_clock_that_goes_back_starts_anew(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    pacer.wait(never)
+    hand.now -= 3 * MS
+    before = hand.now
+    pacer.wait(never)
+    assert (pacer.jumps, pacer.missed, hand.now) == (1, 0, before + MS)

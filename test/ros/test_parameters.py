@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters at start and at run time."""
+
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+from rcl_interfaces.srv import DescribeParameters
+
+from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.schema import specs
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).parents[2]
+
+
+def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, observer):
+    nodes.run("simulator")
+    observer.told("phase", "running")
+
+    def put(name, value):
+        result = observer.set_parameter("/sst_simulator", name, value)
+        return result.successful, result.reason
+
+    assert put("real_time_factor", 4.0) == (True, "")
+    observer.told("real_time_factor_now", lambda factor: float(factor) > 2.0)
+    assert put("command_timeout", 0.0)[0]
+    for name, value in (
+        ("real_time_factor", -1.0),
+        ("real_time_factor", math.nan),
+        ("real_time_factor", math.inf),
+        ("real_time_factor", "fast"),
+        ("command_timeout", -0.1),
+        ("rate", 500),
+        ("scene", "example1"),
+        ("sync", "lockstep"),
+        ("use_sim_time", True),
+    ):
+        successful, reason = put(name, value)
+        assert not successful, (name, value)
+        assert reason, (name, value)
+    assert "read" in put("use_sim_time", True)[1]
+    observer.told("phase", "running")
+
+
+@pytest.mark.slow
+def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
+    nodes.run("simulator")
+    known = specs(SimulatorParameters)
+    reply = observer.call(
+        DescribeParameters, "/sst_simulator/describe_parameters", names=list(known)
+    )
+    for descriptor in reply.descriptors:
+        assert descriptor.description.startswith(known[descriptor.name].doc)
+        may_change = descriptor.name in SimulatorParameters.CHANGEABLE
+        assert descriptor.read_only == (not may_change)
+        if known[descriptor.name].kind == "number":
+            assert len(descriptor.floating_point_range) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"real_time_factor": ".nan"}, "real_time_factor = nan: must be a finite number >= 0"),
+        ({"sync": "loose"}, "sync = 'loose': must be one of free, lockstep"),
+        ({"realtime_priority": 100}, "must be a whole number from 0 to 99"),
+        ({"publish_clock": True, "use_sim_time": True}, "cannot be its source"),
+    ],
+)
+def test_refused_at_start(nodes, given, said):
+    process = nodes.run("simulator", **given)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert said in err
+    assert "Traceback" not in err
+
+
+def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
+    path = ROOT / "config" / "simulator.yaml"
+    document = yaml.safe_load(path.read_text())
+    given = document["sst_simulator"]["ros__parameters"]
+    defaults = SimulatorParameters()
+    assert given == {name: getattr(defaults, name) for name in specs(SimulatorParameters)}
+    process = nodes.start("simulator", "--ros-args", "--params-file", str(path))
+    observer.told("phase", "running")
+    assert nodes.stop(process)[0] == 0

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state machine of a run, in a thread of its own, without ROS."""
+
+import contextlib
+import threading
+import time
+from functools import partial
+from types import SimpleNamespace as Box
+
+import numpy as np
+import pytest
+
+from sst_ros import load_scene
+from sst_ros.errors import RunStopped
+from sst_ros.nodes.commands import ZERO, CommandBoard
+from sst_ros.nodes.interfaces import SimulationInterfaces
+from sst_ros.nodes.pacing import Pacer, SteadyTime
+from sst_ros.nodes.run_loop import RunLoop
+from sst_ros.nodes.run_parts import Phase
+from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.simulation import Simulation
+
+
+class Audience:
+    """Keeps what it is told; gives time from 1 s on."""
+
+    def __init__(self):
+        self.samples, self.ticks, self.idles, self.phases = [], [], [], []
+        self.now_ns = 1_000_000_000
+
+    def begin_ns(self, earliest_ns):
+        return max(self.now_ns, earliest_ns) if self.now_ns else 0
+
+    def tick(self, torque, moment):
+        self.ticks.append(torque)
+
+    def sample(self, state, stamp_ns):
+        self.samples.append((stamp_ns, state))
+
+    def idle(self, state, *, still):
+        self.idles.append((state, still))
+
+    def changed(self, phase):
+        self.phases.append(phase)
+
+
+class Bench:
+    def __init__(self, scene="example1", build=Simulation, **given):
+        self.parameters = SimulatorParameters(scene=scene, **{"real_time_factor": 0.0, **given})
+        self.queue, self.stamped, self.audience = [], [], Audience()
+        takes = [lambda q=q: q.pop(0) if q else None for q in (self.queue, self.stamped)]
+        self.board = CommandBoard(self, None, *takes)
+        pacer = Pacer(self.parameters.period_ns, self.parameters.real_time_factor, SteadyTime())
+        self.loop = RunLoop(load_scene(scene), build, self, self.board, pacer, self.audience)
+        self.thread = threading.Thread(target=self.loop.run)
+
+    @contextlib.contextmanager
+    def running(self):
+        self.thread.start()
+        try:
+            yield self.loop
+        finally:
+            self.loop.stop()
+            self.thread.join(10)
+            assert not self.thread.is_alive()
+
+    def until(self, condition, timeout=10.0):
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+
+
+def answer(stamp_ns):
+    stamp = Box(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    names = ["gamma_1", "gamma_2", "gamma_3"]
+    return Box(header=Box(stamp=stamp), name=names, effort=[0.0, 0.0, 0.0])
+
+
+def stamps(bench):
+    return [stamp for stamp, _ in bench.audience.samples]
+
+
+def test_a_run_ends_after_its_duration_with_every_sample():
+    bench = Bench(duration=0.0105, publish_rate=250)
+    bench.loop.run()
+    assert bench.loop.phase is Phase.FINISHED
+    first = stamps(bench)[0]
+    assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
+    assert len(bench.audience.ticks) == bench.loop.counters.ticks == 11
+    assert bench.audience.phases == ["waiting", "running", "finished"]
+
+
+def test_pause_is_idempotent_and_a_step_is_one_sample():
+    bench = Bench()
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.audience.samples) > 3)
+        assert loop.ask(loop.step) == (
+            False,
+            "refused: only a paused run can be stepped, it is running",
+        )
+        assert loop.ask(partial(loop.pause, True)) == (True, "paused")
+        assert loop.ask(partial(loop.pause, True)) == (True, "already paused")
+        before = stamps(bench)
+        assert loop.ask(loop.step).success
+        assert stamps(bench) == [*before, before[-1] + 2_000_000]
+        assert loop.ask(partial(loop.step, 5)).success
+        assert len(stamps(bench)) == len(before) + 6
+        assert loop.ask(partial(loop.pause, False)) == (True, "running")
+        assert loop.ask(partial(loop.pause, False)) == (True, "not paused: running")
+        bench.until(lambda: len(bench.audience.samples) > len(before) + 8)
+    whole = stamps(bench)[:-1]  # the last one is where it was stopped
+    spacing = set(np.diff(whole).tolist())
+    assert spacing == {2_000_000}
+
+
+def test_resume_makes_no_burst():
+    bench = Bench(real_time_factor=1.0)
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.audience.samples) > 3)
+        loop.ask(partial(loop.pause, True))
+        time.sleep(0.2)
+        before = loop.counters.ticks
+        loop.ask(partial(loop.pause, False))
+        assert loop.counters.ticks - before < 50
+    assert bench.audience.idles  # the state is shown meanwhile
+
+
+def test_reset_goes_back_and_stamps_go_on():
+    bench = Bench()
+    start = bench.loop.simulation.state
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.audience.samples) > 5)
+        loop.ask(partial(loop.pause, True))
+        last = stamps(bench)[-1]
+        assert loop.ask(loop.reset) == (True, "at the initial state, paused")
+        assert loop.simulation.state == start
+        bench.audience.now_ns = 0  # no time: cannot begin
+        assert "no time yet" in loop.ask(loop.step).message
+        bench.audience.now_ns = 1_000_000_000
+        assert loop.ask(loop.step).success
+        assert stamps(bench)[-2:] == [last + 2_000_000, last + 4_000_000]
+        assert bench.audience.samples[-2][1] == start
+
+
+def test_a_fault_is_latched_until_a_reset():
+    bench = Bench(scene="example2")
+    with bench.running() as loop:
+        loop.ask(partial(loop.pause, True))
+        bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
+        loop.ask(partial(loop.pause, False))
+        bench.until(lambda: loop.phase is Phase.FAULT)
+        assert "gamma_1 > 1.570796 rad" in loop.fault
+        assert bench.audience.phases[-1].startswith("fault: stopped at t = ")
+        bench.until(lambda: bench.audience.idles and bench.audience.idles[-1][1])
+        held, _ = bench.audience.idles[-1]
+        assert held == bench.audience.samples[-1][1]
+        assert not loop.ask(partial(loop.pause, True)).success
+        assert not loop.ask(loop.step).success
+        assert not loop.ask(partial(loop.set_state, (0.7,) * 3, ZERO)).success
+        assert loop.phase is Phase.FAULT
+        assert loop.ask(loop.reset).success
+        bench.until(lambda: loop.phase is Phase.RUNNING)
+        assert loop.fault == ""
+        bench.until(lambda: bench.audience.ticks[-1] == ZERO)  # the command is forgotten
+
+
+def test_set_state_is_checked():
+    bench = Bench(wait_for_command=True)
+    with bench.running() as loop:
+        given = (0.6, 0.7, 0.8), (0.1, 0.0, -0.1)
+        assert loop.ask(partial(loop.set_state, *given)) == (True, "the state is set, waiting")
+        assert loop.simulation.state.joints.gamma == pytest.approx(given[0], abs=1e-12)
+        assert loop.simulation.state.joints.gamma_dot == pytest.approx(given[1], abs=1e-12)
+        assert "stroke" in loop.ask(partial(loop.set_state, (9.0, 0.7, 0.8), ZERO)).message
+        assert loop.simulation.state.joints.gamma == pytest.approx(given[0], abs=1e-12)
+        assert loop.ask(loop.reset).success
+        assert loop.simulation.state.joints.gamma != pytest.approx(given[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("boom"), RunStopped("boom", 0.0, None)])
+def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
+    class Broken(Simulation):
+        broken = False
+
+        def step(self, *args):
+            if self.broken:
+                raise error
+            return super().step(*args)
+
+    bench = Bench(build=Broken)
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.audience.samples) > 2)
+        loop.simulation.broken = True
+        bench.until(lambda: loop.phase is Phase.FAULT)
+        assert "boom" in loop.fault
+        loop.simulation.broken = False
+        assert loop.ask(loop.reset).success
+        bench.until(lambda: loop.phase is Phase.RUNNING)
+
+
+def test_lockstep_times_out_into_a_fault():
+    bench = Bench(sync="lockstep", lockstep_timeout=0.05)
+    with bench.running() as loop:
+        bench.stamped.append(answer(0))
+        bench.until(lambda: bench.audience.samples)
+        bench.stamped.append(answer(stamps(bench)[0]))
+        bench.until(lambda: loop.phase is Phase.FAULT)
+        assert "no command answered the sample of 1002000000 ns within 0.05 s" in loop.fault
+        assert len(bench.audience.ticks) == 2
+
+
+def test_requests_after_the_end_are_refused():
+    bench = Bench(duration=0.002)
+    bench.loop.run()
+    assert not bench.loop.ask(bench.loop.reset).success
+
+
+def test_simulation_interfaces_are_the_same_machine():
+    """The handlers with plain objects for messages: the package is in no wheel."""
+
+    def response():
+        return Box(result=Box(result=None, error_message=""), state=Box(state=None))
+
+    bench = Bench()
+    with bench.running() as loop:
+        answers = SimulationInterfaces(loop)
+        bench.until(lambda: loop.phase is Phase.RUNNING)
+        assert answers.get_state(None, response()).state.state == 1
+        assert answers.step(Box(steps=1), response()).result.result == 4
+        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 1
+        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 101
+        before = len(bench.audience.samples)
+        assert answers.step(Box(steps=3), response()).result.result == 1
+        assert len(bench.audience.samples) == before + 3
+        assert answers.reset(Box(scope=1), response()).result.result == 0
+        assert answers.reset(Box(scope=255), response()).result.result == 1
+        assert answers.get_state(None, response()).state.state == 0
+        assert answers.set_state(Box(state=Box(state=1)), response()).result.result == 1
+        assert answers.set_state(Box(state=Box(state=0)), response()).result.result == 1
+        assert answers.get_state(None, response()).state.state == 0
+        assert answers.set_state(Box(state=Box(state=3)), response()).result.result == 0
