@@ -64,12 +64,17 @@ class Recorder:
         self.node.get_logger().info(said)
 
     def _look(self) -> None:
-        """Subscribe to wanted topics as they appear; say once when all that speak were heard."""
+        """Subscribe to wanted topics as they appear; say once when all that speak were heard.
+
+        DDS finds the topics of a node one after the other: none may have come since the last look.
+        """
+        known = len(self._readers)
         for topic, kinds in self.node.get_topic_names_and_types():
             if topic in self._wanted and topic not in self._readers:
                 self._subscribe(topic, kinds[0])
         speaking = {topic for topic in self._readers if self.node.count_publishers(topic)}
-        if not self._ready and speaking and speaking <= self._heard.keys():
+        settled = known == len(self._readers)
+        if not self._ready and settled and speaking and speaking <= self._heard.keys():
             self._ready = True
             print(f"ready: {len(self._readers)} topics", flush=True)
 

@@ -140,7 +140,7 @@ def _losses(axes: Axes, recording: Recording, timing: Timing, summary: dict[str,
 
 
 def _latency(axes: Axes, recording: Recording, timing: Timing) -> None:
-    axes.set_title("From a command's reception to the tick that applies it", loc="left")
+    axes.set_title("From a command's reception to the stamp of its tick", loc="left")
     axes.set_ylabel("latency [µs]")
     if not len(timing.latency_us):
         return _nothing(axes, "not known")

@@ -41,7 +41,7 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield ""
     for name, key in (
         ("period of reception", "period"),
-        ("command to its tick", "command_latency"),
+        ("command to stamp of tick", "command_latency"),
     ):
         for word in ("min", "mean", "p99", "p99_9", "max"):
             label = f"{name}, {word.replace('_', '.')}"
