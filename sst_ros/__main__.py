@@ -58,6 +58,15 @@ def _report_stability(options: argparse.Namespace) -> int:
     return 0 if report(options.out) else 1
 
 
+def _recover(options: argparse.Namespace) -> None:
+    from sst_ros.nodes.recovery import recover
+
+    bag, messages, cut = recover(options.bag, options.out)
+    print(
+        f"{messages} messages recovered into {bag}" + (", the recording is cut off" if cut else "")
+    )
+
+
 def _scene_list(_: argparse.Namespace) -> None:
     for name in scene.names():
         print(f"{name:<18}{scene.load(name).description}")
@@ -123,6 +132,11 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("stability_out"), help="folder of the results"
     )
     stability.set_defaults(run=_report_stability)
+
+    recovery = commands.add_parser("recover", help="save what a killed recorder has written")
+    recovery.add_argument("bag", type=Path, help="folder of the bag")
+    recovery.add_argument("--out", type=Path, help="folder of the new bag; default: beside the old")
+    recovery.set_defaults(run=_recover)
 
     scenes = _group(commands.add_parser("scene", help="look at scenes"))
     scenes.add_parser("list", help="the scenes that come with sst_ros").set_defaults(

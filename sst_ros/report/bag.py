@@ -140,7 +140,8 @@ def refused(path: Path, key: str, value: object, allowed: str) -> InputError:
 
 def _damaged(path: Path, error: Exception, where: str = "") -> InputError:
     said = " ".join(str(error).split()) or type(error).__name__
-    allowed = f"must be a whole rosbag2 recording, MCAP or sqlite3; reading failed{where}: {said}"
+    allowed = f"must be a whole rosbag2 recording, MCAP or sqlite3; reading failed{where}: {said};"
+    allowed += " if the recorder was killed: python -m sst_ros recover BAG"
     return refused(path, "bag", path.name, allowed)
 
 

@@ -64,7 +64,7 @@ def begins(recording: Recording) -> bool:
     Only a recording that lost samples is doubted: where all are there, a first sample that is not
     what the scene asks for is an error of the simulator, and must be seen as one.
     """
-    if recording.time_ns[0] != 0:
+    if recording.time_ns[0] != 0 or recording.diagnostics.get("states_set", "0") != "0":
         return False
     published = recording.diagnostics.get("samples_published", "")
     if published.isdecimal() and int(published) == len(recording.time_ns):
