@@ -83,7 +83,6 @@ class Simulation:
         tolerance: float = 1e-10,
         compiled: bool = False,
     ) -> None:
-        integrator = getattr(integrator, "name", integrator)
         if integrator not in INTEGRATORS:
             allowed = "must be one of " + ", ".join(INTEGRATORS)
             raise InputError("simulation", [Problem("integrator", integrator, allowed)])

@@ -19,7 +19,6 @@ from sst_ros.errors import (
     StrokeExceeded,
     WorkspaceLeft,
 )
-from sst_ros.integration.tableaux import DOP853, RK4
 from sst_ros.mechanism import kernel
 from sst_ros.mechanism.energy import kinetic
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -39,7 +38,7 @@ def energy(simulation):
 
 def started(sample, gamma_dot):
     initial = Initial(gamma=sample.gamma, gamma_dot=gamma_dot)
-    return Simulation(replace(sample.scene, initial=initial, **IGNORE), DOP853)
+    return Simulation(replace(sample.scene, initial=initial, **IGNORE), "dop853")
 
 
 def run_until_stopped(simulation, torque, steps):
@@ -132,7 +131,7 @@ def test_runs_repeat_bit_by_bit():
 
 
 def test_the_quaternion_stays_of_unit_length():
-    simulation, torque = Simulation(EXAMPLE2, RK4), sine(EXAMPLE2.torque)
+    simulation, torque = Simulation(EXAMPLE2, "rk4"), sine(EXAMPLE2.torque)
     for _ in range(100):
         simulation.step(torque, 5 * MILLISECOND)
     assert np.linalg.norm(simulation.state.quaternion) == pytest.approx(1.0, abs=1e-15)

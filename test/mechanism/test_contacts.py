@@ -11,7 +11,6 @@ from sst_ros import Simulation, load_scene
 from sst_ros.control.torque import sine
 from sst_ros.errors import ImpactsAccumulate
 from sst_ros.integration import journey
-from sst_ros.integration.tableaux import DOP853
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.contacts import RigidEnds
@@ -72,7 +71,7 @@ def test_the_run_bounces_and_is_the_same_for_any_step():
     scene = load_scene("impacts")
     ends = []
     for step in (MILLISECOND, 250_000):
-        simulation, torque = Simulation(scene, DOP853), sine(scene.torque)
+        simulation, torque = Simulation(scene, "dop853"), sine(scene.torque)
         for _ in range(1_000_000_000 // step):
             simulation.step(torque, step)
             assert min(simulation.geometry.arc - simulation.state.joints.gamma) > -1e-12
