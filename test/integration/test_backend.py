@@ -12,7 +12,6 @@ import pytest
 from loaded_scenes import REST
 
 from sst_ros.integration import backend
-from sst_ros.integration.tableaux import RK4
 from sst_ros.scene import load
 from sst_ros.simulation import Simulation
 
@@ -103,7 +102,7 @@ def test_a_folder_that_cannot_be_written_means_compiling_anew(tmp_path, truth):
 def test_without_numba_plain_python_runs_and_says_so(monkeypatch, truth):
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
     with pytest.warns(RuntimeWarning, match="running plain Python, slower, the same digits"):
-        simulation = Simulation(load("example1"), RK4, compiled=True)
+        simulation = Simulation(load("example1"), "rk4", compiled=True)
     assert not simulation.compiled
     assert str(simulation.step((1.0, 2.0, 3.0), MILLISECOND).quaternion) == truth
 
