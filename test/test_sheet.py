@@ -10,8 +10,8 @@ import pytest
 from mechanism.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
-from sst_ros.integration.advice import advise
 from sst_ros.mechanism.compiled import Dynamics, compiled
+from sst_ros.report.advice import advise
 from sst_ros.report.costs import TERMS, costs, operations
 from sst_ros.report.sheet import WIDTH, sheet
 from sst_ros.scene import Scene, load, names

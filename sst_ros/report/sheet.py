@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from sst_ros.integration.advice import advise
 from sst_ros.limits import limits_of
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report.advice import advise
 from sst_ros.report.costs import costs
 from sst_ros.scene import Scene
 

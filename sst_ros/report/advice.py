@@ -24,7 +24,7 @@ ACCURATE = 0.3
 def spectrum(
     dynamics: Dynamics, y: tuple[float, ...], drive: tuple[float, ...]
 ) -> NDArray[np.complex128]:
-    """Eigenvalues of d(dy/dt)/dy [1/s], without the one along the quaternion's length."""
+    """Eigenvalues of d(dy/dt)/dy [1/s], one for each number of the state."""
     size = len(y)
     flat = dynamics.linearised(*y, *drive)[size:]
     return np.asarray(np.linalg.eigvals(np.array(flat).reshape(size, size).T))
