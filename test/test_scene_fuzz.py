@@ -6,7 +6,6 @@ What is taken is assembled, traced, differentiated and described as well.
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import FAST
+from trees import changed
 
 from sst_ros.document import dump, read
 from sst_ros.errors import InputError
@@ -94,15 +94,6 @@ class Plain(yaml.SafeDumper):
 
 def written(tree):
     return yaml.dump(tree, Dumper=Plain)
-
-
-def changed(tree, path, value):
-    tree = copy.deepcopy(tree)
-    inner = tree
-    for key in path[:-1]:
-        inner = inner[key]
-    inner[path[-1]] = value
-    return tree
 
 
 @FUZZ

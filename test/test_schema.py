@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import FrozenInstanceError, dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import FAST
+from trees import changed
 
 from sst_ros.document import dump, read
 from sst_ros.errors import InputError
@@ -73,25 +73,16 @@ values = st.recursive(
 )
 
 
-def replaced(path, value):
-    tree = copy.deepcopy(TREE)
-    inner = tree
-    for key in path[:-1]:
-        inner = inner[key]
-    inner[path[-1]] = value
-    return tree
-
-
 @FUZZ
 @given(st.sampled_from(PATHS), values)
 def test_a_scene_with_another_value_is_a_scene_or_refused(path, value):
-    scene_or_refusal(yaml.safe_dump(replaced(path, value), allow_unicode=True))
+    scene_or_refusal(yaml.safe_dump(changed(TREE, path, value), allow_unicode=True))
 
 
 @FUZZ
 @given(st.sampled_from(PATHS), numbers)
 def test_a_scene_with_another_number_is_a_scene_or_refused(path, value):
-    scene_or_refusal(yaml.safe_dump(replaced(path, value)))
+    scene_or_refusal(yaml.safe_dump(changed(TREE, path, value)))
 
 
 @FAST
