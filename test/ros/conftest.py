@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real nodes in real processes, each test in a ROS domain of its own on localhost."""
 
+import fcntl
 import itertools
 import os
 import select
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -19,15 +23,36 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
-DOMAINS = itertools.cycle(range(1 + os.getpid() % 50, 101))
+DOMAINS = itertools.cycle(range(1, 101))
 
 
 @pytest.fixture
-def domain(monkeypatch):
-    number = next(DOMAINS)
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    return number
+def domain():
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture(scope="module")
+def domain_of_module():
+    with own_domain() as number:
+        yield number
+
+
+@contextmanager
+def own_domain():
+    """In a domain that no other test run on this machine has: locked as long as it is used."""
+    for number in itertools.islice(DOMAINS, 100):
+        with (Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("ROS_DOMAIN_ID", str(number))
+                patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+                yield number
+            return
+    raise AssertionError("no ROS domain is free")
 
 
 class Nodes:

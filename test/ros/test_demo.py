@@ -26,12 +26,10 @@ PICTURES = {
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory):
+def out(tmp_path_factory, domain_of_module):
     folder = tmp_path_factory.mktemp("demo") / "demo_out"
     (folder / "bag").mkdir(parents=True)  # a bag of an earlier demo gives way
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", "101")
-        assert demo(folder) == 0
+    assert demo(folder) == 0
     return folder
 
 
