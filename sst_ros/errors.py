@@ -43,6 +43,10 @@ class InputError(SstError):
         super().__init__("\n".join(f"{origin}: {problem}" for problem in self.problems))
 
 
+class MotionRefused(InputError):
+    """A desired motion leaves what the manipulator or its actuators can do."""
+
+
 class AssemblyError(SstError):
     """The direct kinematics has no unique admissible answer at `gamma` [rad]."""
 

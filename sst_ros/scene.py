@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.bodies import Base, Inertia, Link, Payload, Star, Vector
+from sst_ros.desired_motions import DesiredMotion
 from sst_ros.document import read
 from sst_ros.errors import InputError, Problem
 from sst_ros.schema import Section, notes, number, section, sections, specs, text
@@ -20,6 +21,7 @@ from sst_ros.terms import (
     Gravity,
     Initial,
     JointFriction,
+    Markers,
     Moment,
     SineTorque,
     Spring,
@@ -35,12 +37,14 @@ LARGEST = 1e9
 __all__ = [
     "Actuators",
     "Base",
+    "DesiredMotion",
     "Friction",
     "Gravity",
     "Inertia",
     "Initial",
     "JointFriction",
     "Link",
+    "Markers",
     "Moment",
     "Payload",
     "Scene",
@@ -82,6 +86,8 @@ class Scene(Section):
     torque: SineTorque | None = section(
         "torques that torque_player plays", SineTorque, default=None
     )
+    motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
+    markers: Markers | None = section("what is shown in RViz", Markers, default=None)
     duration: float | None = number("length of a run", "s", default=None, above=0.0)
     provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
 

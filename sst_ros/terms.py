@@ -110,14 +110,44 @@ class Actuators(Section):
     time_constant: float | None = number(
         "time constant of a first-order lag of the torque", "s", default=None, above=0.0
     )
+    idle_damping: float = number(
+        "torque -idle_damping gamma_dot in place of a command that is too old; 0 for no torque",
+        "N m s/rad",
+        default=0.0,
+        least=0.0,
+    )
+    velocity_limit: float | None = number(
+        "largest rate of a desired motion; a simulation does not hold it",
+        "rad/s",
+        default=None,
+        above=0.0,
+    )
+    acceleration_limit: float | None = number(
+        "largest acceleration of a desired motion; a simulation does not hold it",
+        "rad/s^2",
+        default=None,
+        above=0.0,
+    )
 
     def check(self) -> Iterator[Problem]:
         """Refuse actuators that change nothing, and a gear without a rotor behind it."""
+        limits = (self.torque_limit, self.velocity_limit, self.acceleration_limit)
         if self.gear_ratio != 1.0 and not self.rotor_inertia:
             allowed = "acts on rotor_inertia only (torques are those at the joint): give it"
             yield Problem("gear_ratio", self.gear_ratio, allowed)
-        elif not self.rotor_inertia and self.torque_limit is self.time_constant is None:
+        elif not self.rotor_inertia and not any((*limits, self.time_constant, self.idle_damping)):
             yield Problem("", None, "changes nothing: leave it out")
+
+
+@dataclass(frozen=True)
+class Markers(Section):
+    """What the simulator shows in RViz on ~/markers; needs no description and no transforms."""
+
+    rate: float = number("messages per second", "Hz", default=20.0, above=0.0, most=100.0)
+    trace: float = number(
+        "length of the path of E that is shown", "s", default=5.0, least=0.0, most=600.0
+    )
+    torque_scale: float = number("length of the torque arrows", "m/(N m)", default=0.04, above=0.0)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ RATE = ("wx", "wy", "wz")
 LAG = ("l1", "l2", "l3")
 TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
+BODY_ACCELERATION = ("ax", "ay", "az")
 
 
 class Dynamics:
@@ -59,12 +60,26 @@ class Dynamics:
     @cached_property
     def joints(self) -> Function:
         """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven."""
-        return compiled(trace(self._joints, (*QUATERNION, *RATE)))
+        return compiled(self.joints_program)
+
+    @cached_property
+    def joints_program(self) -> Program:
+        """The program of `joints`."""
+        return trace(self._joints, (*QUATERNION, *RATE))
 
     @cached_property
     def acceleration(self) -> Function:
         """W_dot without external moment, of the first seven numbers and torques that act now."""
         return compiled(trace(self._acceleration, (*QUATERNION, *RATE, *TORQUE)))
+
+    @cached_property
+    def inverse(self) -> Function:
+        """Torques that give a W_dot, det g and sin^2(mu_k), 7 numbers: `kernel.actuator_torque`.
+
+        Of the first seven numbers of the state, W_dot, and a moment if it comes from a topic.
+        """
+        more = MOMENT if self.moved else ()
+        return compiled(trace(self._inverse, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
 
     @cached_property
     def reach(self) -> Function:
@@ -85,6 +100,13 @@ class Dynamics:
     def _acceleration(self, *inputs: Any) -> tuple[Any, ...]:
         q, rate, torque = inputs[:4], inputs[4:7], inputs[7:]
         return kernel.body_acceleration(self.model, q, rate, torque)
+
+    def _inverse(self, *inputs: Any) -> tuple[Any, ...]:
+        q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:] or None
+        torque, determinant = kernel.actuator_torque(self.model, q, rate, acceleration, moment)
+        rows = rotation_rows(q)
+        squares = (kernel.leg_motion(leg, rows, rate).u for leg in self.model.legs)
+        return (*torque, determinant, *squares)
 
     def _reach(self, *state: Any) -> tuple[Any, ...]:
         rows, rate = rotation_rows(state[:4]), state[4:7]

@@ -21,12 +21,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from sst_ros.mechanism import loads
 from sst_ros.mechanism.elementary import sqrt
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.loads import LegLoads, LegMotion
+from sst_ros.mechanism.loads import LegMotion
+from sst_ros.mechanism.model import Leg, Model, model_of
 from sst_ros.mechanism.triples import (
     ZERO,
     Rows,
@@ -41,52 +39,22 @@ from sst_ros.mechanism.triples import (
     solve_symmetric,
     turned_back,
 )
-from sst_ros.scene import Payload, Scene, Star
+
+__all__ = [
+    "Balance",
+    "Joints",
+    "Leg",
+    "Model",
+    "actuator_torque",
+    "balance",
+    "body_acceleration",
+    "derivative",
+    "joints",
+    "model_of",
+]
 
 Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 State = tuple[Scalar, ...]
-
-
-class Leg(NamedTuple):
-    """Constants of one leg: axis w and start v of the arc in {B}, axis (e0, e1, 0) in {E}.
-
-    A = A0 + A2 a^2 - 2 Iyz a sqrt(u) and C = Ixz a/sqrt(u) - Ixy, with A0 = I_a(zz) + Iyy - Ixx and
-    A2 = Izz - Iyy + Ixx.
-    """
-
-    w: Triple
-    v: Triple
-    across: Triple
-    e0: float
-    e1: float
-    a0: float
-    a2: float
-    ixy: float
-    ixz: float
-    iyz: float
-    loads: LegLoads | None
-
-
-class Model(NamedTuple):
-    """All constants of the dynamics.
-
-    Attributes:
-        star: inertia (xx, yy, zz, xy, xz, yz) in {E} of star, payload and what of the intermediate
-            links turns with the star [kg m^2].
-        legs: the three legs.
-        gravity: acceleration of free fall in {B} [m/s^2]; None without gravity.
-        weight: mass times centre of star and payload in {E} [kg m].
-        moment: constant external moment on the star in {B} [N m]; None without one.
-        time_constant: lag of the actuators [s]; None without one.
-
-    """
-
-    star: tuple[float, float, float, float, float, float]
-    legs: tuple[Leg, Leg, Leg]
-    gravity: Triple | None = None
-    weight: Triple = ZERO
-    moment: Triple | None = None
-    time_constant: float | None = None
 
 
 class Joints(NamedTuple):
@@ -100,35 +68,19 @@ class Joints(NamedTuple):
     beta_dot: Triple
 
 
-def model_of(scene: Scene) -> Model:
-    """Collect the constants of a scene."""
-    geometry, star = Geometry.of(scene), scene.star_inertia
-    drives, links = scene.actuated_inertias, scene.intermediate_inertias
-    legs = []
-    for k in range(3):
-        w, v, e = (tuple(row[k].tolist()) for row in (geometry.w, geometry.v, geometry.e))
-        link, drive_zz = links[k], float(drives[k][2, 2])
-        xx, yy, zz = (float(link[i, i]) for i in range(3))
-        xy, xz, yz = float(link[0, 1]), float(link[0, 2]), float(link[1, 2])
-        constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
-        star = star + xx * (np.eye(3) - np.outer(geometry.e[k], geometry.e[k]))
-        legs.append(
-            Leg(w, v, cross(w, v), e[0], e[1], *constants, loads.of_leg(scene, geometry, k))
-        )
-    carried: list[Star | Payload] = [scene.star]
-    if scene.payload is not None:
-        carried.append(scene.payload)
-    weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    xx, yy, zz, xy, xz, yz = (float(star[i]) for i in pairs)
-    return Model(
-        star=(xx, yy, zz, xy, xz, yz),
-        legs=(legs[0], legs[1], legs[2]),
-        gravity=None if scene.gravity is None else scene.gravity.acceleration,
-        weight=(weight[0], weight[1], weight[2]),
-        moment=None if scene.moment is None else scene.moment.value,
-        time_constant=None if scene.actuators is None else scene.actuators.time_constant,
-    )
+class Balance(NamedTuple):
+    """M W_dot = force in {E}, everything reduced to the star by virtual work.
+
+    Attributes:
+        inertia: M (xx, yy, zz, xy, xz, yz) [kg m^2].
+        force: moment of all that acts at W_dot = 0, velocity products included [N m].
+        reach: rows g_k; gamma_dot_k = g_k.W, and a torque at gamma_k acts as tau_k g_k.
+
+    """
+
+    inertia: tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+    force: Triple
+    reach: Rows
 
 
 def derivative(model: Model, state: State, torque: Triple, moment: Triple | None = None) -> State:
@@ -164,13 +116,46 @@ def body_acceleration(
     model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
 ) -> Triple:
     """W_dot [rad/s^2] in {E} of the direct dynamics; arguments as for `derivative`."""
+    at = balance(model, q, rate, torque, moment)
+    return solve_symmetric(*at.inertia, *at.force)
+
+
+def actuator_torque(
+    model: Model, q: Quadruple, rate: Triple, acceleration: Triple, moment: Triple | None = None
+) -> tuple[Triple, Scalar]:
+    """Torques [N m] of the inverse dynamics, and the determinant of the rows g_k.
+
+    The torques do the work tau_k g_k.W on the star: M W_dot = force + sum tau_k g_k. With
+    g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel singularity.
+    """
+    at = balance(model, q, rate, ZERO, moment)
+    xx, yy, zz, xy, xz, yz = at.inertia
+    x, y, z = acceleration
+    missing = (
+        xx * x + xy * y + xz * z - at.force[0],
+        xy * x + yy * y + yz * z - at.force[1],
+        xz * x + yz * y + zz * z - at.force[2],
+    )
+    first, second, third = at.reach
+    others = (cross(second, third), cross(third, first), cross(first, second))
+    determinant = dot(first, others[0])
+    tau = tuple(dot(missing, other) / determinant for other in others)
+    return (tau[0], tau[1], tau[2]), determinant
+
+
+def balance(
+    model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
+) -> Balance:
+    """Collect all that acts on the star; arguments as for `derivative`."""
     rows = rotation_rows(q)
     mxx, myy, mzz, mxy, mxz, myz = model.star
     fx, fy, fz = _on_star(model, rows, rate, moment)
     field = field_of(model, rows)
+    reach = []
     for leg, drive in zip(model.legs, torque, strict=True):
         at = leg_motion(leg, rows, rate)
         a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
+        reach.append(g)
         a_rest, gamma_rest = rest_accelerations(at, rate)
         # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
         a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
@@ -201,7 +186,7 @@ def body_acceleration(
         mxy = mxy + toward_a[0] * p[1] + toward_gamma[0] * g[1]
         mxz = mxz + toward_a[0] * p[2] + toward_gamma[0] * g[2]
         myz = myz + toward_a[1] * p[2] + toward_gamma[1] * g[2]
-    return solve_symmetric(mxx, myy, mzz, mxy, mxz, myz, fx, fy, fz)
+    return Balance((mxx, myy, mzz, mxy, mxz, myz), (fx, fy, fz), (reach[0], reach[1], reach[2]))
 
 
 def joints(model: Model, state: State) -> Joints:

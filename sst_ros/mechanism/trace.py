@@ -146,6 +146,30 @@ class Program:
         """How often each operation is done."""
         return Counter(op for op, _ in self.steps)
 
+    def first(self, count: int) -> Program:
+        """Return the program of the first `count` outputs alone."""
+        inputs = len(self.inputs)
+        outputs, needed = self.outputs[:count], set[int]()
+        waiting = [out.number for out in outputs if isinstance(out, Operand)]
+        while waiting:
+            number = waiting.pop()
+            if number >= inputs and number not in needed:
+                needed.add(number)
+                operands = self.steps[number - inputs][1]
+                waiting += [x.number for x in operands if isinstance(x, Operand)]
+        numbers = {i: i for i in range(inputs)}
+        numbers |= {number: inputs + i for i, number in enumerate(sorted(needed))}
+
+        def moved(operand: float | Operand) -> float | Operand:
+            return Operand(numbers[operand.number]) if isinstance(operand, Operand) else operand
+
+        steps = [self.steps[number - inputs] for number in sorted(needed)]
+        return Program(
+            self.inputs,
+            tuple((op, tuple(map(moved, operands))) for op, operands in steps),
+            tuple(map(moved, outputs)),
+        )
+
     def source(self, name: str) -> str:
         """Source of a flat function of all inputs that returns the tuple of outputs."""
         names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]

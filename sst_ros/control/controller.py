@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques that make the manipulator follow a motion: by its model, by feedback, or by both.
+
+With e = desired - measured, in gamma:
+
+    feedforward         tau = ID(desired)
+    pd                  tau = K e + D e_dot
+    gravity_pd          tau = K e + D e_dot + G(measured)           Takegaki and Arimoto 1981
+    feedforward_pd      tau = ID(desired) + K e + D e_dot
+    computed_torque     tau = ID(measured state, gamma_ddot + kd e_dot + kp e)
+
+ID is the inverse dynamics with all terms of the model. On SO(3) the error of computed_torque is
+the rotation vector phi = log(R^T R_d) in {E}, and W_dot = d/dt(R^T R_d W_d) + kd e_W + kp phi
+with e_W = R^T R_d W_d - W. As phi is an eigenvector of its own differential, kp phi^2 + e_W^2 falls
+at the rate 2 kd e_W^2 from every error below half a turn (Bullo and Murray 1995).
+
+Integral action adds K r times the sum of e. The sum stands still while a torque is at its limit and
+the error would drive it further (conditional integration, Astrom and Hagglund 2006, section 3.5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sst_ros.control import attitude
+from sst_ros.control.control_settings import MODES, ControlSettings
+from sst_ros.control.desired import Desired, Motion, Triple
+from sst_ros.control.inverse import InverseDynamics
+from sst_ros.control.observer import OrientationObserver
+from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.triples import ZERO, added, axpy, cross, dot, rotation_rows, scaled
+from sst_ros.scene import Scene
+
+__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measured"]
+
+
+class ControlStopped(SstError):
+    """The controller has no torque any more; it says so to every later call until a reset.
+
+    Attributes:
+        time: when, in the time of the motion [s].
+
+    """
+
+    def __init__(self, reason: str, time: float) -> None:
+        self.time = time
+        super().__init__(f"control stopped at t = {time:.9f} s: {reason}")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the encoders give: angles [rad] and rates [rad/s] of the actuators."""
+
+    gamma: Triple
+    gamma_dot: Triple
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the actuators are told at one instant.
+
+    Attributes:
+        torque: what to apply [N m]: the sum of the next two, limited.
+        feedforward: what the model gives without an error [N m]; for gravity_pd the weight.
+        feedback: what the measurement adds [N m].
+        desired: the motion at this instant.
+        saturated: a torque was limited.
+
+    """
+
+    torque: Triple
+    feedforward: Triple
+    feedback: Triple
+    desired: Desired
+    saturated: bool
+
+
+class Controller:
+    """A controller of one motion.
+
+    Args:
+        model: what it takes the manipulator for; the manipulator itself may differ.
+        motion: what is wanted.
+        settings: mode and gains.
+        period_s: time from one command to the next, over which each is held [s].
+
+    Raises:
+        InputError: the integral action would be unstable.
+        SingularConfiguration: the motion begins in a singularity.
+
+    """
+
+    def __init__(
+        self, model: Scene, motion: Motion, settings: ControlSettings, period_s: float
+    ) -> None:
+        self._motion, self._settings, self._period_s = motion, settings, period_s
+        geometry, start = Geometry.of(model), motion.at(0.0)
+        self._inverse = InverseDynamics(model)
+        self._observer = OrientationObserver(geometry, start.quaternion, start.gamma)
+        posture = virtual_work.posture(
+            geometry, np.array(start.gamma), rotation_matrix(start.quaternion)
+        )
+        t1, _ = virtual_work.equation_of_motion(
+            virtual_work.Mechanism.of(model), posture, (0.0, 0.0, 0.0)
+        )
+        self._inertia = _three(-np.diag(t1))
+        self._kp, self._kd = self._gains()
+        limits = [settings.torque_limit or math.inf]
+        if model.actuators is not None:
+            limits.append(model.actuators.torque_limit or math.inf)
+        self._limit = min(limits)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew: without what was summed, and without a failure."""
+        self._observer.reset()
+        self._sum: Triple = ZERO
+        self._failure: ControlStopped | None = None
+
+    def follow(self, motion: Motion) -> None:
+        """Take another motion, which must begin where the present one is; gains and sum stay."""
+        self._motion = motion
+
+    def command(self, time: float, measured: Measured) -> Command:
+        """Give the torques from `time` [s] of the motion on, to be held for a period.
+
+        Raises:
+            ControlStopped: what was measured is not finite, the branch of the assembly ends, or
+                the model is singular there. The error stays until a reset.
+
+        """
+        if self._failure is not None:
+            raise self._failure
+        try:
+            return self._command(time, measured)
+        except (SstError, ArithmeticError, ValueError) as error:
+            self._failure = ControlStopped(str(error), time)
+            raise self._failure from error
+
+    def _command(self, time: float, measured: Measured) -> Command:
+        _refuse_what_is_not_finite((*measured.gamma, *measured.gamma_dot), "measured")
+        mode, desired = self._settings.mode, self._motion.at(time)
+        error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
+        feedforward, feedback = ZERO, ZERO
+        if mode == "gravity_pd":
+            feedforward = self._inverse.gravity_torque(self._observer.see(measured.gamma))
+        elif mode != "pd":
+            feedforward = self._at_desired(desired)
+        summed: Triple = ZERO
+        if mode == "computed_torque":
+            asked, summed = self._computed(desired, measured, error)
+            feedback = axpy(1.0, asked, -1.0, feedforward)
+        elif mode != "feedforward":
+            rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
+            wanted, summed = self._wanted(error, rates)
+            feedback = _by_joint(self._inertia, wanted)
+        if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
+            feedforward = self._at_desired(self._motion.at(time + 0.5 * self._period_s))
+        return self._limited(feedforward, feedback, desired, error, summed)
+
+    def _limited(
+        self, feedforward: Triple, feedback: Triple, desired: Desired, error: Triple, summed: Triple
+    ) -> Command:
+        asked = added(feedforward, feedback)
+        _refuse_what_is_not_finite(asked, "torque")
+        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in asked)
+        torque = (first, second, third)
+        if dot(axpy(1.0, asked, -1.0, torque), error) <= 0.0:
+            self._sum = axpy(1.0, self._sum, self._period_s, summed)
+        return Command(torque, feedforward, feedback, desired, torque != asked)
+
+    def _at_desired(self, at: Desired) -> Triple:
+        return self._inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
+
+    def _computed(
+        self, desired: Desired, measured: Measured, error: Triple
+    ) -> tuple[Triple, Triple]:
+        """Torques of computed_torque, and the error to sum."""
+        quaternion = self._observer.see(measured.gamma)
+        rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
+        wanted, summed = self._wanted(error, rates)
+        now = self._observer.coordinates.of_actuators(
+            quaternion, measured.gamma, measured.gamma_dot, added(desired.gamma_ddot, wanted)
+        )
+        acceleration = now.body_acceleration
+        if self._settings.space == "so3":
+            acceleration, summed = self._on_so3(desired, now)
+        return self._inverse.torque(now.quaternion, now.body_rate, acceleration), summed
+
+    def _on_so3(self, desired: Desired, now: Desired) -> tuple[Triple, Triple]:
+        """W_dot in {E}, and the rotation vector of the error."""
+        between = attitude.between(now.quaternion, desired.quaternion)
+        turn = rotation_rows(between)
+        rate, forward = (
+            _three(dot(row, vector) for row in turn)
+            for vector in (desired.body_rate, desired.body_acceleration)
+        )
+        moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
+        phi = attitude.rotation_vector(between)
+        wanted, summed = self._wanted(phi, axpy(1.0, rate, -1.0, now.body_rate))
+        return added(moving, wanted), summed
+
+    def _wanted(self, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
+        """Accelerations that the feedback asks for, and the error to sum."""
+        leaning = axpy(1.0, error, self._settings.integral_rate, self._sum)
+        return added(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
+
+    def _gains(self) -> tuple[Triple, Triple]:
+        """Gains kp [1/s^2] and kd [1/s] of accelerations."""
+        given, of = self._settings, self._inertia
+        if given.direct:
+            kp = _three(np.divide(given.stiffness, of))
+            kd = _three(np.divide(given.damping, of))
+        else:
+            kp = scaled(given.bandwidth**2, (1.0, 1.0, 1.0))
+            kd = scaled(2.0 * given.damping_ratio * given.bandwidth, (1.0, 1.0, 1.0))
+        # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
+        if given.integral_rate >= min(kd) and given.integral_rate > 0.0:
+            allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
+            raise InputError("control", [Problem("integral_rate", given.integral_rate, allowed)])
+        return kp, kd
+
+
+def _three(values: Iterable[float]) -> Triple:
+    first, second, third = map(float, values)
+    return first, second, third
+
+
+def _by_joint(factors: Triple, values: Triple) -> Triple:
+    return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
+
+
+def _refuse_what_is_not_finite(numbers: Sequence[float], what: str) -> None:
+    if not all(map(math.isfinite, numbers)):
+        raise InputError("control", [Problem(what, tuple(numbers), "must be finite numbers")])

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The largest value of a function of time: sampled, then searched for between the samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from sst_ros.mechanism.geometry import Array
+
+_ROUNDING = 1e-13
+
+
+class Extreme(NamedTuple):
+    """A value and the time at which it is taken [s]."""
+
+    value: float
+    time: float
+
+
+def largest(
+    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+) -> Extreme:
+    """Return the maximum of a function of which samples are known.
+
+    Every sample that no neighbour exceeds is a summit. The function is searched about it, between
+    its neighbours, if it could there exceed the best sample: it rises from sample to sample by
+    less than it fell beside the summit, or there were wiggles between samples.
+
+    Args:
+        function: of time.
+        times: of the samples, rising [s], shape (n,).
+        values: the function there, shape (n,).
+        floor: what is certainly below it is not searched for.
+
+    """
+    top = int(np.argmax(values))
+    best = Extreme(float(values[top]), float(times[top]))
+    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
+    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
+    summits = (values >= left) & (values >= right) & high
+    for index in np.flatnonzero(summits):
+        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
+        width = float(bounds[1] - bounds[0])
+        found = minimize_scalar(
+            lambda time: -function(time), bounds=bounds, method="bounded",
+            options={"xatol": 1e-8 * width},
+        )  # fmt: skip
+        if -found.fun > best.value + _ROUNDING * abs(best.value):
+            best = Extreme(float(-found.fun), float(found.x))
+    return best
+
+
+def least(function: Callable[[float], float], times: Array, values: Array) -> Extreme:
+    """Return the minimum; see `largest`."""
+    found = largest(lambda time: -function(time), times, -values)
+    return Extreme(-found.value, found.time)
+
+
+def widest(function: Callable[[float], float], times: Array, values: Array) -> Extreme:
+    """Return the value of the largest size, with its sign; see `largest`."""
+    high, low = largest(function, times, values), least(function, times, values)
+    return high if high.value >= -low.value else low

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a desired motion asks of the manipulator, before any torque is sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.integrate import simpson
+from scipy.optimize import brentq
+
+from sst_ros.control.coordinates import Coordinates
+from sst_ros.control.desired import Desired, Triple
+from sst_ros.control.extremes import Extreme, largest, least, widest
+from sst_ros.control.inverse import InverseDynamics
+from sst_ros.control.planned import PlannedMotion
+from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
+from sst_ros.limits import SINGULAR_MU
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene import Actuators, Scene
+
+SAMPLES = 16
+"""Parts of a piece of the motion; even, for Simpson's rule."""
+
+SINGULAR_J2 = 1e-6
+"""det J2 within which a motion counts as singular."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a motion asks of one actuator; values of the largest size, with their signs.
+
+    Attributes:
+        torque: [N m].
+        torque_rms: root of the mean square over the duration [N m].
+        power: torque times rate [W]; negative where the actuator brakes.
+        velocity, acceleration: [rad/s], [rad/s^2].
+
+    """
+
+    torque: Extreme
+    torque_rms: float
+    power: Extreme
+    velocity: Extreme
+    acceleration: Extreme
+
+
+@dataclass(frozen=True)
+class Distance:
+    """How near a motion comes to an end of what is allowed.
+
+    Attributes:
+        key: what the end is of.
+        end: its value.
+        sign: +1 for a lower end, -1 for an upper one.
+        unit: of both.
+        reached: the value nearest to the end, or farthest beyond it.
+        refused: whether the motion must not go beyond.
+
+    """
+
+    key: str
+    end: float
+    sign: float
+    unit: str
+    reached: Extreme
+    refused: bool
+
+    @property
+    def least(self) -> float:
+        """The smallest distance, negative beyond the end."""
+        return self.sign * (self.reached.value - self.end)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A motion as it was checked.
+
+    Attributes:
+        motion: the motion.
+        scene: the manipulator.
+        times: where it was sampled [s], shape (n,).
+        desired: the motion there.
+        torques: actuator torques there [N m], shape (n, 3).
+        demands: on the actuators, by leg.
+        distances: to all ends.
+        problems: why it is refused; empty where it is not.
+
+    """
+
+    motion: PlannedMotion
+    scene: Scene
+    times: Array
+    desired: tuple[Desired, ...]
+    torques: Array
+    demands: tuple[Demand, Demand, Demand]
+    distances: tuple[Distance, ...]
+    problems: tuple[Problem, ...]
+
+
+def check(motion: PlannedMotion, scene: Scene) -> Plan:
+    """Examine a motion and refuse it if it cannot be.
+
+    Raises:
+        MotionRefused: it leaves the stroke or the workspace, or asks for more than the limits of
+            the actuators; lists everything.
+        SingularConfiguration: it meets a singularity.
+
+    """
+    plan = examine(motion, scene)
+    if plan.problems:
+        raise MotionRefused("motion", plan.problems)
+    return plan
+
+
+def examine(motion: PlannedMotion, scene: Scene) -> Plan:
+    """Find out what a motion asks for, everywhere and not only at samples.
+
+    An external moment from a topic counts as zero; what the lag of actuators costs is not counted.
+
+    Raises:
+        SingularConfiguration: the motion meets a singularity; no torque is defined there.
+
+    """
+    times = sample_times(motion)
+    desired = tuple(motion.at(time) for time in times.tolist())
+    geometry = Geometry.of(scene)
+    distances = tuple(_distances(motion, scene, geometry, times, desired))
+    inverse = InverseDynamics(scene)
+
+    def torque(time: float) -> Triple:
+        at = motion.at(time)
+        return inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
+
+    torques = np.array(
+        [inverse.torque(at.quaternion, at.body_rate, at.body_acceleration) for at in desired]
+    )
+    demands = [_demand(motion, torque, leg, times, desired, torques) for leg in range(3)]
+    problems = [*_beyond(distances), *_too_much(demands, scene.actuators)]
+    return Plan(
+        motion, scene, times, desired, torques, (demands[0], demands[1], demands[2]), distances,
+        tuple(problems),
+    )  # fmt: skip
+
+
+def sample_times(motion: PlannedMotion) -> Array:
+    """Return the ends of SAMPLES equal parts of every piece [s]."""
+    inner = [
+        np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
+    ]
+    return np.concatenate([*inner, [motion.pieces[-1]]])
+
+
+def _demand(
+    motion: PlannedMotion,
+    torque: Callable[[float], Triple],
+    leg: int,
+    times: Array,
+    desired: tuple[Desired, ...],
+    torques: Array,
+) -> Demand:
+    rates = np.array([at.gamma_dot[leg] for at in desired])
+    accelerations = np.array([at.gamma_ddot[leg] for at in desired])
+    mine = torques[:, leg]
+    square = sum(
+        float(simpson(mine[start : start + SAMPLES + 1] ** 2, x=times[start : start + SAMPLES + 1]))
+        for start in range(0, len(times) - 1, SAMPLES)
+    )
+    return Demand(
+        torque=widest(lambda time: torque(time)[leg], times, mine),
+        torque_rms=float(np.sqrt(square / motion.duration)),
+        power=widest(
+            lambda time: torque(time)[leg] * motion.at(time).gamma_dot[leg], times, mine * rates
+        ),
+        velocity=widest(lambda time: motion.at(time).gamma_dot[leg], times, rates),
+        acceleration=widest(lambda time: motion.at(time).gamma_ddot[leg], times, accelerations),
+    )
+
+
+def _distances(
+    motion: PlannedMotion,
+    scene: Scene,
+    geometry: Geometry,
+    times: Array,
+    desired: tuple[Desired, ...],
+) -> Iterator[Distance]:
+    coordinates = Coordinates(geometry)
+    gammas = np.array([at.gamma for at in desired])
+    postures = np.array([_posture(coordinates, at) for at in desired])
+
+    def gamma(leg: int) -> Callable[[float], float]:
+        return lambda time: motion.at(time).gamma[leg]
+
+    def posture(index: int) -> Callable[[float], float]:
+        return lambda time: _posture(coordinates, motion.at(time))[index]
+
+    def both(
+        key: str, end: float, function: Callable[[float], float], values: Array, refused: bool
+    ) -> Iterator[Distance]:
+        yield Distance(key, 0.0, 1.0, "rad", least(function, times, values), refused)
+        yield Distance(key, end, -1.0, "rad", largest(function, times, values), refused)
+
+    held = scene.stroke.at_end != "ignore"
+    for leg in range(3):
+        arc = float(geometry.arc[leg])
+        yield from both(f"gamma_{leg + 1}", arc, gamma(leg), gammas[:, leg], held)
+    held = scene.workspace.at_edge != "ignore"
+    for leg in range(3):
+        most, index = geometry.beta_max, 3 + leg
+        yield from both(f"beta_{leg + 1}", most, posture(index), postures[:, index], held)
+    for leg in range(3):
+        low = least(posture(leg), times, postures[:, leg])
+        if low.value < SINGULAR_MU:
+            said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
+            raise SingularConfiguration(said, low.value)
+        yield Distance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
+    sign = 1.0 if postures[0, 6] > 0.0 else -1.0
+    low = least(lambda time: sign * posture(6)(time), times, sign * postures[:, 6])
+    if low.value < SINGULAR_J2:
+        end = low.time if low.value > 0.0 else brentq(posture(6), 0.0, low.time)
+        said = f"parallel singularity at t = {end:.9g} s, det J2"
+        raise SingularConfiguration(said, posture(6)(end))
+    yield Distance("det J2", 0.0, sign, "1", Extreme(sign * low.value, low.time), True)
+
+
+def _posture(coordinates: Coordinates, at: Desired) -> tuple[float, ...]:
+    """See `Coordinates.posture`; beyond a serial singularity the leg's sine is negative."""
+    found = list(coordinates.posture(at.quaternion))
+    turned = coordinates.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
+    for leg in range(3):
+        # On the other branch of the leg r_k points the other way: gamma differs by pi.
+        if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
+            found[leg] = -found[leg]
+    return tuple(found)
+
+
+def _beyond(distances: tuple[Distance, ...]) -> Iterator[Problem]:
+    for distance in distances:
+        if distance.refused and distance.least < 0.0:
+            side = "above" if distance.sign > 0.0 else "below"
+            allowed = f"must stay {side} {distance.end:.9g} {distance.unit}"
+            said = f"{allowed} (t = {distance.reached.time:.9g} s)"
+            yield Problem(distance.key, distance.reached.value, said)
+
+
+def _too_much(demands: list[Demand], actuators: Actuators | None) -> Iterator[Problem]:
+    for name, limit, unit in limits(actuators):
+        for leg, demand in enumerate(demands):
+            value, time = getattr(demand, name)
+            if abs(value) > limit:
+                allowed = f"exceeds the limit {limit:g} {unit} at t = {time:.9g} s"
+                yield Problem(f"{name}_{leg + 1}", value, allowed)
+
+
+def limits(actuators: Actuators | None) -> Iterator[tuple[str, float, str]]:
+    """Yield the limits that the actuators have: name of the demand, limit, unit."""
+    for name, unit in (("torque", "N m"), ("velocity", "rad/s"), ("acceleration", "rad/s^2")):
+        limit: float | None = getattr(actuators, f"{name}_limit", None)
+        if limit is not None:
+            yield name, limit, unit

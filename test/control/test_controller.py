@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controllers against the paper's equations, closed forms and what a closed loop must do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sst_ros import scene
+from sst_ros.control.control_settings import ControlSettings
+from sst_ros.control.controller import MODES, Controller, ControlStopped, Measured
+from sst_ros.control.coordinates import Coordinates
+from sst_ros.control.observer import OrientationObserver
+from sst_ros.control.star_motions import Turn
+from sst_ros.errors import InputError
+from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Actuators, Initial, Moment
+from sst_ros.simulation import Simulation
+from test.models import seeded_samples
+
+PERIOD = 0.002
+ZERO = (0.0, 0.0, 0.0)
+
+
+class Standing:
+    """The same for all times."""
+
+    duration = 0.0
+
+    def __init__(self, desired):
+        self.desired = desired
+
+    def at(self, _):
+        return self.desired
+
+
+def turned(model, vector, duration=0.4):
+    """From the initial orientation by a rotation vector in {E}."""
+    geometry = Geometry.of(model)
+    start = kinematics.admissible(geometry, model.initial.gamma).rotation
+    end = quaternion_of(start @ Rotation.from_rotvec(vector).as_matrix())
+    return Turn(geometry, tuple(quaternion_of(start)), tuple(end), duration)
+
+
+def desired_near(sample, seed):
+    """Another pose of the same assembly, in motion."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(0.1 * rng.standard_normal(3))
+    q = tuple((Rotation.from_matrix(sample.rotation) * turn).as_quat().tolist())
+    rate, acceleration = (tuple(rng.standard_normal(3).tolist()) for _ in range(2))
+    return Coordinates(sample.geometry).of_star(q, rate, acceleration)
+
+
+def seen(sample):
+    return Measured(tuple(sample.gamma.tolist()), tuple(sample.gamma_dot.tolist()))
+
+
+def controller(sample, desired, **given):
+    return Controller(sample.scene, Standing(desired), ControlSettings(**given), PERIOD)
+
+
+def papers_torque(sample, desired):
+    rotation = rotation_matrix(desired.quaternion)
+    at = virtual_work.posture(sample.geometry, np.array(desired.gamma), rotation)
+    return virtual_work.inverse_dynamics(
+        sample.mechanism, at, desired.gamma_dot, desired.gamma_ddot
+    )
+
+
+def papers_inertia(sample, desired):
+    rotation = rotation_matrix(desired.quaternion)
+    at = virtual_work.posture(sample.geometry, np.array(desired.gamma), rotation)
+    return -np.diag(virtual_work.equation_of_motion(sample.mechanism, at, np.zeros(3))[0])
+
+
+def test_feedforward_is_the_papers_inverse_dynamics():
+    for seed, sample in enumerate(seeded_samples(1, 5)):
+        desired = desired_near(sample, seed)
+        told = controller(sample, desired).command(0.0, seen(sample))
+        assert told.torque == told.feedforward and told.feedback == ZERO
+        assert np.allclose(told.torque, papers_torque(sample, desired), rtol=1e-9, atol=1e-9)
+
+
+def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes():
+    for seed, sample in enumerate(seeded_samples(2, 5)):
+        desired = desired_near(sample, seed)
+        m = papers_inertia(sample, desired)
+        error = np.subtract(desired.gamma, sample.gamma)
+        error_rate = np.subtract(desired.gamma_dot, sample.gamma_dot)
+        expected = m * (20.0**2 * error + 2.0 * 0.7 * 20.0 * error_rate)
+        given = {"bandwidth": 20.0, "damping_ratio": 0.7}
+        for mode in ("pd", "gravity_pd", "feedforward_pd"):
+            told = controller(sample, desired, mode=mode, **given).command(0.0, seen(sample))
+            assert np.allclose(told.feedback, expected, rtol=1e-9, atol=1e-9)
+            assert np.allclose(told.torque, np.add(told.feedforward, told.feedback), rtol=1e-15)
+        direct = {"stiffness": m * 400.0, "damping": m * 28.0}
+        told = controller(sample, desired, mode="pd", **direct).command(0.0, seen(sample))
+        assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics():
+    for seed, sample in enumerate(seeded_samples(3, 5)):
+        desired = desired_near(sample, seed)
+        told = controller(
+            sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6
+        ).command(0.0, seen(sample))
+        found = virtual_work.direct_dynamics(
+            sample.mechanism, sample.posture, sample.gamma_dot, told.torque
+        )
+        error = np.subtract(desired.gamma, sample.gamma)
+        error_rate = np.subtract(desired.gamma_dot, sample.gamma_dot)
+        wanted = desired.gamma_ddot + 225.0 * error + 18.0 * error_rate
+        assert np.allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says():
+    """R = R_d exp(-phi n) with phi'' = -2 w phi' - w^2 phi; R_d turns about the same axis."""
+    w, phi0, t = 12.0, 0.3, 0.05
+    phi, dot, ddot = (
+        phi0 * np.exp(-w * t) * factor
+        for factor in (1.0 + w * t, -w * w * t, w * w * (w * t - 1.0))
+    )
+    for sample in seeded_samples(4, 5):
+        axis = np.array([0.48, 0.6, 0.64])
+        here = sample.rotation
+        there = here @ Rotation.from_rotvec(phi * axis).as_matrix()
+        rate, acceleration = 0.7, -1.3
+        desired = Coordinates(sample.geometry).of_star(
+            tuple(quaternion_of(there).tolist()), tuple(rate * axis), tuple(acceleration * axis)
+        )
+        body_rate = (rate - dot) * axis
+        motion = rates.of_star(sample.geometry, here, here @ body_rate)
+        told = controller(
+            sample, desired, mode="computed_torque", space="so3", bandwidth=w
+        ).command(0.0, Measured(tuple(sample.gamma), tuple(motion.gamma_dot)))
+        gamma_ddot = virtual_work.direct_dynamics(
+            sample.mechanism, sample.posture, motion.gamma_dot, told.torque
+        )
+        found = rates.of_actuators(sample.posture, motion.gamma_dot, gamma_ddot).omega_dot
+        expected = here @ ((acceleration - ddot) * axis)
+        assert np.allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_gravity_pd_holds_the_weight_where_the_manipulator_is():
+    model = scene.load("gravity_payload")
+    # At rest and without a lag of the actuators, which the torque would have to grow through.
+    still = Initial(gamma=model.initial.gamma)
+    model = dataclasses.replace(model, initial=still, actuators=None)
+    simulation = Simulation(model)
+    gamma = simulation.state.joints.gamma
+    coordinates = Coordinates(Geometry.of(model))
+    begin = coordinates.of_actuators(simulation.state.quaternion, gamma, ZERO, ZERO)
+    settings = ControlSettings(mode="gravity_pd")
+    holding = Controller(model, Standing(begin), settings, PERIOD)
+    told = holding.command(0.0, Measured(gamma, ZERO))
+    assert told.feedback == ZERO
+    for _ in range(20):
+        state = simulation.step(told.torque, 10_000_000)
+    assert np.abs(np.subtract(state.joints.gamma, gamma)).max() < 1e-9
+
+
+def loop(model, plant, motion, settings, seconds, period=PERIOD):
+    """Close the loop; largest and last error of gamma [rad]."""
+    acting, simulation = Controller(model, motion, settings, period), Simulation(plant)
+    errors = []
+    for k in range(round(seconds / period) + 1):
+        joints = simulation.state.joints
+        told = acting.command(k * period, Measured(joints.gamma, joints.gamma_dot))
+        errors.append(np.abs(np.subtract(told.desired.gamma, joints.gamma)).max())
+        simulation.step(told.torque, round(period * 1e9))
+    return max(errors), errors[-1]
+
+
+@pytest.mark.parametrize(("instant", "order"), [("start", 1), ("middle", 2)])
+def test_what_a_hold_costs_the_feedforward_is_of_its_order(instant, order):
+    model = scene.load("example2")
+    motion = turned(model, (0.3, -0.2, 0.4))
+    periods = np.array([0.008, 0.004, 0.002])
+    settings = ControlSettings(feedforward_at=instant)
+    errors = [loop(model, model, motion, settings, 0.4, h)[0] for h in periods]
+    slope = np.polyfit(np.log(periods), np.log(errors), 1)[0]
+    assert abs(slope - order) < 0.1
+
+
+@pytest.mark.parametrize("space", ["gamma", "so3"])
+def test_computed_torque_brings_the_manipulator_to_the_motion(space):
+    model = scene.load("example2")
+    off = dataclasses.replace(
+        model, initial=Initial(gamma=tuple(np.add(model.initial.gamma, (0.2, -0.15, 0.1))))
+    )
+    settings = ControlSettings(mode="computed_torque", space=space, feedforward_at="middle")
+    largest, last = loop(model, off, turned(model, (0.1, 0.1, -0.2)), settings, 0.6)
+    assert largest == pytest.approx(0.2, abs=0.02)  # no overshoot: critically damped
+    assert last < 1e-5
+
+
+def test_the_integral_takes_out_what_the_model_does_not_know():
+    model = scene.load("example2")
+    pushed = dataclasses.replace(model, moment=Moment(value=(0.5, -0.4, 0.3)))
+    motion = turned(model, (0.1, 0.1, -0.2), duration=0.2)
+    for mode in ("feedforward_pd", "computed_torque"):
+        without, with_it = (
+            loop(model, pushed, motion, ControlSettings(mode=mode, integral_rate=r), 1.2)[1]
+            for r in (0.0, 12.0)
+        )
+        assert without > 1e-4
+        assert with_it < 1e-3 * without
+
+
+@pytest.mark.parametrize("mode", ["pd", "computed_torque"])
+def test_an_integral_that_would_be_unstable_is_refused(mode):
+    """The bound is where a root of s^3 + kd s^2 + kp s + kp r crosses the imaginary axis."""
+    model = scene.load("example2")
+    motion, w, zeta = turned(model, (0.1, 0.0, 0.0)), 30.0, 0.8
+    for share, sound in ((0.999, True), (1.001, False)):
+        r = share * 2.0 * zeta * w
+        roots = np.roots([1.0, 2.0 * zeta * w, w * w, w * w * r])
+        assert (roots.real.max() < 0.0) == sound
+        settings = ControlSettings(mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r)
+        if sound:
+            Controller(model, motion, settings, PERIOD)
+        else:
+            with pytest.raises(InputError, match="integral_rate"):
+                Controller(model, motion, settings, PERIOD)
+
+
+@pytest.mark.parametrize("mode", ["pd", "computed_torque"])
+def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
+    """A second of an error that saturates leaves nothing behind; without a limit it winds up."""
+    model = scene.load("example2")
+    motion = turned(model, (0.1, 0.0, 0.0))
+    begin = motion.at(0.0)
+    away = tuple(angle - 0.1 for angle in begin.gamma)
+    left = []
+    for limit in (1.0, 0.0):
+        settings = ControlSettings(mode=mode, integral_rate=10.0, torque_limit=limit)
+        acting = Controller(model, Standing(begin), settings, PERIOD)
+        for _ in range(500):
+            told = acting.command(0.0, Measured(away, ZERO))
+        assert told.saturated == (limit > 0.0)
+        left.append(acting.command(0.0, Measured(begin.gamma, ZERO)))
+    limited, unlimited = left
+    assert np.abs(limited.torque).max() < 1e-12
+    assert np.abs(unlimited.torque).max() > 1.0
+
+
+def test_the_limit_of_the_models_actuators_holds_too():
+    model = dataclasses.replace(scene.load("example2"), actuators=Actuators(torque_limit=0.5))
+    motion = turned(model, (0.1, 0.0, 0.0))
+    away = Measured(tuple(angle - 0.2 for angle in model.initial.gamma), ZERO)
+    for limit, expected in ((0.0, 0.5), (0.2, 0.2), (0.9, 0.5)):
+        settings = ControlSettings(mode="pd", torque_limit=limit)
+        told = Controller(model, motion, settings, PERIOD).command(0.0, away)
+        assert told.torque == (expected,) * 3 and told.saturated
+        assert min(told.feedback) > 0.5  # what was asked for is told
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_not_finite_is_refused_until_a_reset(mode):
+    model = scene.load("example2")
+    acting = Controller(model, turned(model, (0.1, 0.0, 0.0)), ControlSettings(mode=mode), PERIOD)
+    gamma = model.initial.gamma
+    good = Measured(gamma, ZERO)
+    for bad in (Measured((np.nan, *gamma[1:]), ZERO), Measured(gamma, (0.0, np.inf, 0.0))):
+        acting.command(0.0, good)
+        with pytest.raises(ControlStopped, match="must be finite"):
+            acting.command(0.002, bad)
+        with pytest.raises(ControlStopped, match=r"t = 0\.002"):
+            acting.command(0.004, good)
+        acting.reset()
+    assert np.isfinite(acting.command(0.0, good).torque).all()
+
+
+@pytest.mark.parametrize("mode", ["computed_torque", "gravity_pd"])
+def test_angles_that_no_assembly_has_end_the_control(mode):
+    rng, ended = np.random.default_rng(5), 0
+    for seed, sample in enumerate(seeded_samples(6, 40)):
+        nowhere = tuple(rng.uniform(-1.5, 1.5, 3) + sample.gamma)
+        if kinematics.direct(sample.geometry, nowhere):
+            continue
+        acting = controller(sample, desired_near(sample, seed), mode=mode)
+        acting.command(0.0, seen(sample))
+        with pytest.raises(ControlStopped, match="parallel singularity"):
+            acting.command(PERIOD, Measured(nowhere, ZERO))
+        ended += 1
+    assert ended >= 2
+
+
+def test_the_observer_sees_what_continuation_proves():
+    """Over short and long steps, of a general manipulator; also back to where it began."""
+    for sample in seeded_samples(7, 5):
+        begin = tuple(quaternion_of(sample.rotation).tolist())
+        observer = OrientationObserver(sample.geometry, begin, tuple(sample.gamma.tolist()))
+        way = sample.gamma + np.outer(np.sin([0.01, 0.02, 0.3, 0.31, 0.05]), (0.4, -0.3, 0.5))
+        truth = continuation.follow(sample.geometry, [sample.gamma, *way], sample.rotation)
+        for gamma, rotation in zip(way, truth.rotation[1:], strict=True):
+            found = rotation_matrix(observer.see(tuple(gamma.tolist())))
+            assert np.abs(found - rotation).max() < 1e-12
+        observer.reset()
+        assert np.abs(np.abs(np.dot(observer.see(tuple(sample.gamma)), begin)) - 1.0) < 1e-14

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inverse dynamics against the direct ones, the paper's form, Lagrange's, and its own limits."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanism.loaded_lagrange import LoadedLagrange
+from mechanism.test_loads import loaded
+from mechanism.test_terms_truth import laden
+from models import FAST, samples, seeded_samples
+from scipy.spatial.transform import Rotation
+
+from sst_ros.control.inverse import InverseDynamics
+from sst_ros.errors import InputError, SingularConfiguration
+from sst_ros.mechanism import kernel, singularities, virtual_work, workspace
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.dynamics import Dynamics as PaperDynamics
+from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import load
+from sst_ros.terms import Moment
+
+FEW = settings(FAST, max_examples=25)  # each traces programs of its own
+EPS = np.finfo(float).eps
+ACCELERATIONS = st.tuples(*[st.floats(-20.0, 20.0)] * 3)
+
+
+def rounding(scene, sample, acceleration, torque, moment=None):
+    """What rounding of the terms of both balances makes of W_dot, through M^-1 and the g_k."""
+    at = kernel.balance(
+        kernel.model_of(scene), sample.quaternion, sample.body_rate, (0.0,) * 3, moment
+    )
+    xx, yy, zz, xy, xz, yz = at.inertia
+    m, reach = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.array(at.reach)
+    terms = np.abs(m) @ np.abs(acceleration) + np.abs(at.force) + np.abs(reach.T) @ np.abs(torque)
+    return 16.0 * EPS * np.linalg.cond(reach) * np.linalg.norm(np.linalg.inv(m)) * terms.sum()
+
+
+@FEW
+@given(samples(), st.floats(0.0, 1.0), ACCELERATIONS)
+def test_direct_dynamics_undo_inverse_dynamics_with_every_term(sample, number, acceleration):
+    scene = loaded(sample, number)
+    torque = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, acceleration)
+    found = Dynamics(scene).derivative(*sample.state, *torque)[4:]
+    error = np.abs(np.subtract(found, acceleration)).max()
+    assert error <= rounding(scene, sample, acceleration, torque)
+
+
+@FEW
+@given(samples(), ACCELERATIONS)
+def test_a_moment_from_a_topic_counts(sample, acceleration):
+    scene = dataclasses.replace(sample.scene, moment=Moment(topic=True))
+    moment = tuple(sample.moment.tolist())
+    inverse = InverseDynamics(scene)
+    torque = inverse.torque(sample.quaternion, sample.body_rate, acceleration, moment)
+    found = Dynamics(scene).derivative(*sample.state, *torque, *moment)[4:]
+    error = np.abs(np.subtract(found, acceleration)).max()
+    assert error <= rounding(scene, sample, acceleration, torque, moment)
+
+
+@FEW
+@given(samples(), ACCELERATIONS)
+def test_torques_are_those_of_the_paper(sample, gamma_ddot):
+    scene = dataclasses.replace(sample.scene, moment=Moment(topic=True))
+    at, moment = sample.posture, tuple(sample.moment.tolist())
+    paper = PaperDynamics.of(sample.mechanism, at, sample.gamma_dot)
+    expected = paper.torque(gamma_ddot, moment)
+    omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, sample.gamma_dot).omega_dot
+    body = tuple((sample.rotation.T @ omega_dot).tolist())
+    found = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, body, moment)
+    # Both lose to J and to M what the largest of the terms that meet allows.
+    size = np.linalg.norm(paper.m) * np.linalg.norm(gamma_ddot) + np.linalg.norm(paper.h)
+    size += np.linalg.norm(at.j) * np.linalg.norm(moment)
+    assert np.abs(found - expected).max() <= 1e-12 * size * np.linalg.cond(at.j)
+
+
+@pytest.mark.parametrize("sample", seeded_samples(83, 3), ids=range(3))
+def test_torques_are_lagranges_with_gravity_springs_and_friction(sample):
+    scene, at = laden(sample), sample.posture
+    truth = LoadedLagrange(scene, sample.rotation)
+    loads = truth.loads(sample.gamma, sample.gamma_dot)
+    gamma_ddot = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque + loads)
+    bias = virtual_work.bias(at, sample.gamma_dot).omega_dot
+    omega_dot = at.j @ np.array(gamma_ddot, dtype=float) + bias
+    body = tuple((sample.rotation.T @ omega_dot).tolist())
+    found = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, body)
+    assert np.abs(found - sample.torque).max() <= 1e-11 * np.abs(loads).max()
+
+
+@pytest.mark.parametrize("sample", seeded_samples(84, 3), ids=range(3))
+def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
+    scene = dataclasses.replace(laden(sample), friction=None)
+    truth = LoadedLagrange(laden(sample), sample.rotation)
+    expected = -np.array(truth.loads(sample.gamma, np.zeros(3)))
+    found = InverseDynamics(scene).gravity_torque(sample.quaternion)
+    assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():
+    assert Dynamics(load("example1")).program.operations.total() <= 290
+
+
+def test_near_a_serial_singularity_a_torque_is_finite_or_refused():
+    """Towards t_1 = w_1 = (0, 0, 1), with e_1 = (0, 1, 0): about e_1, then about x to 90 deg."""
+    inverse = InverseDynamics(load("example1"))
+    said = []
+    for off in [*(10.0**-power for power in range(1, 18)), 0.0]:
+        turn = Rotation.from_euler("yx", [0.5, 0.5 * math.pi - off])
+        q = tuple(turn.as_quat().tolist())
+        try:
+            assert all(map(math.isfinite, inverse.torque(q, (0.1,) * 3, (1.0, 2.0, 3.0))))
+            said.append("torque")
+        except SingularConfiguration as error:
+            assert "serial" in str(error) and 0.0 <= error.measure <= 1e-10
+            said.append("refused")
+    assert said[0] == "torque" and said[-1] == "refused"
+    assert said == sorted(said, reverse=True)
+
+
+def test_a_parallel_singularity_is_told():
+    scene = load("example1")
+    star = dataclasses.replace(scene.star, alpha_deg=(210.0, 75.0, 75.0))
+    scene = dataclasses.replace(scene, star=star)
+    geometry = Geometry.of(scene)
+    s, _ = workspace.triangle_directions(geometry, 6)
+    poses = singularities.parallel(workspace.over_orientations(geometry, s, 36))
+    assert len(poses)
+    for rotation in poses.rotation:
+        q = tuple(quaternion_of(rotation).tolist())
+        with pytest.raises(SingularConfiguration, match="parallel") as told:
+            InverseDynamics(scene).torque(q, (0.0,) * 3, (1.0, 2.0, 3.0))
+        assert abs(told.value.measure) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("q", "rate", "acceleration", "named"),
+    [
+        ((math.nan, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, "finite"),
+        ((0.0, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0), (0.0,) * 3, "finite"),
+        ((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0, 0.0, math.nan), "finite"),
+        ((0.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, "length > 0"),
+    ],
+)
+def test_what_is_no_state_is_refused(q, rate, acceleration, named):
+    with pytest.raises(InputError, match=named):
+        InverseDynamics(load("example1")).torque(q, rate, acceleration)

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a motion asks for, against closed forms, and the speed at which it can be had."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from models import FAST
+from scipy.integrate import quad
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from sst_ros import __main__ as cli
+from sst_ros.control.extremes import largest, least
+from sst_ros.control.motions import motion_of
+from sst_ros.control.plan import check, examine
+from sst_ros.control.speed import speed
+from sst_ros.control.star_motions import Turn
+from sst_ros.control.torque import table
+from sst_ros.desired_motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
+from sst_ros.errors import MotionRefused, SingularConfiguration
+from sst_ros.mechanism import kinematics, singularities, workspace
+from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import (
+    Actuators,
+    Friction,
+    Initial,
+    JointFriction,
+    Spring,
+    Stroke,
+    Workspace,
+    load,
+    text_of,
+)
+from sst_ros.simulation import Simulation
+
+HOME = (math.pi / 4,) * 3
+EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))
+WAY, TIME = 0.3, 0.5
+SHIPPED = ("point_to_point", "spiral")
+
+
+def with_motion(scene, motion, **more):
+    kinds = {
+        ToAngles: "to_angles", ToOrientation: "to_orientation", Sweep: "sweep", Spiral: "spiral"
+    }  # fmt: skip
+    return replace(scene, motion=DesiredMotion(**{kinds[type(motion)]: motion}), **more)
+
+
+def planned(scene):
+    return examine(motion_of(scene), scene)
+
+
+def swing(duration=TIME, **more):
+    """Example 1's one degree of freedom: all gamma go WAY on together."""
+    goal = ToAngles(gamma=tuple(angle + WAY for angle in HOME), duration=duration)
+    return with_motion(EXAMPLE1, goal, **more)
+
+
+def swing_torque(time):
+    """Of each actuator, from the inertia M1(x) of the one coordinate x = gamma - pi/4."""
+    star = EXAMPLE1.star.inertia
+    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
+
+    def inertia(x):
+        d, c = 2.0 - np.cos(2 * x), np.cos(x)
+        return star.zz / d**2 + drive.zz + link.yy + 2.0 * link.xx * c**2 / d**2
+
+    law = WAY * np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+    u = time / TIME
+    x, rate, acceleration = law(u), law.deriv()(u) / TIME, law.deriv(2)(u) / TIME**2
+    slope = inertia(x + 1e-20j).imag / 1e-20
+    return inertia(x) * acceleration + 0.5 * slope * rate**2, rate
+
+
+def summit(function, count=4000):
+    """Largest size of a function of time over the swing: a fine grid, then a search."""
+    times = np.linspace(0.0, TIME, count)
+    top = int(np.argmax([abs(function(time)) for time in times]))
+    bounds = times[max(top - 1, 0)], times[min(top + 1, count - 1)]
+    found = minimize_scalar(
+        lambda time: -abs(function(time)), bounds=bounds, method="bounded", options={"xatol": 1e-12}
+    )
+    return function(found.x), found.x
+
+
+def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
+    plan = planned(swing())
+    for name, function in (
+        ("torque", lambda time: swing_torque(time)[0]),
+        ("power", lambda time: math.prod(swing_torque(time))),
+    ):
+        value, time = summit(function)
+        for demand in plan.demands:
+            found = getattr(demand, name)
+            assert found.value == pytest.approx(value, rel=1e-12)
+            assert found.time == pytest.approx(time, abs=1e-6)
+    square = quad(lambda time: swing_torque(time)[0] ** 2, 0.0, TIME, epsabs=1e-14)[0]
+    for demand in plan.demands:
+        assert demand.torque_rms == pytest.approx(math.sqrt(square / TIME), rel=1e-6)
+
+
+def test_rates_of_minimum_jerk_are_15_8ths_and_10_over_root_3():
+    for demand in planned(swing()).demands:
+        assert demand.velocity.value == pytest.approx(15.0 / 8.0 * WAY / TIME, rel=1e-14)
+        peak = 10.0 / math.sqrt(3.0) * WAY / TIME**2
+        assert abs(demand.acceleration.value) == pytest.approx(peak, rel=1e-14)
+        root = 0.5 - math.sqrt(3.0) / 6.0
+        at = {round(share * TIME, 6) for share in (root, 1.0 - root)}
+        assert round(demand.acceleration.time, 6) in at
+
+
+@FAST
+@given(st.floats(0.0, 6.3), st.floats(0.5, 12.0), st.integers(40, 90))
+def test_extremes_between_samples_are_found(phase, frequency, count):
+    """Two sines of up to two periods, some 20 samples each at least; the truth from 20001."""
+
+    def function(time):
+        return math.sin(frequency * time + phase) + 0.5 * math.sin(2.3 * frequency * time)
+
+    times, fine = np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, 20_001)
+    values = np.array([function(time) for time in times.tolist()])
+    truth = np.array([function(time) for time in fine.tolist()])
+    # A parabola through the best of the fine samples is lower than the truth by 1e-6 at most.
+    assert largest(function, times, values).value == pytest.approx(truth.max(), abs=2e-6)
+    assert least(function, times, values).value == pytest.approx(truth.min(), abs=2e-6)
+    assert largest(function, times, values).value >= truth.max() - 1e-12
+
+
+def test_the_speed_of_pure_inertia_is_the_root_of_the_torques_ratio():
+    limit = 2.0
+    plan = planned(swing(actuators=Actuators(torque_limit=limit)))
+    value, _ = summit(lambda time: swing_torque(time)[0])
+    found = speed(plan)
+    assert found.highest == pytest.approx(math.sqrt(limit / abs(value)), rel=1e-12)
+    assert (found.lowest, found.binding) == (0.0, "torque")
+
+
+def test_the_speed_under_limits_of_rate_and_acceleration_is_a_quotient_and_a_root():
+    velocity, acceleration = 15.0 / 8.0 * WAY / TIME, 10.0 / math.sqrt(3.0) * WAY / TIME**2
+    found = speed(planned(swing(actuators=Actuators(velocity_limit=3.0))))
+    assert found.highest == pytest.approx(3.0 / velocity, rel=1e-12)
+    assert found.binding == "velocity"
+    found = speed(planned(swing(actuators=Actuators(velocity_limit=3.0, acceleration_limit=9.0))))
+    assert found.highest == pytest.approx(math.sqrt(9.0 / acceleration), rel=1e-12)
+    assert found.binding == "acceleration"
+
+
+def test_without_limits_any_speed_will_do():
+    found = speed(planned(swing()))
+    assert found.highest == math.inf and found.binding == ""
+
+
+def rubbing(duration, limit):
+    """A turn under gravity with friction: torques that follow no power of the speed."""
+    rub = JointFriction(gamma=Friction(viscous=0.3, coulomb=0.2), beta=Friction(coulomb=0.1))
+    turn = Rotation.from_quat(
+        quaternion_of(kinematics.admissible(Geometry.of(EXAMPLE1), HOME).rotation)
+    )
+    goal = (turn * Rotation.from_rotvec([0.2, -0.1, 0.3])).as_quat()
+    motion = ToOrientation(orientation=tuple(goal.tolist()), duration=duration)
+    hung = replace(load("gravity_payload"), springs=(), friction=rub)
+    hung = replace(hung, initial=Initial(gamma=HOME), actuators=Actuators(torque_limit=limit))
+    return with_motion(hung, motion)
+
+
+def test_the_highest_speed_is_where_the_check_turns():
+    """The motion itself is squeezed in time here, not the torques of the planned one."""
+    limit = 9.0
+    found = speed(planned(rubbing(1.0, limit)))
+    assert found.lowest == 0.0 and 1.5 < found.highest < 10.0
+    for factor, fits in ((1.0 - 1e-9, True), (1.0 + 1e-9, False)):
+        scene = rubbing(1.0 / (factor * found.highest), limit)
+        assert (not planned(scene).problems) == fits
+
+
+def test_a_weight_beyond_the_limit_is_infeasible_at_any_speed():
+    plan = planned(rubbing(1.0, 0.5))
+    assert {problem.key for problem in plan.problems} <= {f"torque_{leg}" for leg in (1, 2, 3)}
+    assert plan.problems and speed(plan).highest is None
+
+
+def resonant(factor=1.0):
+    """A sweep against springs: near their resonance it takes little, slower and faster it does."""
+    springs = tuple(Spring(joint=f"gamma_{k}", stiffness=20.0, rest=HOME[0]) for k in (1, 2, 3))
+    inertia = swing_inertia_at_home()
+    own = factor * math.sqrt(20.0 / inertia)
+    motion = Sweep(amplitude=(0.1,) * 3, frequency=(own,) * 3, fade=20.0 / own, duration=60.0 / own)
+    scene = replace(EXAMPLE1, springs=springs, actuators=Actuators(torque_limit=1.2))
+    return with_motion(scene, motion)
+
+
+def swing_inertia_at_home():
+    star = EXAMPLE1.star.inertia
+    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
+    return star.zz + drive.zz + link.yy + 2.0 * link.xx
+
+
+def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
+    """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points; 1.2 are there."""
+    found = speed(planned(resonant()))
+    assert found.highest is not None and 0.3 < found.lowest < 1.0 < found.highest
+    for end, inside in ((found.lowest, 1.0 + 1e-6), (found.highest, 1.0 - 1e-6)):
+        assert not planned(resonant(end * inside)).problems
+        assert planned(resonant(end / inside)).problems
+
+
+def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
+    away = ToAngles(gamma=(1.7, 0.9, 0.9), duration=1.0)
+    free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+    scene = with_motion(EXAMPLE1, away, workspace=free["workspace"])
+    with pytest.raises(MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"):
+        check(motion_of(scene), scene)
+    elastic = replace(scene, stroke=Stroke(at_end="elastic", stiffness=1e3))
+    assert planned(elastic).problems
+    ignoring = replace(scene, stroke=free["stroke"])
+    assert not check(motion_of(ignoring), ignoring).problems
+
+
+def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
+    out = Spiral(phi=1.0, theta=0.3, duration=1.0)
+    scene = with_motion(EXAMPLE1, out)
+    plan = planned(scene)
+    told = {problem.key: problem.value for problem in plan.problems}
+    assert any(key.startswith("beta") for key in told)
+    motion, geometry = plan.motion, Geometry.of(scene)
+    times = np.linspace(0.0, 1.0, 2001)
+    turned = Rotation.from_quat([motion.at(time).quaternion for time in times.tolist()])
+    beta = kinematics.inverse(geometry, turned.as_matrix())[2]
+    for distance in plan.distances:
+        if distance.key.startswith("beta"):
+            mine = distance.sign * (beta[:, int(distance.key[-1]) - 1] - distance.end)
+            assert distance.least == pytest.approx(mine.min(), abs=1e-6)
+            assert distance.least <= mine.min() + 1e-12
+
+
+def test_limits_are_held_between_samples_and_told_with_the_instant():
+    limit = abs(summit(lambda time: swing_torque(time)[0])[0])
+    fits = swing(actuators=Actuators(torque_limit=limit * (1.0 + 1e-12)))
+    assert not check(motion_of(fits), fits).problems
+    tight = swing(actuators=Actuators(torque_limit=limit * (1.0 - 1e-9)))
+    with pytest.raises(MotionRefused) as told:
+        check(motion_of(tight), tight)
+    assert [problem.key for problem in told.value.problems] == ["torque_1", "torque_2", "torque_3"]
+    rates = Actuators(velocity_limit=1.1, acceleration_limit=6.9)
+    keys = {problem.key.partition("_")[0] for problem in planned(swing(actuators=rates)).problems}
+    assert keys == {"velocity", "acceleration"}
+
+
+def test_a_turn_through_a_parallel_singularity_is_refused():
+    star = replace(EXAMPLE1.star, alpha_deg=(210.0, 75.0, 75.0))
+    scene = replace(
+        EXAMPLE1, star=star, stroke=Stroke(at_end="ignore"), workspace=Workspace(at_edge="ignore")
+    )
+    geometry = Geometry.of(scene)
+    s, _ = workspace.triangle_directions(geometry, 6)
+    poses = singularities.parallel(workspace.over_orientations(geometry, s, 36))
+    ends = [
+        quaternion_of(poses.rotation[1] @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix())
+        for angle in (-0.1, 0.123)
+    ]
+    first, last = (tuple(end.tolist()) for end in ends)
+    with pytest.raises(
+        SingularConfiguration, match=r"parallel singularity at t = 0\.\d+ s"
+    ) as told:
+        check(Turn(geometry, first, last, 1.0), scene)
+    assert abs(told.value.measure) < 1e-9
+
+
+def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
+    """Through t_1 = w_1: the arc of the star folds over the base's."""
+    scene = replace(EXAMPLE1, workspace=Workspace(at_edge="ignore"), stroke=Stroke(at_end="ignore"))
+    geometry = Geometry.of(scene)
+    first, last = (
+        tuple(Rotation.from_euler("yx", [0.5, 0.5 * math.pi + off]).as_quat().tolist())
+        for off in (-0.2, 0.2)
+    )
+    with pytest.raises(SingularConfiguration, match="serial singularity"):
+        check(Turn(geometry, first, last, 1.0), scene)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_motions_are_feasible_and_end_where_they_should(name):
+    scene = load(name)
+    plan = check(motion_of(scene), scene)
+    assert scene.duration == plan.motion.duration
+    assert speed(plan).highest > 1.0
+    assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
+
+
+def test_the_command_tells_verdict_and_status(capsys, tmp_path):
+    assert cli.main(["plan", "check", "point_to_point"]) == 0
+    said = capsys.readouterr().out
+    assert "\nfeasible\nHighest speed 1." in said and "torque limit is met" in said
+    fast = tmp_path / "fast.yaml"
+    source, _ = text_of("point_to_point")
+    fast.write_text(source.replace("duration: 1}", "duration: 0.5}"), encoding="utf-8")
+    assert cli.main(["plan", "check", str(fast)]) == 1
+    said = capsys.readouterr().out
+    assert "not feasible" in said and "refused: torque_1 = " in said
+    assert cli.main(["plan", "check", "example1"]) == 1
+    assert "no desired motion" in capsys.readouterr().err
+    assert cli.main(["plan", "check", "spiral", "--csv", "x.csv", "--period", "0"]) == 1
+    assert "--period = 0.0" in capsys.readouterr().err
+
+
+def test_json_says_what_the_table_says(capsys):
+    assert cli.main(["plan", "check", "point_to_point", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    plan = planned(load("point_to_point"))
+    assert told["feasible"] is True and told["problems"] == []
+    assert told["highest_speed"] == speed(plan).highest
+    for found, demand in zip(told["actuators"], plan.demands, strict=True):
+        assert found["torque"] == {"value": demand.torque.value, "time": demand.torque.time}
+        assert found["torque_rms"] == demand.torque_rms
+    assert len(told["distances"]) == len(plan.distances) == 16
+
+
+def test_written_torques_do_the_motion(tmp_path):
+    """Held torques of the middles err with the square of the period: 16 times less at a quarter."""
+    scene, errors = load("point_to_point"), []
+    goal = motion_of(scene).at(1.0).gamma
+    for period_ns in (8_000_000, 2_000_000):
+        path = tmp_path / f"{period_ns}.csv"
+        assert cli.main(
+            ["plan", "check", "point_to_point", "--csv", str(path), "--period", f"{period_ns}e-9"]
+        ) == 0  # fmt: skip
+        profile, last = table(path)
+        assert last == pytest.approx(1.0, abs=1e-12)
+        simulation = Simulation(scene)
+        for k in range(1_000_000_000 // period_ns):
+            simulation.step(profile((k + 0.5) * period_ns * 1e-9), period_ns)
+        errors.append(np.abs(np.subtract(simulation.state.joints.gamma, goal)).max())
+    assert errors[1] < 1e-5
+    assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.05)

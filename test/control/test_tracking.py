@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of a track against closed forms."""
+
+import numpy as np
+import pytest
+
+from sst_ros.control.tracking import BAND, Track, judge, table
+
+TIME = np.linspace(0.0, 2.0, 2001)
+
+
+def track(error, gamma=None, **given):
+    """A track of the same error in all joints; gamma rises over the first second by default."""
+    gamma = np.minimum(TIME, 1.0) if gamma is None else gamma
+    columns = {"gamma": gamma, "gamma_dot": np.gradient(gamma), "error": error}
+    columns |= {name: np.zeros_like(TIME) for name in ("error_rate", "feedforward", "feedback")}
+    columns |= {"torque": given.get("feedforward", 0.0) + given.get("feedback", 0.0 * TIME)}
+    columns |= given
+    return Track(TIME, **{name: np.outer(column, [1, 1, 1]) for name, column in columns.items()})
+
+
+def test_errors_of_a_sine():
+    found = judge(track(0.3 * np.sin(2.0 * np.pi * TIME)))
+    assert found.rms == pytest.approx(0.3 / np.sqrt(2.0), rel=1e-3)
+    assert found.largest == pytest.approx(0.3, rel=1e-5)
+    assert found.last == pytest.approx(0.0, abs=1e-15)
+    assert (found.samples, found.seconds) == (2001, 2.0)
+
+
+def test_error_against_run_time_only_grows_in_its_largest():
+    found = judge(track(TIME))
+    time, rms, largest = found.history.T
+    assert time[0] == 0.0 and time[-1] == 2.0
+    assert largest == pytest.approx(time)
+    assert rms == pytest.approx(time / np.sqrt(3.0), rel=2e-3)  # rms of a ramp
+
+
+def test_settling_time_of_a_decay_after_the_motion():
+    error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
+    found = judge(track(error))
+    assert found.band == pytest.approx(BAND)  # the way is 1 rad
+    assert found.settling == pytest.approx(0.1 * np.log(0.5 / BAND), abs=2e-3)
+
+
+def test_settling_time_is_unknown_where_it_is_not_seen():
+    assert judge(track(np.full_like(TIME, 0.5))).settling is None  # never settles
+    assert judge(track(0.0 * TIME, gamma=TIME)).settling is None  # the motion never ends
+    assert judge(track(0.0 * TIME)).settling == 0.0
+
+
+def test_shares_are_those_of_the_torque_and_sum_to_one():
+    feedforward = 3.0 * np.sin(2.0 * np.pi * TIME[:-1])
+    feedback = np.cos(2.0 * np.pi * TIME[:-1])
+    whole = track(
+        0.0 * TIME, feedforward=np.append(feedforward, 0.0), feedback=np.append(feedback, 0.0)
+    )
+    found = judge(whole)
+    assert found.feedforward == pytest.approx(0.9) and found.feedback == pytest.approx(0.1)
+    assert found.torque_rms == pytest.approx(np.sqrt(5.0), rel=1e-3)
+    nothing = judge(track(0.0 * TIME))
+    assert np.isnan(nothing.feedforward).all()
+
+
+def test_the_table_says_what_it_knows():
+    lines = table(judge(track(0.0 * TIME, gamma=TIME), limited=7))
+    assert "nan" not in lines
+    assert "7  (of 2001)" in lines
+    assert lines.count("\n") == 10 + 2 + 11
