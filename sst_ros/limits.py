@@ -61,18 +61,6 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
     return [(joint, low, high) for joint, (low, high) in found.items()]
 
 
-def all_far(
-    ranges: list[tuple[int, float, float]], begin: Sequence[float], end: Sequence[float]
-) -> bool:
-    """Say quickly that no limit may have been crossed: inside at both ends, no rate turned."""
-    for joint, low, high in ranges:
-        if not (low < begin[joint] < high and low <= end[joint] <= high):
-            return False
-        if begin[joint + 9] * end[joint + 9] < 0.0:
-            return False
-    return True
-
-
 def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
     """Yield serial singularities, and the ends that the scene neither ignores nor makes elastic."""
     stroke: type[RunStopped] | None = StrokeExceeded if scene.stroke.at_end == "stop" else None

@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -50,6 +50,14 @@ class State:
     body_rate: Triple
     joints: Joints
     torque: Triple
+
+
+class _Instant(NamedTuple):
+    """What a state is made of, when it is asked for."""
+
+    time_ns: int
+    point: Point
+    torque: Torque
 
 
 class Simulation:
@@ -105,16 +113,23 @@ class Simulation:
     def reset(self) -> State:
         """Go back to the initial state at time zero."""
         self._journey.reset()
-        self._point = self._start
+        self._now = self._before = _Instant(0, self._start, (0.0, 0.0, 0.0))
+        self._shown = self._now, self._as_state(self._now)
         self._energy = self._stored()
-        self._state = self._as_state(0, (0.0, 0.0, 0.0), self._point)
-        self._before, self._last = self._point, self._state
-        return self._state
+        return self.state
 
     @property
     def state(self) -> State:
         """The last valid state."""
-        return self._state
+        now = self._now
+        if self._shown[0] is not now:
+            self._shown = now, self._as_state(now)
+        return self._shown[1]
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the last valid state [ns]."""
+        return self._now.time_ns
 
     @property
     def method(self) -> str:
@@ -133,30 +148,30 @@ class Simulation:
         A companion takes steps of twice the length; their difference, over 2^order - 1, is the
         error of the run, rounding included where it is what the difference consists of.
         """
-        return self._journey.errors(self._point)[0]
+        return self._journey.errors(self._now.point)[0]
 
     @property
     def rate_error_estimate(self) -> float:
         """Estimated global error of the body rate so far [rad/s]."""
-        return self._journey.errors(self._point)[1]
+        return self._journey.errors(self._now.point)[1]
 
     @property
     def energy_residual(self) -> float:
         """Energy now, less energy at the start, less the work done on the manipulator [J]."""
-        return self._stored() - self._energy - self._journey.work(self._point)
+        return self._stored() - self._energy - self._journey.work(self._now.point)
 
     @property
     def closure_residual(self) -> float:
         """Largest abs(r_k . t_k): how far the loops are from closed."""
-        r, t = self._directions(self._state.joints.gamma, self._state.quaternion)
+        r, t = self._directions(self.state.joints.gamma, self.state.quaternion)
         return float(np.abs(np.sum(r * t, axis=1)).max())
 
     @property
     def conditioning(self) -> dict[str, float]:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
-        r, t = self._directions(self._state.joints.gamma, self._state.quaternion)
+        r, t = self._directions(self.state.joints.gamma, self.state.quaternion)
         determinant = float(np.linalg.det(np.cross(t, r)))
-        return {"sin_mu": min(map(math.sin, self._state.joints.mu)), "det_j2": determinant}
+        return {"sin_mu": min(map(math.sin, self.state.joints.mu)), "det_j2": determinant}
 
     def step(self, torque: Torque, dt_ns: int, moment: Triple = (0.0, 0.0, 0.0)) -> State:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
@@ -176,23 +191,40 @@ class Simulation:
             Diverged: no step resolves the motion. In all cases the state stays as it was.
 
         """
+        self.steps(torque, dt_ns, 1, moment)
+        return self.state
+
+    def steps(
+        self, torque: Torque, dt_ns: int, count: int, moment: Triple = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Advance by `count` times dt_ns: the bits are those of `count` calls of `step`.
+
+        Where nothing happens but steps, all of them are one call of compiled code.
+
+        Raises:
+            as `step`: the state is then that after the last step before, `time_ns` tells which.
+
+        """
         _refuse_bad_input(torque, dt_ns, moment)
-        start = self._state.time_ns / NANOSECONDS
         drive = (*moment,) if self.dynamics.moved else ()
+        h = dt_ns / NANOSECONDS
+        while count > 0:
+            point, done = self._journey.glide(self._now.point, h, count, torque, drive)
+            if done == 0:
+                point, done = self._travelled(h, torque, drive), 1
+            time_ns = self._now.time_ns + done * dt_ns
+            self._given = torque, drive
+            self._before, self._now = self._now, _Instant(time_ns, point, torque)
+            count -= done
+
+    def _travelled(self, h: float, torque: Torque, drive: tuple[float, ...]) -> Point:
+        start = self._now.time_ns / NANOSECONDS
         try:
             with np.errstate(all="ignore"):
-                point = self._journey.travel(
-                    self._point, start, dt_ns / NANOSECONDS, torque, drive, self._state
-                )
+                return self._journey.travel(self._now.point, start, h, torque, drive, self.state)
         except (CannotStep, ArithmeticError, ValueError) as error:
             told = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
-            raise Diverged(f"{error or 'not finite'} ({told})", start, self._state) from None
-        self._before, self._last, self._given = self._point, self._state, (torque, drive)
-        self._point = point
-        time_ns = self._state.time_ns + dt_ns
-        asked = torque(time_ns / NANOSECONDS) if callable(torque) else torque
-        self._state = self._as_state(time_ns, self._journey.limited(asked), point)
-        return self._state
+            raise Diverged(f"{error or 'not finite'} ({told})", start, self.state) from None
 
     def within(self, time_ns: int) -> State:
         """State at a time inside the last step, to the full accuracy of the run.
@@ -203,32 +235,35 @@ class Simulation:
             InputError: the time is not inside the last step.
 
         """
-        began, end = self._last.time_ns, self._state.time_ns
+        began, end = self._before.time_ns, self._now.time_ns
         if not began <= time_ns <= end:
             allowed = f"must lie in the last step, {began} to {end} ns"
             raise InputError("within", [Problem("time_ns", time_ns, allowed)])
+        before = self._as_state(self._before)
         if time_ns == began:
-            return self._last
+            return before
         torque, more = self._given
         h = (time_ns - began) / NANOSECONDS
         start = began / NANOSECONDS
-        point = self._journey.revisited(self._before, start, h, torque, more, self._last)
-        asked = torque(time_ns / NANOSECONDS) if callable(torque) else torque
-        return self._as_state(time_ns, self._journey.limited(asked), point)
+        point = self._journey.revisited(self._before.point, start, h, torque, more, before)
+        return self._as_state(_Instant(time_ns, point, torque))
 
     def _stored(self) -> float:
         size = len(self.dynamics.state)
         kinetic, potential, _ = self.dynamics.energies(
-            *self._point.y[:size], *(0.0,) * len(self.dynamics.drive)
+            *self._now.point.y[:size], *(0.0,) * len(self.dynamics.drive)
         )
         return kinetic + potential
 
-    def _as_state(self, time_ns: int, torque: Triple, point: Point) -> State:
-        y, at = point.y, point.joints
+    def _as_state(self, at: _Instant) -> State:
+        (y, _, j, _), asked = at.point, at.torque
         if len(self.dynamics.state) > 7:
             torque = (y[7], y[8], y[9])
-        joints = Joints(*zip(at[::3], at[1::3], at[2::3], strict=True))
-        return State(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), joints, torque)
+        else:
+            given = asked(at.time_ns / NANOSECONDS) if callable(asked) else asked
+            torque = self._journey.limited(given)
+        joints = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])  # type: ignore[arg-type]
+        return State(at.time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), joints, torque)
 
     def _initial(self) -> Point:
         initial = self.scene.initial

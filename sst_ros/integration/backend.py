@@ -16,7 +16,7 @@ import pickletools
 import platform
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,7 +26,14 @@ from sst_ros.integration.steps import explicit_step
 from sst_ros.integration.tableaux import Rosenbrock, Tableau
 from sst_ros.mechanism.trace import Program
 
-_EXPLICIT = (loops.size_of, loops.normalise, loops.pair, loops.march)
+_EXPLICIT = (
+    loops.size_of,
+    loops.normalise,
+    loops.pair,
+    loops.march,
+    loops.all_far,
+    loops.glide,
+)
 _IMPLICIT = (loops.factorise, loops.substitute, loops.attempt_linearly_implicit, *_EXPLICIT)
 
 _PLAIN = """\
@@ -47,7 +54,7 @@ from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
 import numba
 import numpy as np
 
-jit = numba.njit(cache={cache}, error_model="numpy")
+jit = numba.njit(cache={cache}, error_model="numpy", nogil={nogil})
 
 @jit
 def vector(n):
@@ -75,20 +82,26 @@ def numba_version() -> str | None:
 
 
 def source(
-    program: Program, jacobian: Program | None, method: Tableau | Rosenbrock, size: int, drive: int
+    program: Program,
+    jacobian: Program | None,
+    joints: Program,
+    method: Tableau | Rosenbrock,
+    size: int,
+    drive: int,
 ) -> list[str]:
     """Functions of the module, one text each, in the order in which they need each other.
 
     Args:
         program: derivative of the state; inputs t, state, drive.
         jacobian: derivative, and its derivatives by t and by each state; for implicit methods.
+        joints: nine angles and nine rates; inputs are the first seven numbers of the state.
         method: the integrator.
         size: numbers in the state.
         drive: numbers in the drive.
 
     """
     y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(drive)]
-    texts = [program.source("rhs")]
+    texts = [program.source("rhs"), joints.source("angles_and_rates"), _joints_of()]
     if isinstance(method, Tableau):
         new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
         texts += [explicit_step(method, size, drive), _attempt(y, d, new)]
@@ -108,34 +121,29 @@ def source(
     return texts + [text.replace("attempt_linearly_implicit", "attempt") for text in functions]
 
 
-def load(texts: list[str], constants: dict[str, Any], *, numba: bool) -> ModuleType:
+def load(
+    texts: list[str], constants: dict[str, Any], *, numba: bool, nogil: bool = False
+) -> ModuleType:
     """Turn function texts into a module, for the interpreter or compiled by numba."""
-    named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
     if not numba:
+        named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
         return _executed("\n".join([_PLAIN, named, *texts]), "sst_ros_plain")
-    body = "\n".join([named, *(f"@jit\n{text}" for text in texts)])
-    cached = _NUMBA.format(cache=True) + body
-    path = _cached_file(cached)
+    path = _cached_file(_for_numba(texts, constants, nogil=nogil))
     if path is None:
-        return _executed(_NUMBA.format(cache=False) + body, "sst_ros_compiled")
+        head = _NUMBA.format(cache=False, nogil=nogil)
+        return _executed(head + _body(texts, constants), "sst_ros_compiled")
     return _imported(path)
 
 
-def load_parallel(texts: list[str], last: str) -> ModuleType:
-    """Compile texts of a batch; the last function runs its loop over blocks on all cores."""
-    heads = [_NUMBA.format(cache=cache) + "from numba import prange\n" for cache in (True, False)]
-    parallel = '\n@numba.njit(cache={}, error_model="numpy", parallel=True)\n'
-    bodies = [
-        "\n".join([head, *texts, parallel.format(cache) + last])
-        for head, cache in zip(heads, (True, False), strict=True)
-    ]
-    path = _cached_file(bodies[0])
-    return _imported(path) if path else _executed(bodies[1], "sst_ros_batch")
+def _joints_of() -> str:
+    outputs = ", ".join(f"joints[{i}]" for i in range(18))
+    inputs = ", ".join(f"y[{i}]" for i in range(7))
+    return f"def joints_of(y, joints):\n    ({outputs},) = angles_and_rates({inputs})\n"
 
 
 def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
     call = f"step({', '.join(['t', 'h', *y, *d])})"
-    return f"def attempt(t, h, y, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
+    return f"def attempt(t, h, y, near, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
 
 
 def _imported(path: Path) -> ModuleType:
@@ -170,15 +178,40 @@ def _executed(text: str, name: str) -> ModuleType:
     return module
 
 
-def _cached_file(text: str) -> Path | None:
-    """File that holds `text`; None where no folder for it can be written."""
+def has_code(texts: list[str], constants: dict[str, Any], functions: Sequence[str]) -> bool:
+    """Tell whether machine code of these functions of the module is there to be loaded."""
+    path = _path_of(_for_numba(texts, constants))
+    cached = path.parent / "__pycache__"
+    return all(any(cached.glob(f"{path.stem}.{name}-*.nbi")) for name in functions)
+
+
+def _for_numba(texts: list[str], constants: dict[str, Any], *, nogil: bool = False) -> str:
+    return _NUMBA.format(cache=True, nogil=nogil) + _body(texts, constants)
+
+
+def _body(texts: list[str], constants: dict[str, Any]) -> str:
+    named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
+    return "\n".join([named, *(f"@jit\n{text}" for text in texts)])
+
+
+def _path_of(text: str) -> Path:
     import numpy
 
     versions = (sys.version, numba_version(), numpy.__version__, platform.machine())
     digest = hashlib.sha256("\n".join([text, *map(str, versions)]).encode()).hexdigest()[:24]
+    return cache_folder() / f"sst_{digest}.py"
+
+
+def cache_folder() -> Path:
+    """Folder of machine code: SST_ROS_CACHE, or sst_ros in the user's cache."""
     default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sst_ros"
-    path = Path(os.environ.get("SST_ROS_CACHE") or default) / f"sst_{digest}.py"
+    return Path(os.environ.get("SST_ROS_CACHE") or default)
+
+
+def _cached_file(text: str) -> Path | None:
+    """File that holds `text`; None where no folder for it can be written."""
     try:
+        path = _path_of(text)
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             # Two processes may write at once: each its own file, then one atomic rename.

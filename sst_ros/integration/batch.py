@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 from typing import Any
 
@@ -12,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import backend
-from sst_ros.integration.blocks import NOT_FINITE, batch_source, driver
+from sst_ros.integration.blocks import LANES, NOT_FINITE, batch_source
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import DOP853, Tableau
 from sst_ros.limits import Limit, limits_of
@@ -91,6 +94,7 @@ class Batch:
         step: float,
         count: int,
         keep_every: int = 0,
+        threads: int = 0,
         progress: bool = False,
     ) -> Scenarios:
         """Run all scenarios for `count` steps.
@@ -102,40 +106,38 @@ class Batch:
             step: length of a step [s].
             count: number of steps.
             keep_every: keep the states every so many steps; 0 keeps none.
+            threads: how many; 0 takes all cores. No bit depends on it.
             progress: draw a bar on a terminal.
 
         Raises:
             InputError: an argument is not finite or has another shape.
 
         """
-        start, code = self._start(_rows("gamma", gamma, None), gamma_dot)
-        number = start.shape[1]
-        given = np.zeros((max(len(self._system.drive), 1), number))
-        if len(self._system.drive) >= 3:
-            given[:3] = _rows("torque", torque, number).T
-        when = np.full(number, np.nan)
-        error = np.zeros(number)
-        kept = [start[:7].T.copy()] if keep_every else []
+        gamma = _rows("gamma", gamma, None)
+        y, code = self.start(gamma, gamma_dot)
+        given = self.drives(torque, len(gamma))
+        when, error = np.full(len(gamma), np.nan), np.zeros(len(gamma))
+        kept = [y[:7].T.copy()] if keep_every else []
         size = keep_every or max(1, count // _CHUNKS)
         for part in slices(count, size, self.scene.name, progress):
             span = part.stop - part.start
-            self._module.batch(step, part.start, span, start, given, code, when, error)
+            self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
             if keep_every and span == keep_every:
-                kept.append(start[:7].T.copy())
+                kept.append(y[:7].T.copy())
         when[code == _NO_START] = 0.0
         return Scenarios(
-            quaternion=start[:4].T.copy(),
-            body_rate=start[4:7].T.copy(),
+            quaternion=y[:4].T.copy(),
+            body_rate=y[4:7].T.copy(),
             fault=tuple(self._said(int(number)) for number in code),
             fault_time=when,
             local_error=error,
             kept=np.stack(kept) if kept else None,
         )
 
-    def _start(self, gamma: Array, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-        """States at t = 0, columns, and codes of scenarios that cannot start."""
+    def start(self, gamma: Array, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+        """States at t = 0, a column a scenario, and codes: 0, or of those that cannot start."""
         rates = _rows("gamma_dot", gamma_dot, len(gamma))
-        y = np.zeros((len(self._system.state), len(gamma)))
+        y = np.zeros((len(self.state), len(gamma)))
         y[3] = 1.0
         code = np.full(len(gamma), _NO_START, dtype=np.int64)
         found = kinematics.direct_many(self.geometry, gamma)
@@ -150,6 +152,29 @@ class Batch:
                 code[n] = 0
         return y, code
 
+    def drives(self, torque: ArrayLike, number: int) -> Array:
+        """Return what acts from outside, a column a scenario."""
+        given = np.zeros((max(len(self._system.drive), 1), number))
+        if len(self._system.drive) >= 3:
+            given[:3] = _rows("torque", torque, number).T
+        return given
+
+    def advance(
+        self, first: int, count: int, step: float, *columns: NDArray[Any], threads: int = 0
+    ) -> None:
+        """Go on by `count` steps from step `first`: columns y, given, code, when, error change.
+
+        Threads take whole blocks in turn, without the interpreter's lock.
+        """
+        threads = threads or len(os.sched_getaffinity(0))
+        shares = _shares(-(-columns[0].shape[1] // LANES), threads)
+
+        def run(share: tuple[int, int]) -> None:
+            self._module.batch(step, first, count, *share, *columns)
+
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, shares))
+
     def _said(self, code: int) -> str:
         if code == 0:
             return ""
@@ -157,12 +182,23 @@ class Batch:
             return "no unique admissible assembly"
         return "not finite" if code == NOT_FINITE else self._limits[code - 1].reason
 
-    def _compile(self, method: Tableau) -> ModuleType:
-        size = len(self._system.state)
-        texts = batch_source(self._system.program, self._margins(), method, size)
-        return backend.load_parallel(texts, driver())
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Names of the state's numbers."""
+        return self._system.state
 
-    def _margins(self) -> Program:
+    @property
+    def program(self) -> Program:
+        """Derivative of the state."""
+        return self._system.program
+
+    def _compile(self, method: Tableau) -> ModuleType:
+        text = batch_source(self.program, self.margins, method, len(self.state))
+        nodes = {"NODES": method.c}
+        return backend.load([text], nodes, numba=True, nogil=True)
+
+    @cached_property
+    def margins(self) -> Program:
         """Signs of the limits without an angle: positive inside, for angles less than pi away."""
         model = self._dynamics.model
 
@@ -174,6 +210,12 @@ class Batch:
             )
 
         return trace(signs, (*QUATERNION, *RATE))
+
+
+def _shares(blocks: int, threads: int) -> list[tuple[int, int]]:
+    """First and last + 1 of the blocks of each share of the work; more shares than threads."""
+    size = max(1, -(-blocks // (4 * threads)))
+    return [(first, min(first + size, blocks)) for first in range(0, blocks, size)]
 
 
 def _sign(limit: Limit, at: Any, leg: kernel.Leg) -> Any:

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Source of many scenarios at once: blocks of lanes that a compiler can turn into SIMD.
+"""Source of many scenarios at once: blocks of lanes that a compiler turns into SIMD.
 
-A lane that leaves what its scene allows, or finite numbers, keeps its last valid state and a code;
-the others go on. Lanes do not touch each other, so threads change no bit.
+The operations of a lane are those of a run of its own in the same order. A lane that leaves what
+its scene allows, or finite numbers, keeps its last valid state and a code; the others go on. Lanes
+do not touch each other, so threads change no bit.
 """
 
 from __future__ import annotations
 
+from sst_ros.integration.lanes import Layout, evaluated, indented, loop
+from sst_ros.integration.steps import combination
 from sst_ros.integration.tableaux import Tableau
 from sst_ros.mechanism.trace import Program
 
-LANES = 64
+LANES = 32
 NOT_FINITE = 1000
 
 
-def batch_source(program: Program, margins: Program, tableau: Tableau, size: int) -> list[str]:
-    """Texts of a module whose `batch(h, first, count, y, d, code, when, error)` runs all lanes.
+def batch_source(program: Program, margins: Program, tableau: Tableau, size: int) -> str:
+    """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
 
     Args:
         program: derivative; inputs t, state, drive.
@@ -26,124 +29,116 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
 
     """
     drive = len(program.inputs) - 1 - size
-    return [
-        "@jit\n" + _lanes(program, "rhs", ["t", "state", "drive"], 1, size),
-        "@jit\n" + _lanes(margins, "margins", ["state"], 0, 7),
-        _step(tableau, size),
-        _block(size, drive, len(margins.outputs), len(tableau.b)),
+    stages = len(tableau.b)
+    at = Layout(
+        LANES, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
+        far=len(margins.outputs), code=1, when=1, error=1,
+    )  # fmt: skip
+    given = ["time", *at.rows("s", size), *at.rows("d", drive)]
+    lines = [
+        "def batch(h, first, count, begin, end, y, d, code, when, error):",
+        f"    block = vector({at.numbers})",
+        "    for b in range(begin, end):",
+        f"        lo = b * {LANES}",
+        f"        last = min({LANES}, y.shape[1] - lo) - 1",
+        # Lanes beyond the last repeat it, for all blocks to have the same length.
+        f"        for i in range({LANES}):",
+        "            n = lo + min(i, last)",
+        *(f"            {at.lane('y', j)} = y[{j}, n]" for j in range(size)),
+        *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
+        *(f"            {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")),
+        "        for step in range(first, first + count):",
+        f"            for stage in range({stages}):",
+        *indented(16, _arguments(tableau, size, at)),
+        *indented(16, ["time = step * h + NODES[stage] * h"]),
+        *indented(16, evaluated(program, given, at, "f")),
+        *indented(16, _kept(tableau, size, at)),
+        *indented(12, _results(tableau, size, at)),
+        *indented(12, evaluated(margins, at.rows("new", 7), at, "far")),
+        *indented(12, _judged(size, len(margins.outputs), at)),
+        "        for i in range(last + 1):",
+        *(f"            y[{j}, lo + i] = {at.lane('y', j)}" for j in range(size)),
+        f"            code[lo + i] = int({at.lane('code')})",
+        f"            when[lo + i] = {at.lane('when')}",
+        f"            error[lo + i] = {at.lane('error')}",
     ]
+    return "\n".join(lines) + "\n"
 
 
-def _lanes(program: Program, name: str, arrays: list[str], scalars: int, size: int) -> str:
-    """Wrap a program in a loop over lanes; arrays have one row per number."""
-    lines = program.source("body").splitlines()
-    loads = [f"        {x} = state[{i}, i]" for i, x in enumerate(program.inputs[scalars:][:size])]
-    rest = program.inputs[scalars + size :]
-    loads += [f"        {x} = drive[{i}, i]" for i, x in enumerate(rest)]
-    body = ["    " + line for line in lines[1:-1]]
-    results = lines[-1].strip().removeprefix("return (").removesuffix(",)").split(", ")
-    stores = [f"        out[{i}, i] = {result}" for i, result in enumerate(results)]
-    head = [f"def {name}({', '.join(arrays)}, out, lanes):", "    for i in range(lanes):"]
-    return "\n".join([*head, *loads, *body, *stores]) + "\n"
+def _arguments(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    """Where a stage evaluates the derivative, all numbers of the state in one loop."""
+    lines = []
+    for stage, row in enumerate(tableau.a):
+        total = combination(row, lambda m: at.lane("k", m * size, "x"))
+        value = f"{at.lane('y', 0, 'x')} + h * ({total})" if stage else at.lane("y", 0, "x")
+        lines += [
+            f"{'elif' if stage else 'if'} stage == {stage}:",
+            f"    for x in range({size * LANES}):",
+            f"        {at.lane('s', 0, 'x')} = {value}",
+        ]
+    return lines
 
 
-def _step(tableau: Tableau, size: int) -> str:
-    """One step of all lanes: k holds the stages, s the arguments, new and e the results.
-
-    There is one call of `rhs` in the text; twelve would be compiled twelve times.
-    """
-    count = len(tableau.b)
-    padded = [(*row, *(0.0,) * (count - len(row))) for row in tableau.a]
-    return f"""\
-A = np.array({padded!r})
-C = np.array({tableau.c!r})
-B = np.array({tableau.b!r})
-FINE = np.array({tableau.error or (0.0,) * count!r})
-COARSE = np.array({tableau.damping or (0.0,) * count!r})
-
-@jit
-def step(t, h, y, d, k, s, new, e, lanes):
-    for stage in range({count}):
-        for j in range({size}):
-            for i in range(lanes):
-                s[j, i] = 0.0
-            for m in range(stage):
-                weight = A[stage, m]
-                if weight != 0.0:
-                    for i in range(lanes):
-                        s[j, i] += weight * k[m, j, i]
-            for i in range(lanes):
-                s[j, i] = y[j, i] + h * s[j, i]
-        rhs(t + C[stage] * h, s, d, k[stage], lanes)
-    for j in range({size}):
-        for i in range(lanes):
-            total = fine = coarse = 0.0
-            for m in range({count}):
-                total += B[m] * k[m, j, i]
-                fine += FINE[m] * k[m, j, i]
-                coarse += COARSE[m] * k[m, j, i]
-            new[j, i] = y[j, i] + h * total
-            if {bool(tableau.damping)}:
-                fine *= abs(fine) / sqrt(fine * fine + 0.01 * (coarse * coarse) + 1e-300)
-            e[j, i] = h * fine
-"""
+def _kept(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    lines = []
+    for stage in range(len(tableau.b)):
+        lines += [
+            f"{'elif' if stage else 'if'} stage == {stage}:",
+            f"    for x in range({size * LANES}):",
+            f"        {at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}",
+        ]
+    return lines
 
 
-def _block(size: int, drive: int, margin_count: int, stages: int) -> str:
-    return f"""\
-@jit
-def block(h, first, count, y, d, code, when, error, lanes):
-    k = np.empty(({stages}, {size}, {LANES}))
-    s = np.empty(({size}, {LANES}))
-    new = np.empty(({size}, {LANES}))
-    e = np.empty(({size}, {LANES}))
-    far = np.empty(({margin_count}, {LANES}))
-    for n in range(count):
-        step((first + n) * h, h, y, d, k, s, new, e, lanes)
-        for i in range(lanes):
-            x0, x1, x2, x3 = new[0, i], new[1, i], new[2, i], new[3, i]
-            scale = 1.0 / sqrt(x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3)
-            new[0, i] = x0 * scale
-            new[1, i] = x1 * scale
-            new[2, i] = x2 * scale
-            new[3, i] = x3 * scale
-        margins(new, far, lanes)
-        for i in range(lanes):
-            if code[i] != 0:
-                continue
-            found = 0
-            total = 0.0
-            for j in range({size}):
-                total += new[j, i]
-            if not total - total == 0.0:
-                found = {NOT_FINITE}
-            else:
-                for j in range({margin_count}):
-                    if far[j, i] < 0.0 and found == 0:
-                        found = j + 1
-            if found != 0:
-                code[i] = found
-                when[i] = (first + n + 1) * h
-                continue
-            for j in range({size}):
-                y[j, i] = new[j, i]
-                error[i] = max(error[i], abs(e[j, i])) if j < 4 else error[i]
-"""
+def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    """Write the new state, with a quaternion of length 1, and errors of the quaternion."""
+
+    def total(weights: tuple[float, ...]) -> str:
+        return combination(weights, lambda m: at.lane("k", m * size, "x"))
+
+    lines = [
+        f"for x in range({size * LANES}):",
+        f"    {at.lane('new', 0, 'x')} = {at.lane('y', 0, 'x')} + h * ({total(tableau.b)})",
+        f"for x in range({4 * LANES}):",
+    ]
+    if tableau.damping:
+        lines += [
+            f"    fine = {total(tableau.error)}",
+            f"    coarse = {total(tableau.damping)}",
+            "    both = fine * fine + 0.01 * (coarse * coarse) + 1e-300",
+            f"    {at.lane('e', 0, 'x')} = h * fine * abs(fine) / sqrt(both)",
+        ]
+    else:
+        lines += [f"    {at.lane('e', 0, 'x')} = h * ({total(tableau.error) or '0.0'})"]
+    parts = at.rows("new", 4)
+    squares = " + ".join(f"{part} * {part}" for part in parts)
+    scaled = [f"{part} = {part} * factor" for part in parts]
+    return [*lines, *loop(at, [f"factor = 1.0 / sqrt({squares})", *scaled])]
 
 
-def driver() -> str:
-    """Source of the loop over blocks, for all cores."""
-    return f"""\
-def batch(h, first, count, y, d, code, when, error):
-    blocks = (y.shape[1] + {LANES - 1}) // {LANES}
-    for b in prange(blocks):
-        lo = b * {LANES}
-        hi = min(lo + {LANES}, y.shape[1])
-        lanes = hi - lo
-        part = np.empty((y.shape[0], {LANES}))
-        given = np.empty((d.shape[0], {LANES}))
-        part[:, :lanes] = y[:, lo:hi]
-        given[:, :lanes] = d[:, lo:hi]
-        block(h, first, count, part, given, code[lo:hi], when[lo:hi], error[lo:hi], lanes)
-        y[:, lo:hi] = part[:, :lanes]
-"""
+def _judged(size: int, margins: int, at: Layout) -> list[str]:
+    """Take over the new state where it is valid; otherwise note why and when not."""
+    inside = ["found = 0.0"]
+    for j in reversed(range(margins)):
+        inside += [f"far = {at.lane('far', j)}", f"found = {j + 1}.0 if far < 0.0 else found"]
+    inside += [
+        f"total = {' + '.join(at.lane('new', j) for j in range(size))}",
+        f"found = found if total - total == 0.0 else {NOT_FINITE}.0",
+        f"before = {at.lane('code')}",
+        f"since = {at.lane('when')}",
+        "now = before if before != 0.0 else found",
+        f"{at.lane('code')} = now",
+        f"{at.lane('when')} = since if before == now else ends",
+        f"least = {at.lane('error')}",
+        "worst = least",
+    ]
+    for j in range(4):
+        inside += [f"here = abs({at.lane('e', j)})", "worst = here if here > worst else worst"]
+    inside += [f"{at.lane('error')} = worst if now == 0.0 else least"]
+    for j in range(size):
+        inside += [
+            f"old = {at.lane('y', j)}",
+            f"new = {at.lane('new', j)}",
+            f"{at.lane('y', j)} = new if now == 0.0 else old",
+        ]
+    return ["ends = (step + 1) * h", *loop(at, inside)]

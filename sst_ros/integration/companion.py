@@ -34,10 +34,10 @@ def errors(y: Vector, z: Vector, order: int, legs: int) -> tuple[float, float]:
     return first, second
 
 
-def rescaled(y: Vector, z: Vector, order: int, new: int) -> Vector:
+def rescaled(y: Vector, z: Vector, order: int, new: int) -> list[float]:
     """Move the companion so that under a method of order `new` it stands for the same error."""
     if order == new:
-        return z
+        return z if isinstance(z, list) else list(z)
     grow = (2.0**new - 1.0) / (2.0**order - 1.0)
     return [a + grow * (b - a) for a, b in zip(y, z, strict=True)]
 

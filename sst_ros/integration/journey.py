@@ -8,13 +8,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sst_ros.errors import ImpactsAccumulate
-from sst_ros.integration import companion
+from sst_ros.integration import companion, loops
 from sst_ros.integration.events import first_met
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import METHODS, Rosenbrock
-from sst_ros.integration.touches import just_beyond, may_touch, touches_of
+from sst_ros.integration.touches import BESIDE, just_beyond, may_touch, touches_of
 from sst_ros.integration.walk import CannotStep, Change, Leg, Mark, Walk
-from sst_ros.limits import Limit, all_far, limits_of, ranges_of
+from sst_ros.limits import Limit, limits_of, ranges_of
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.compiled import compiled as plain
 from sst_ros.mechanism.contacts import RigidEnds
@@ -58,10 +58,12 @@ class Journey:
         self._system = System(dynamics, work=True)
         self._limits = tuple(limits_of(scene, geometry))
         self._kinks = tuple(touches_of(scene, geometry))
-        self._ranges = ranges_of(self._limits)
+        self._ranges = ranges_of([*self._limits, *map(_clear_of, filter(_is_inner, self._kinks))])
         self._ends = RigidEnds(dynamics)
         self._limit = scene.actuators.torque_limit if scene.actuators else None
-        self._walk = Walk(self._system, integrator, tolerance, compiled=compiled)
+        self._walk = Walk(
+            self._system, integrator, tolerance, compiled=compiled, ranges=self._ranges
+        )
         explicit = integrator if not isinstance(METHODS.get(integrator), Rosenbrock) else "auto"
         # Torques that are functions, and ends that hold: the slope is put together in Python.
         self._slow = Walk(self._system, explicit, tolerance, compiled=False, slope=self._slope)
@@ -105,8 +107,12 @@ class Journey:
         """Clamp torques to the limit of the actuators."""
         if self._limit is None:
             return torque
-        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in torque)
-        return (first, second, third)
+        limit, (first, second, third) = self._limit, torque
+        return (
+            min(max(first, -limit), limit),
+            min(max(second, -limit), limit),
+            min(max(third, -limit), limit),
+        )
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
@@ -115,6 +121,23 @@ class Journey:
     def work(self, at: Point) -> float:
         """Work done on the manipulator, less what friction and impacts have taken [J]."""
         return at.y[-1] - self._lost
+
+    def glide(
+        self, at: Point, h: float, count: int, torque: Torque, more: tuple[float, ...]
+    ) -> tuple[Point, int]:
+        """Do what `travel` does for up to `count` periods of h [s], as long as that is only steps.
+
+        Returns where the last period ended that was done, and how many were.
+        """
+        if self._resting or callable(torque):
+            return at, 0
+        book, drive = self._mark(), (*self.limited(torque), *more)
+        done, (y, z, joints) = self._walk.glide(h, count, (at.y, at.z, at.joints), drive, at.order)
+        if done == 0:
+            return at, 0
+        self._book = book
+        self._legs += done
+        return Point(y, z, joints, self._walk.method.order), done
 
     def travel(
         self,
@@ -177,7 +200,7 @@ class Journey:
         for leg in walk.legs(x, h, at.y, at.z, drive, at.order):
             self._legs += 1
             joints = self._dynamics.joints(*leg.y[:7])
-            if not self._kinks and all_far(self._ranges, at.joints, joints):
+            if loops.all_far(self._ranges, at.joints, joints):  # type: ignore[no-untyped-call]
                 at = Point(leg.y, leg.z, joints, leg.order)
                 continue
             near = [
@@ -247,3 +270,13 @@ class Journey:
     def _kinetic(self, y: list[float]) -> float:
         size = len(self._dynamics.state)
         return self._dynamics.energies(*y[:size], *(0.0,) * len(self._dynamics.drive))[0]
+
+
+def _is_inner(kink: Limit) -> bool:
+    """Whether an elastic end is met by going through this kink."""
+    return (kink.end == 0.0) == (kink.sign > 0.0)
+
+
+def _clear_of(kink: Limit) -> Limit:
+    """Return a limit before which the kink is surely not touched."""
+    return kink._replace(end=kink.end + 4.0 * BESIDE * kink.sign)

@@ -17,11 +17,11 @@ def pair(t, h, y, z, d, new_y, new_z, error):
     """
     middle = vector(SIZE)
     other = vector(SIZE)
-    attempt(t, 0.5 * h, y, d, middle, error)
+    attempt(t, 0.5 * h, y, y, d, middle, error)
     first = size_of(error, y, middle, h)
-    attempt(t + 0.5 * h, 0.5 * h, middle, d, new_y, error)
+    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, new_y, error)
     second = size_of(error, middle, new_y, h)
-    attempt(t, h, z, d, new_z, other)
+    attempt(t, h, z, y, d, new_z, other)
     # In proportion, so that it counts only where the longer step is unstable.
     companion = size_of(other, z, new_z, h) * SHARE
     normalise(new_y)
@@ -67,20 +67,60 @@ def march(t, h, count, y, d, new_y):
     for i in range(SIZE):
         new_y[i] = y[i]
     for k in range(count):
-        attempt(t + k * h, h, new_y, d, new_y, error)
+        attempt(t + k * h, h, new_y, new_y, d, new_y, error)
         normalise(new_y)
 
 
-def attempt_linearly_implicit(t, h, y, d, new_y, error):
+def glide(count, h, tolerance, y, z, d, ranges, joints, sizes):
+    """Go on by up to `count` periods of h, a pair of steps each; return how many were done.
+
+    Stops before a period that asks for more than that: one whose error is beyond the tolerance, or
+    in which a limit may be met. y, z and joints (nine angles, nine rates) become those at the end
+    of the last period that was done; sizes[k] is the local error estimate of period k.
+    """
+    new_y = vector(SIZE)
+    new_z = vector(SIZE)
+    error = vector(SIZE)
+    found = vector(18)
+    for k in range(count):
+        size = pair(0.0, h, y, z, d, new_y, new_z, error)
+        if not size <= tolerance:
+            return k
+        joints_of(new_y, found)
+        if not all_far(ranges, joints, found):
+            return k
+        for i in range(SIZE):
+            y[i] = new_y[i]
+            z[i] = new_z[i]
+        for i in range(18):
+            joints[i] = found[i]
+        sizes[k] = size
+    return count
+
+
+def all_far(ranges, begin, end):
+    """Say quickly that no limit may have been crossed: inside at both ends, no rate turned."""
+    for row in ranges:
+        joint = int(row[0])
+        if not (row[1] < begin[joint] < row[2] and row[1] <= end[joint] <= row[2]):
+            return False
+        if begin[joint + 9] * end[joint + 9] < 0.0:
+            return False
+    return True
+
+
+def attempt_linearly_implicit(t, h, y, near, d, new_y, error):
     """One step of RODAS4 (Hairer & Wanner, Solving ODEs II, section VI.4), exact Jacobian.
 
-    Order 4, L-stable, stiffly accurate; the error estimate is of order 3.
+    Order 4, L-stable, stiffly accurate; the error estimate is of order 3. The Jacobian is that at
+    `near`: y itself, or for a companion the run, from which it is as far as its error. Beside a
+    kink of a force the two may stand on different sides, and the step is that of the run's.
     """
     matrix = square(SIZE)
     slope = vector(SIZE)
     by_time = vector(SIZE)
     pivot = vector(SIZE)
-    linearise(t, y, d, slope, by_time, matrix)
+    linearise(t, near, d, slope, by_time, matrix)
     for i in range(SIZE):
         for j in range(SIZE):
             matrix[i][j] = -matrix[i][j]
@@ -95,8 +135,7 @@ def attempt_linearly_implicit(t, h, y, d, new_y, error):
         for j in range(stage):
             for i in range(SIZE):
                 at[i] += RODAS_A[stage][j] * u[j][i]
-        if stage:
-            evaluate(t + RODAS_ALPHA[stage] * h, at, d, slope)
+        evaluate(t + RODAS_ALPHA[stage] * h, at, d, slope)
         for i in range(SIZE):
             right[i] = slope[i] + h * RODAS_D[stage] * by_time[i]
             for j in range(stage):

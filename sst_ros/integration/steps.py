@@ -8,7 +8,7 @@ of the state, zero where the method has none: its steps are as long as they are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sst_ros.integration.tableaux import Tableau
 
@@ -41,9 +41,14 @@ def explicit_step(tableau: Tableau, size: int, drive: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _combination(weights: Sequence[float], j: int) -> str:
-    terms = [f"{w!r} * k{i}_{j}" for i, w in enumerate(weights) if w]
+def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
+    """Sum of weights times words, without the zeros; "" where there is nothing else."""
+    terms = [f"{w!r} * {word(i)}" for i, w in enumerate(weights) if w]
     return " + ".join(terms).replace("+ -", "- ")
+
+
+def _combination(weights: Sequence[float], j: int) -> str:
+    return combination(weights, lambda i: f"k{i}_{j}")
 
 
 def _names(letter: str, count: int) -> list[str]:

@@ -49,6 +49,11 @@ class System:
         return with_jacobian(self._derivative, self._inputs, ("t", *self.state))
 
     @property
+    def joints(self) -> Program:
+        """Nine angles and nine rates, of quaternion and body rate."""
+        return self._dynamics.joints_program
+
+    @property
     def _inputs(self) -> tuple[str, ...]:
         return ("t", *self.state, *self.drive)
 

@@ -10,7 +10,7 @@ from sst_ros.limits import Limit
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene import Scene
 
-_BESIDE = 1e-9
+BESIDE = 1e-9
 """Farther beyond than this [rad], an actuator has not just come to the kink."""
 
 
@@ -26,7 +26,7 @@ def touches_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
 def may_touch(kink: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
     """Cheap test before a search: it goes through, or in and back, and does not start there."""
     if kink.margin(begin) <= GRAZING and not (
-        kink.margin(begin) > -_BESIDE and kink.slope(begin) > 0.0
+        kink.margin(begin) > -BESIDE and kink.slope(begin) > 0.0
     ):
         return False
     return kink.margin(end) < 0.0 or kink.slope(begin) < 0.0 < kink.slope(end)

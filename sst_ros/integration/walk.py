@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros.integration import companion
-from sst_ros.integration.machine import Machine, Method, Slope, Vector
+from sst_ros.integration.machine import Machine, Method, Ranges, Slope, Stretch, Vector
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
 
@@ -56,6 +56,7 @@ class Walk:
             relative to its length.
         compiled: by numba.
         slope: see `Machine`; with it only explicit methods are used.
+        ranges: see `Machine`.
 
     Attributes:
         history: changes of method.
@@ -71,6 +72,7 @@ class Walk:
         *,
         compiled: bool,
         slope: Slope | None = None,
+        ranges: Ranges = (),
     ) -> None:
         self.tolerance = tolerance
         self.history: list[Change] = []
@@ -78,6 +80,7 @@ class Walk:
         self._auto = method == "auto"
         self._compiled = compiled
         self._slope = slope
+        self._ranges = ranges
         self._machines: dict[str, Machine] = {}
         self._machine = self._machine_of(DORMAND_PRINCE if self._auto else METHODS[method])
         self._h = float("inf")
@@ -131,6 +134,29 @@ class Walk:
                 return
             t, y, z = t + h, new_y, new_z
         raise CannotStep(f"{STEP_BUDGET} steps do not reach the end of the period")
+
+    def glide(
+        self, h: float, count: int, at: Stretch, d: Vector, order: int
+    ) -> tuple[int, Stretch]:
+        """Do what `legs` does for up to `count` periods of h, as long as a leg each is enough.
+
+        Returns how many were done, and where the last one ended: the next may need several legs or
+        another method, or leave `ranges`. The bits are those of `legs`.
+        """
+        if self._h < h or self._slope is not None:
+            return 0, at
+        implicit = isinstance(self.method, Rosenbrock)
+        if implicit and self._auto:
+            count = min(count, _LOOK_EVERY - 1 - self._since_look)
+        if order != self.method.order:
+            at = (at[0], companion.rescaled(at[0], at[1], order, self.method.order), at[2])
+        done, end = self._machine.glide(h, count, self.tolerance, at, d)
+        if self._h < _GROW * h:
+            for size in self._machine.sizes[:done]:
+                self._h = max(self._h, h * self._factor(float(size) / self.tolerance))
+        if implicit:
+            self._since_look += done
+        return done, end
 
     def retake(
         self, start: float, x: float, y: Vector, z: Vector, d: Vector, order: int
@@ -190,6 +216,10 @@ class Walk:
     def _machine_of(self, method: Method) -> Machine:
         if method.name not in self._machines:
             self._machines[method.name] = Machine(
-                self._system, method, compiled=self._compiled, slope=self._slope
+                self._system,
+                method,
+                compiled=self._compiled,
+                slope=self._slope,
+                ranges=self._ranges,
             )
         return self._machines[method.name]

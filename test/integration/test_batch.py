@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import numba
 import numpy as np
 import pytest
 
@@ -7,6 +6,11 @@ from sst_ros import Simulation, load_scene
 from sst_ros.control.torque import sine
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
+from sst_ros.integration.blocks import LANES
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE
+from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.scene import Initial
 
 EXAMPLE2 = load_scene("example2")
@@ -29,7 +33,7 @@ def gamma():
 
 @pytest.fixture(scope="module")
 def result(batch, gamma):
-    return batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100, keep_every=25)
+    return batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100, keep_every=25, threads=3)
 
 
 def single(gamma):
@@ -66,13 +70,26 @@ def test_faults_stay_with_their_scenario(result):
 
 
 def test_threads_change_no_bit(batch, gamma, result):
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    again = batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100)
-    numba.set_num_threads(threads)
+    again = batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100, threads=1)
     assert np.array_equal(again.quaternion, result.quaternion)
     assert np.array_equal(again.body_rate, result.body_rate)
     assert again.fault == result.fault
+
+
+@pytest.mark.parametrize("method", [DORMAND_PRINCE, DOP853])
+def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
+    """SIMD, blocks and slices of time change none: the same operations in the same order."""
+    if method is not DOP853:
+        batch = Batch(EXAMPLE2, method, profile=True)
+    inside = gamma[8 : 8 + LANES + 5]
+    found = batch.run(inside, (0.0, 0.0, 0.0), step=2e-3, count=60)
+    free = ~np.isfinite(found.fault_time)
+    assert free.sum() > LANES
+    start, _ = batch.start(inside, (0.0, 0.0, 0.0))
+    machine = Machine(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), method, compiled=False)
+    for n in np.flatnonzero(free):
+        alone = machine.march(0.0, 2e-3, 60, start[:, n].tolist(), [])
+        assert alone == [*found.quaternion[n], *found.body_rate[n]]
 
 
 def test_trajectories_are_kept_when_asked_for(result, gamma):

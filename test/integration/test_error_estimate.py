@@ -56,7 +56,8 @@ def slowly(*values):
     [
         *((name, "auto") for name in SPANS),
         *(slowly(name, "dop853") for name in ("friction", "fast_spin", "elastic_stops", "impacts")),
-        *(slowly(name, "rodas4") for name in ("friction", "elastic_stops", "impacts", "general")),
+        ("elastic_stops", "rodas4"),
+        *(slowly(name, "rodas4") for name in ("friction", "impacts", "general")),
     ],
 )
 def test_the_estimate_is_within_ten_times_of_the_true_error(name, method, tolerance):
@@ -66,7 +67,7 @@ def test_the_estimate_is_within_ten_times_of_the_true_error(name, method, tolera
     for estimate, error, its_own in zip(estimates, apart(simulation, truth), own, strict=True):
         unsure = max(ROUNDING, 20.0 * its_own)
         assert estimate > 0.1 * error - unsure
-        assert estimate < 12.0 * error + unsure
+        assert estimate < 10.0 * error + unsure
 
 
 @pytest.mark.parametrize("name", ["elastic_stops", "impacts"])

@@ -60,7 +60,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
     attempt = names["attempt_linearly_implicit"]
     y, new, error = [y0], [0.0], [0.0]
     for k in range(count):
-        attempt(k * h, h, y, (), new, error)
+        attempt(k * h, h, y, y, (), new, error)
         y[0] = new[0]
     return y[0], error[0]
 

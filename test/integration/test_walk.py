@@ -43,7 +43,7 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     simulation = Simulation(viscous(coefficient), tolerance=1e-10)
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas4"
-    fastest = np.abs(simulation._journey._walk.spectrum(0.0, simulation._point.y, REST)).max()
+    fastest = np.abs(simulation._journey._walk.spectrum(0.0, simulation._now.point.y, REST)).max()
     explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
     assert explicit > 0.6 * coefficient
     assert pairs["rodas4"] < min(350, explicit / 2)

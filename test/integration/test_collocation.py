@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gauss collocation against the theory of its tables, and motions against SciPy's DOP853."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from loaded_scenes import loaded
+from scipy.integrate import solve_ivp
+
+from sst_ros.control.torque import sine
+from sst_ros.integration.collocation import Collocation, tables
+from sst_ros.integration.system import System
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.scene import load
+from sst_ros.simulation import Simulation
+
+EXAMPLE2 = load("example2")
+START = Simulation(EXAMPLE2).state
+STATE = [*START.quaternion, *START.body_rate]
+
+
+@pytest.mark.parametrize("nodes", [2, 4, 8])
+def test_tables_integrate_and_continue_all_polynomials_that_they_can(nodes):
+    rows = tables(nodes)
+    c, b, a, later = rows[0], rows[1], rows[2 : 2 + nodes].T, rows[2 + nodes :].T
+    for power in range(2 * nodes):
+        assert b @ c**power == pytest.approx(1.0 / (power + 1), abs=1e-14)
+    for power in range(nodes):
+        np.testing.assert_allclose(a @ c**power, c ** (power + 1) / (power + 1), atol=1e-14)
+        # Continued over a step, rounding grows with the numbers: up to 2^power, and the basis.
+        np.testing.assert_allclose(later @ c**power, (1.0 + c) ** power, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    model, torque = kernel.model_of(EXAMPLE2), sine(EXAMPLE2.torque)
+    found = solve_ivp(
+        lambda t, y: kernel.derivative(model, tuple(y), torque(t)),
+        (0.0, 1.0),
+        STATE,
+        method="DOP853",
+        rtol=2.3e-14,
+        atol=1e-15,
+    )
+    return found.y[:, -1]
+
+
+def apart(y, truth):
+    return 2.0 * min(math.dist(y[:4], truth[:4]), math.dist(y[:4], -truth[:4]))
+
+
+@pytest.mark.parametrize(
+    ("steps", "iterations", "error"), [(6, 3, 1e-6), (7, 5, 1e-9), (9, 6, 1e-12)]
+)
+def test_a_second_of_example_2_in_a_few_steps(truth, steps, iterations, error):
+    system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
+    method = Collocation(system, compiled=False)
+    flight = method.march(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
+    assert apart(flight.y, truth) < error
+    assert math.dist(flight.y[4:], truth[4:]) < 10.0 * error
+    assert math.hypot(*flight.y[:4]) == pytest.approx(1.0, abs=1e-15)
+    assert flight.change > apart(flight.y, truth)
+
+
+@pytest.mark.parametrize(("nodes", "steps"), [(2, 128), (3, 48), (4, 24)])
+def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
+    """Iterated to the end. Eight nodes come to rounding before their limit."""
+    method = Collocation(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
+    coarse, fine = (
+        apart(method.march(0.0, 1.0 / n, n, STATE, iterations=20).y, truth)
+        for n in (steps, 2 * steps)
+    )
+    assert fine > 1e-12
+    assert math.log2(coarse / fine) == pytest.approx(2 * nodes, abs=0.1)
+
+
+def test_numba_has_the_digits_of_plain_python(tmp_path, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
+    compiled, plain = (Collocation(system, compiled=c) for c in (True, False))
+    one, other = (m.march(0.1, 0.1, 5, STATE, iterations=4) for m in (compiled, plain))
+    np.testing.assert_allclose(one.y, other.y, rtol=0, atol=1e-14)
+
+
+def test_every_term_lag_and_a_drive_are_carried_along():
+    """Against many steps of a method that is tested by itself."""
+    from sst_ros.integration.machine import Machine
+    from sst_ros.integration.tableaux import DOP853
+
+    scene = loaded()
+    system = System(Dynamics(scene), work=True)
+    state = Simulation(scene).state
+    y = [*state.quaternion, *state.body_rate, *(0.0,) * (len(system.state) - 7)]
+    drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]
+    wanted = Machine(system, DOP853, compiled=False).march(0.0, 2.5e-4, 80, y, drive)
+    method = Collocation(system, compiled=False)
+    found = method.march(0.0, 2e-3, 10, y, drive, iterations=9).y
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)

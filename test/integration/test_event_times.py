@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When events happen, against times that our integrators did not make.
+
+A star without inertia of its legs, and alike about all axes, turns at a constant rate about a fixed
+axis: then every event is a root of A cos(rate t) + B sin(rate t) + C. Impacts are held against the
+paper's equations under SciPy; elastic contact against the half period of a mass on a spring.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loaded_scenes import REST, apart
+from models import inertia_of
+from scipy.integrate import solve_ivp
+
+from sst_ros.control.torque import sine
+from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
+from sst_ros.integration.journey import Journey
+from sst_ros.limits import SINGULAR_MU
+from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
+from sst_ros.simulation import Simulation
+
+EXAMPLE2 = load("example2")
+NOTHING = Link(inertia=inertia_of(1e-30 * np.eye(3)))
+FREE_STAR = replace(
+    EXAMPLE2,
+    star=replace(EXAMPLE2.star, inertia=inertia_of(0.3 * np.eye(3))),
+    actuated_links=(NOTHING,) * 3,
+    intermediate_links=(NOTHING,) * 3,
+    stroke=Stroke(at_end="ignore"),
+    workspace=Workspace(at_edge="ignore"),
+    torque=None,
+)
+GAMMA = (0.7, 0.8, 0.75)
+RATE = 3.0
+MILLISECOND = 1_000_000
+
+
+def turning(scene, axis):
+    """Simulation whose star turns about a fixed axis in {B} at RATE."""
+    start = Simulation(replace(scene, initial=Initial(gamma=GAMMA))).state
+    rotation = rotation_matrix(start.quaternion)
+    at = virtual_work.posture(Geometry.of(scene), start.joints.gamma, rotation)
+    gamma_dot = np.linalg.solve(at.j, RATE * axis)
+    moving = Initial(gamma=GAMMA, gamma_dot=tuple(gamma_dot))
+    return Simulation(replace(scene, initial=moving), "dop853", tolerance=1e-13), at
+
+
+def first_root(axis, moving, fixed):
+    """When a vector that turns about `axis` at RATE is first at right angles to a fixed one."""
+    along = (axis @ moving) * (axis @ fixed)
+    a, b = moving @ fixed - along, np.cross(axis, moving) @ fixed
+    base, spread = math.atan2(b, a), math.acos(-along / math.hypot(a, b))
+    turns = [(base + sign * spread) % (2.0 * math.pi) for sign in (1.0, -1.0)]
+    return min(turns) / RATE
+
+
+def met(simulation, error):
+    with pytest.raises(error) as caught:
+        for _ in range(3000):
+            simulation.step(REST, MILLISECOND)
+    return caught.value
+
+
+@pytest.mark.parametrize("leg", [0, 1, 2])
+def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
+    """The star turns t_k straight into w_k, at a constant rate."""
+    at = virtual_work.posture(Geometry.of(EXAMPLE2), *admissible())
+    axis = np.cross(at.t[leg], at.w[leg])
+    size = np.linalg.norm(axis)
+    mu = math.atan2(size, at.t[leg] @ at.w[leg])
+    simulation, _ = turning(FREE_STAR, axis / size)
+    stop = met(simulation, SingularityReached)
+    assert stop.reason == f"serial singularity, mu_{leg + 1} = 0"
+    assert abs(stop.time - (mu - SINGULAR_MU) / RATE) < 1e-12
+
+
+@pytest.mark.parametrize("leg", [0, 1, 2])
+def test_the_edge_of_the_workspace_is_met_when_e_lies_in_the_plane_of_an_arc(leg):
+    at = virtual_work.posture(Geometry.of(EXAMPLE2), *admissible())
+    s = at.rotation[:, 2]
+    axis = np.cross(s, -at.w[leg])
+    axis /= np.linalg.norm(axis)
+    simulation, _ = turning(replace(FREE_STAR, workspace=EXAMPLE2.workspace), axis)
+    stop = met(simulation, WorkspaceLeft)
+    assert stop.reason.startswith(f"beta_{leg + 1}")
+    assert abs(stop.time - first_root(axis, s, at.w[leg])) < 1e-12
+
+
+@pytest.mark.parametrize("upper", [False, True])
+def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper):
+    """gamma_k has a value where t_k is at right angles to r_k there."""
+    geometry = Geometry.of(EXAMPLE2)
+    at = virtual_work.posture(geometry, *admissible())
+    axis = at.rotation[:, 2] * (1.0 if upper else -1.0)
+    simulation, _ = turning(replace(FREE_STAR, stroke=Stroke()), axis)
+    stop = met(simulation, StrokeExceeded)
+    k = int(stop.reason.removeprefix("gamma_")[0]) - 1
+    ends = kinematics.carriage_directions(geometry, geometry.arc if upper else np.zeros(3))
+    times = [first_root(axis, at.t[j], ends[j]) for j in range(3)]
+    assert abs(stop.time - times[k]) < 1e-12
+    assert times[k] == min(times)
+
+
+def admissible():
+    state = Simulation(replace(EXAMPLE2, initial=Initial(gamma=GAMMA))).state
+    return np.array(state.joints.gamma), rotation_matrix(state.quaternion)
+
+
+class PaperForm:
+    """The paper's equations on (q, gamma_dot) under SciPy at its tightest."""
+
+    def __init__(self, scene):
+        self.geometry, self.torque = Geometry.of(scene), sine(scene.torque)
+        self.mechanism = virtual_work.Mechanism.of(scene)
+        state = Simulation(scene).state
+        self.start = np.array([*state.quaternion, *state.joints.gamma_dot])
+
+    def posture(self, y):
+        rotation = rotation_matrix(y[:4] / np.linalg.norm(y[:4]))
+        gamma = kinematics.inverse(self.geometry, rotation)[0]
+        return virtual_work.posture(self.geometry, gamma, rotation)
+
+    def slope(self, t, y):
+        at = self.posture(y)
+        answer = virtual_work.direct_dynamics(self.mechanism, at, y[4:], self.torque(t))
+        spin = at.j @ y[4:]
+        vector, scalar = y[:3], y[3]
+        turning = [*(scalar * spin + np.cross(spin, vector)), -spin @ vector]
+        return np.concatenate([0.5 * np.array(turning), answer])
+
+    def inertia(self, y):
+        """M = -T1 of the paper."""
+        return -virtual_work.equation_of_motion(self.mechanism, self.posture(y), y[4:])[0]
+
+    def travelled(self, begin, end, y):
+        found = solve_ivp(self.slope, (begin, end), y, method="DOP853", rtol=2.3e-14, atol=1e-14)
+        return found.t, found.y
+
+    def first_end(self, begin, y, span):
+        """Time, leg and state of the first end that is met: Newton's method by whole solutions."""
+        times, states = self.travelled(begin, begin + span, y)
+        for i in range(1, len(times)):
+            gamma = self.posture(states[:, i]).gamma
+            outside = np.flatnonzero((gamma < 0.0) | (gamma > self.geometry.arc))
+            if len(outside):
+                leg = int(outside[0])
+                end = 0.0 if gamma[leg] < 0.0 else self.geometry.arc[leg]
+                t, at = times[i], states[:, i]
+                for _ in range(4):
+                    t -= (self.posture(at).gamma[leg] - end) / at[4 + leg]
+                    at = self.travelled(times[i - 1], t, states[:, i - 1])[1][:, -1]
+                return t, leg, at
+        raise AssertionError("no end is met")
+
+
+def test_impacts_come_when_the_papers_equations_have_them(monkeypatch):
+    scene = load("impacts")
+    struck, strike = [], Journey._strike
+
+    def recorded(self, at, limit, x, drive):
+        struck.append((self._walk.origin + x, limit.leg))
+        return strike(self, at, limit, x, drive)
+
+    monkeypatch.setattr(Journey, "_strike", recorded)
+    simulation = Simulation(scene, "dop853", tolerance=1e-14)
+    while len(struck) < 2:
+        simulation.step(sine(scene.torque), 10 * MILLISECOND)
+    paper, t, y = PaperForm(scene), 0.0, None
+    for time, leg in struck:
+        t, hit, y = paper.first_end(t, paper.start if y is None else y, 1.0)
+        assert hit == leg
+        assert abs(time - t) < 1e-12
+        impulse = np.linalg.solve(paper.inertia(y), np.eye(3)[leg])
+        y[4:] -= (1.0 + scene.stroke.restitution) * y[4 + leg] / impulse[leg] * impulse
+
+
+def contact_time(stiffness):
+    """How long gamma_1 is beyond its end, by nanoseconds, and the mass that it meets."""
+    scene = replace(
+        EXAMPLE2,
+        torque=None,
+        stroke=Stroke(at_end="elastic", stiffness=stiffness),
+        workspace=Workspace(at_edge="ignore"),
+        initial=Initial(gamma=(0.02, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0)),
+    )
+    simulation = Simulation(scene, "dop853", tolerance=1e-12)
+    period, times, mass = max(1000, round(5e8 / math.sqrt(stiffness))), [], 0.0
+    inside = True
+    while len(times) < 2:
+        before = simulation.state.time_ns
+        simulation.step(REST, period)
+        if (simulation.state.joints.gamma[0] > 0.0) == inside:
+            continue
+        low, high = before, simulation.state.time_ns
+        while high - low > 1:
+            middle = (low + high) // 2
+            if (simulation.within(middle).joints.gamma[0] > 0.0) == inside:
+                low = middle
+            else:
+                high = middle
+        if inside:
+            touch = simulation.within(high)
+            rotation = rotation_matrix(touch.quaternion)
+            at = virtual_work.posture(simulation.geometry, touch.joints.gamma, rotation)
+            mechanism = virtual_work.Mechanism.of(scene)
+            inertia = -virtual_work.equation_of_motion(mechanism, at, touch.joints.gamma_dot)[0]
+            mass = 1.0 / np.linalg.inv(inertia)[0, 0]
+        times.append(high * 1e-9)
+        inside = not inside
+    return times[1] - times[0], mass
+
+
+def test_an_elastic_contact_lasts_half_a_period_of_its_mass_on_the_spring():
+    """The stiffer, the more so: what else acts meanwhile shrinks with the time there is for it."""
+    off = []
+    for stiffness in (1e4, 1e6, 1e8):
+        lasted, mass = contact_time(stiffness)
+        off.append(abs(lasted / (math.pi * math.sqrt(mass / stiffness)) - 1.0))
+    assert off[0] < 0.1
+    assert off[1] < off[0] / 5.0
+    assert off[2] < off[1] / 5.0
+
+
+def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
+    """A soft end with much damping: pressed against it, torn off, pressed against it again."""
+    scene = replace(
+        EXAMPLE2,
+        torque=None,
+        stroke=Stroke(at_end="elastic", stiffness=1e5, damping=1e4),
+        workspace=Workspace(at_edge="ignore"),
+        friction=JointFriction(gamma=Friction(viscous=0.5)),
+        initial=Initial(gamma=(0.05, 0.5, 0.5)),
+    )
+    simulation, truth = Simulation(scene, tolerance=1e-9), Simulation(scene, "rodas4")
+    pushes = [(-2.0, 0.0, 0.0)] * 60 + [(2.0, 0.0, 0.0)] * 40 + [(-4.0, 0.0, 0.0)] * 60
+    for push in pushes:
+        simulation.step(push, 10 * MILLISECOND)
+        truth.step(push, 10 * MILLISECOND)
+    told = [change for change in simulation.changes if change.method != "dop853"]
+    assert [change.method for change in told] == ["rodas4", "dopri5", "rodas4"]
+    assert [change.reason.split(":")[0] for change in told] == ["stiff", "no longer stiff", "stiff"]
+    first, back, again = (change.time for change in told)
+    assert 0.0 < first < 0.6 < back < 0.65 < 1.0 < again < 1.6
+    assert apart(simulation, truth)[0] < 1e-6

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many ticks in one call: the bits, the faults and the book-keeping of one tick at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from loaded_scenes import loaded, viscous
+
+from sst_ros.errors import RunStopped, StrokeExceeded
+from sst_ros.integration.backend import numba_version
+from sst_ros.integration.machine import Machine
+from sst_ros.scene import Initial, Workspace, load
+from sst_ros.simulation import Simulation
+
+MILLISECOND = 1_000_000
+TORQUES = ((0.3, -0.2, 0.1), (-1.5, 0.5, 2.0), (0.0, 0.0, 0.0), (4.0, 4.0, -4.0))
+
+INWARDS = {
+    "initial": Initial(gamma=(0.1, 0.8, 0.8), gamma_dot=(-2.0, 0.5, 0.1)),
+    "workspace": Workspace(at_edge="ignore"),
+}
+CASES = {
+    "example2": (load("example2"), {}),
+    "loaded": (loaded(), {}),
+    "impacts": (replace(load("impacts"), **INWARDS), {}),
+    "elastic": (replace(load("elastic_stops"), **INWARDS), {}),
+    "stiff": (viscous(300.0), {"tolerance": 1e-9}),
+    "rodas4": (viscous(3.0), {"integrator": "rodas4", "tolerance": 1e-8}),
+    "rk4": (load("example2"), {"integrator": "rk4"}),
+}
+needs_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
+BY_NUMBA = [
+    pytest.param(name, marks=() if name in ("example2", "impacts") else pytest.mark.slow)
+    for name in CASES
+]
+
+
+@pytest.fixture
+def glided(monkeypatch):
+    """Count the ticks that were done without a look at each."""
+    counts, glide = [], Machine.glide
+
+    def counted(self, h, count, *more):
+        found = glide(self, h, count, *more)
+        counts.append((count, found[0]))
+        return found
+
+    monkeypatch.setattr(Machine, "glide", counted)
+    return counts
+
+
+def told(simulation):
+    """All that a run says of itself."""
+    return (
+        simulation.state,
+        simulation.error_estimate,
+        simulation.rate_error_estimate,
+        simulation.energy_residual,
+        simulation.changes,
+        simulation.method,
+        simulation._journey._mark()[:3],
+    )
+
+
+def run(scene, at_once, ticks, **how):
+    """Ticks under torques that change every 60, `at_once` in a call; also what ended it."""
+    simulation = Simulation(scene, **how)
+    for k in range(0, ticks, at_once):
+        try:
+            simulation.steps(TORQUES[k // 60 % 4], MILLISECOND, at_once)
+        except RunStopped as error:
+            return told(simulation), str(error), error.time
+    return told(simulation), None, None
+
+
+def held_against_single_ticks(name, ticks, glided, *, compiled):
+    scene, how = CASES[name]
+    one = run(scene, 1, ticks, compiled=compiled, **how)
+    assert max(done for _, done in glided) == 1
+    glided.clear()
+    for at_once in (20, 60):
+        assert run(scene, at_once, ticks, compiled=compiled, **how) == one
+    if name in ("example2", "rk4"):
+        assert (60, 60) in glided
+    if name in ("loaded", "impacts", "elastic"):
+        assert any(0 < done < count for count, done in glided)
+    return one
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_bits_do_not_depend_on_how_many_ticks_go_into_a_call(name, glided):
+    held_against_single_ticks(name, 120, glided, compiled=False)
+
+
+@needs_numba
+@pytest.mark.parametrize("name", BY_NUMBA)
+def test_numba_gives_the_bits_of_plain_python_however_many_ticks(name, glided):
+    fast = held_against_single_ticks(name, 120, glided, compiled=True)
+    assert fast == run(CASES[name][0], 20, 120, compiled=False, **CASES[name][1])
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_numba)])
+def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
+    ends = []
+    for at_once in (1, 50):
+        simulation = Simulation(load("example2"), compiled=compiled)
+        with pytest.raises(StrokeExceeded) as caught:
+            for _ in range(10_000):
+                simulation.steps((8.0, 0.0, 0.0), MILLISECOND, at_once)
+        assert caught.value.state is simulation.state
+        assert 0.0 <= caught.value.time - simulation.time_ns / 1e9 <= 1e-3
+        ends.append((told(simulation), caught.value.time))
+    assert ends[0] == ends[1]
+    assert ends[0][0][0].time_ns % (50 * MILLISECOND)
+
+
+def test_a_state_within_ticks_that_were_done_at_once_is_on_the_way():
+    one, other = (Simulation(load("example2")) for _ in range(2))
+    one.steps((1.0, 2.0, 3.0), MILLISECOND, 20)
+    other.step((1.0, 2.0, 3.0), 7 * MILLISECOND)
+    found = one.within(7 * MILLISECOND)
+    assert found.joints.gamma == pytest.approx(other.state.joints.gamma, abs=1e-12)
+    assert one.state.time_ns == 20 * MILLISECOND
