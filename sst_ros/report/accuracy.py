@@ -212,7 +212,7 @@ def _formulation(trial: Trial, truth: Reference) -> float | None:
         now = trial.torque
         torque = now(k * trial.interval) if callable(now) else now
         try:
-            paper = formulation._of_the_paper(mechanism, tuple(state), np.array(torque))
+            paper = formulation.of_the_paper(mechanism, tuple(state), np.array(torque))
         except (SingularConfiguration, np.linalg.LinAlgError):
             continue
         ours = np.array(kernel.derivative(model, tuple(state), torque)[4:7])

@@ -55,7 +55,7 @@ def _panel(axes: Axes, study: Study, quantity: str, floor: float) -> None:
         for kind in (FIXED, "tolerance"):
             rows = [r for r in study.rows if (r.method, r.kind) == (name, kind) and r.largest]
             points = [(1e3 * r.wall_s[0], getattr(r.largest, quantity)) for r in rows]
-            points = [(x, y) for x, y in points if y >= floor and x > 0.0]
+            points = [(x, y) for x, y in points if y >= floor and min(x, y) > 0.0]
             if not points:
                 continue
             shown += points

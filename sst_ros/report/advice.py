@@ -6,12 +6,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sst_ros.control.torque import sine
 from sst_ros.errors import SstError
-from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DORMAND_PRINCE, RODAS4
+from sst_ros.integration.walk import Walk
 from sst_ros.scene import Scene
-from sst_ros.simulation import Simulation
+from sst_ros.simulation import NANOSECONDS, Simulation
 
 LONGEST_STEP = 1e-2
 STABLE = 3.3
@@ -20,14 +22,8 @@ STABLE = 3.3
 ACCURATE = 0.3
 """h abs(lambda) at which its local error is far below 1e-6."""
 
-
-def spectrum(
-    dynamics: Dynamics, y: tuple[float, ...], drive: tuple[float, ...]
-) -> NDArray[np.complex128]:
-    """Eigenvalues of d(dy/dt)/dy [1/s], one for each number of the state."""
-    size = len(y)
-    flat = dynamics.linearised(*y, *drive)[size:]
-    return np.asarray(np.linalg.eigvals(np.array(flat).reshape(size, size).T))
+PERIODS, PERIOD_NS = 20, 5_000_000
+"""Over so many periods [ns] auto is watched."""
 
 
 def advise(scene: Scene) -> str:
@@ -39,15 +35,35 @@ def advise(scene: Scene) -> str:
     state, dynamics = simulation.state, simulation.dynamics
     lagged = (0.0,) * (len(dynamics.state) - 7)
     y = (*state.quaternion, *state.body_rate, *lagged)
-    fastest = float(np.abs(spectrum(dynamics, y, (0.0,) * len(dynamics.drive))).max())
+    walk = Walk(System(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
+    eigenvalues = walk.spectrum(0.0, y, (0.0,) * len(dynamics.drive))
+    fastest = float(np.abs(eigenvalues).max())
     if fastest == 0.0:
         return f"dopri5 with steps of {LONGEST_STEP:g} s; nothing moves fast at the start"
-    step = _rounded(min(LONGEST_STEP, ACCURATE / fastest))
     limit = STABLE / fastest
+    if _stiff(simulation, scene):
+        return (
+            f"auto, which changes to {RODAS4.name}: the scene is stiff; the fastest rate at the "
+            f"start is {fastest:.3g} 1/s, and dopri5 would be unstable in steps above {limit:.2g} s"
+        )
+    step = _rounded(min(LONGEST_STEP, ACCURATE / fastest))
     return (
         f"dopri5 with steps of {step:g} s or less; the fastest rate at the start is "
         f"{fastest:.3g} 1/s, and steps above {limit:.2g} s would be unstable"
     )
+
+
+def _stiff(simulation: Simulation, scene: Scene) -> bool:
+    """Tell whether auto takes the method for stiff motions, over a short run."""
+    profile = sine(scene.torque) if scene.torque else lambda _: (0.0, 0.0, 0.0)
+    try:
+        for period in range(PERIODS):
+            simulation.step(profile(period * PERIOD_NS / NANOSECONDS), PERIOD_NS)
+            if simulation.method == RODAS4.name:
+                return True
+    except SstError:
+        pass  # the run is over before that
+    return False
 
 
 def _rounded(step: float) -> float:

@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rosbag2 recording as a stream of messages; whatever is wrong with it becomes an InputError."""
+"""A rosbag2 recording in blocks of messages; whatever is wrong with it becomes an InputError."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
+import numpy as np
+import yaml
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.report import mcap
+from sst_ros.report.mcap import Block
+
+_BATCH = 20_000
 
 
 class Topic(NamedTuple):
@@ -67,7 +74,7 @@ class Bag:
             self._reader = Reader(path)
             self._reader.open()
         except Exception as error:  # rosbags and what it is built on raise anything on bad bytes
-            raise _damaged(path, error) from None
+            raise self.damaged(error) from None
         try:
             found = [self._find(topic) for topic in wanted]
             if not self._reader.message_count:
@@ -81,6 +88,8 @@ class Bag:
         pairs = [(topic, match) for topic, match in zip(wanted, found, strict=True) if match]
         self._connections = [connection for _, match in pairs for connection in match]
         self._keys = {match[0].topic: topic.key for topic, match in pairs}
+        self._kinds = {topic.key: topic.kind for topic, _ in pairs}
+        self._files = self._mcap_files()
         self.topics = {topic.key: match[0].topic for topic, match in pairs}
         self.missing = tuple(topic.key for topic in absent)
 
@@ -108,7 +117,70 @@ class Bag:
                 yield Message(self._keys[connection.topic], int(received), content)
                 count += 1
         except Exception as error:  # as above; what the caller raises does not come in here
-            raise _damaged(self._path, error, f" after {count} messages") from None
+            raise self.damaged(error, f" after {count} messages") from None
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the messages of all topics found, many at a time; a block's topic is its key.
+
+        The blocks of a topic come in the order of the file, which may not be that of receptions.
+
+        Raises:
+            InputError: the recording is damaged; `Problem.allowed` says how far it could be read.
+
+        """
+        count = 0
+        try:
+            for block in self._mcap() if self._files else self._batches():
+                yield block._replace(topic=self._keys[block.topic])
+                count += len(block.received)
+        except InputError:
+            raise
+        except Exception as error:  # as above
+            raise self.damaged(error, f" after {count} messages") from None
+
+    def content(self, block: Block) -> Iterator[Any]:
+        """Deserialize the messages of a block one by one: for topics with few of them."""
+        kind = self._kinds[block.topic]
+        for row in block.rows:
+            try:
+                content = self._store.deserialize_cdr(row.tobytes(), kind)
+            except Exception as error:  # as above
+                raise self.damaged(error, f" in {block.topic}") from None
+            yield content
+
+    def damaged(self, error: Exception, where: str = "") -> InputError:
+        """Make the error about bytes that are no recording."""
+        said = " ".join(str(error).split()) or type(error).__name__
+        allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
+        allowed += f"reading failed{where}: {said};"
+        allowed += " if the recorder was killed: python -m sst_ros recover BAG"
+        return refused(self._path, "bag", self._path.name, allowed)
+
+    def _mcap(self) -> Iterator[Block]:
+        for file in self._files:
+            yield from mcap.blocks(file, self._keys)
+
+    def _batches(self) -> Iterator[Block]:
+        """Read sqlite3, and what rosbag2 has compressed, through rosbags."""
+        messages = self._reader.messages(self._connections)
+        while batch := list(itertools.islice(messages, _BATCH)):
+            for topic in {connection.topic for connection, *_ in batch}:
+                own = [(at, raw) for connection, at, raw in batch if connection.topic == topic]
+                size = np.array([len(raw) for _, raw in own])
+                data = np.frombuffer(b"".join(raw for _, raw in own), np.uint8)
+                received = np.array([at for at, _ in own], dtype=np.int64)
+                yield from mcap.grouped(topic, received, data, np.cumsum(size) - size, size)
+
+    def _mcap_files(self) -> list[Path]:
+        """Files to be read as they are; none where rosbags has to help."""
+        files = [self._path]
+        if self._path.is_dir():
+            if self._reader.compression_mode:
+                return []
+            told = yaml.safe_load((self._path / "metadata.yaml").read_text(encoding="utf-8"))
+            names = told["rosbag2_bagfile_information"]["relative_file_paths"]
+            files = [self._path / PurePath(name).name for name in names]
+        return files if all(file.suffix == ".mcap" for file in files) else []
 
     def _find(self, topic: Topic) -> list[Connection]:
         """Return the connections of the one topic that matches; each publisher may have its own."""
@@ -136,13 +208,6 @@ class Bag:
 def refused(path: Path, key: str, value: object, allowed: str) -> InputError:
     """Make the error about one fault of a recording."""
     return InputError(str(path), [Problem(key, value, allowed)])
-
-
-def _damaged(path: Path, error: Exception, where: str = "") -> InputError:
-    said = " ".join(str(error).split()) or type(error).__name__
-    allowed = f"must be a whole rosbag2 recording, MCAP or sqlite3; reading failed{where}: {said};"
-    allowed += " if the recorder was killed: python -m sst_ros recover BAG"
-    return refused(path, "bag", path.name, allowed)
 
 
 def _is_essential(topic: Topic) -> bool:

@@ -50,12 +50,11 @@ def check(recording: Recording, count: int = STATES) -> Formulation:
     chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
     differences, sizes = [], []
     for sample in whole[chosen] if len(whole) else ():
-        state = states.recorded(mechanism.geometry, recording, int(sample))
-        if state is None:
-            continue
-        state, torque = state[:7], recording.effort[sample]  # the torque that acts, lagged or not
+        row = states.recorded(mechanism.geometry, recording, [int(sample)])[0]
+        state = tuple(row[:7].tolist())
+        torque = recording.effort[sample]  # the torque that acts, lagged or not
         try:
-            paper = _of_the_paper(mechanism, state, torque)
+            paper = of_the_paper(mechanism, state, torque)
         except SingularConfiguration:
             continue
         first, second, third = torque.tolist()
@@ -68,8 +67,13 @@ def check(recording: Recording, count: int = STATES) -> Formulation:
     return Formulation(max(differences) / scale if scale > 0.0 else max(differences), len(sizes))
 
 
-def _of_the_paper(mechanism: virtual_work.Mechanism, state: states.Vector, torque: Array) -> Array:
-    """W_dot in {E} [rad/s^2] by Eqs. 1 to 92."""
+def of_the_paper(mechanism: virtual_work.Mechanism, state: states.Vector, torque: Array) -> Array:
+    """W_dot in {E} [rad/s^2] of a state (quaternion, W) under torques [N m], by Eqs. 1 to 92.
+
+    Raises:
+        SingularConfiguration: the posture is singular.
+
+    """
     rotation = rotation_matrix(state[:4])
     gamma = kinematics.inverse(mechanism.geometry, rotation)[0]
     posture = virtual_work.posture(mechanism.geometry, gamma, rotation)

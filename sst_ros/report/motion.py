@@ -1,75 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of motion of a scene, integrated with fixed steps: the reference's own way."""
+"""The equations of motion of a scene over many ticks, with fixed steps: the reference's own way.
+
+The method is DOP853 on the kernel's equations, traced, compiled for long runs.
+"""
 
 from __future__ import annotations
 
-import math
+import inspect
 from collections.abc import Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
 
-from sst_ros.control.torque import Profile
-from sst_ros.integration.explicit import ExplicitMethod
+import numpy as np
+
+from sst_ros.integration import backend
 from sst_ros.integration.tableaux import DOP853
 from sst_ros.limits import limits_of
 from sst_ros.mechanism import kernel
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report import states
-from sst_ros.report.rows import NANOSECONDS
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.elementary import positive, sin
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.trace import Program, trace
+from sst_ros.report import ride
+from sst_ros.report.recording import Recording
+from sst_ros.report.rows import NANOSECONDS, Integers
 from sst_ros.report.states import Vector
-from sst_ros.scene import Scene
-
-METHOD = ExplicitMethod(DOP853)
+from sst_ros.scene import Scene, SineTorque
 
 TOUCHING = 1e-12
 """An actuator that is farther beyond its end than this [rad] has hit it."""
+
+COMPILED_FROM = 10_000
+"""From this number of ticks on it is worth compiling."""
+
+
+class Course(NamedTuple):
+    """Ticks to go through.
+
+    Attributes:
+        start_ns, end_ns: relative to the start of the run [ns], shape (m,).
+        drives: what acts from outside over a tick, shape (m, 3 or 6 or 0).
+
+    """
+
+    start_ns: Integers
+    end_ns: Integers
+    drives: Array
+
+    @property
+    def lengths(self) -> Array:
+        """Length of each tick [s]."""
+        return np.asarray((self.end_ns - self.start_ns) / NANOSECONDS)
+
+    def part(self, ticks: slice) -> Course:
+        """Return some of the ticks."""
+        return Course(self.start_ns[ticks], self.end_ns[ticks], self.drives[ticks])
 
 
 class Motion:
     """Motion of a scene up to its next impact.
 
+    Args:
+        scene: what moves.
+        torque: torques over time, within the limit of the actuators; without them they are those
+            of each tick.
+        compiled: by numba, where it is installed.
+
     Attributes:
-        model: constants of the dynamics.
-        size: number of numbers in a state.
-        impacts: how often `advance` met one.
+        dynamics: functions of the scene.
+        compiled: whether numba is used.
 
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.model = kernel.model_of(scene)
-        self.size = 10 if states.lags(scene) else 7
-        self.impacts = 0
-        limit = scene.actuators.torque_limit if scene.actuators else None
-        self._limit = math.inf if limit is None else limit
-        every = limits_of(scene, Geometry.of(scene))
-        self._rigid = [end for end in every if end.error is None]
+    def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
+        self.dynamics = Dynamics(scene)
+        self.compiled = compiled and backend.numba_version() is not None
+        drive = self.dynamics.drive if torque is None else ()
+        size = len(self.dynamics.state)
+        program = trace(
+            _free(self.dynamics, torque, _limit(scene)) if torque else _held(self.dynamics),
+            ("t", *self.dynamics.state, *drive),
+        )
+        self._module = module(program, self.dynamics, size, len(drive), compiled=self.compiled)
+        ends = limits_of(scene, Geometry.of(scene))
+        rigid = [(end.joint, end.sign, end.end) for end in ends if end.error is None]
+        self._ends: Any = np.array(rigid).reshape(-1, 3) if self.compiled else rigid
 
-    def advance(
-        self,
-        torque: Profile,
-        moment: Sequence[float] | None,
-        start_ns: int,
-        end_ns: int,
-        y: Vector,
-        steps: int,
-    ) -> Vector | None:
-        """Integrate from start to end; None where there is an impact or no finite continuation."""
-        external = None if moment is None else (moment[0], moment[1], moment[2])
+    def follow(self, y: Vector, course: Course, counts: Integers) -> tuple[Array, bool]:
+        """Go through ticks, each by its number of steps.
 
-        def rates(t: float, y: Vector) -> kernel.State:
-            first, second, third = (min(max(tau, -self._limit), self._limit) for tau in torque(t))
-            return kernel.derivative(self.model, y, (first, second, third), external)
+        Returns:
+            States at the end of each tick that was done, shape (ticks, size); they are fewer than
+            asked for after an impact, or where there is no finite continuation; and whether it
+            was an impact.
 
-        start, h = start_ns / NANOSECONDS, (end_ns - start_ns) / NANOSECONDS / steps
-        try:
-            for step in range(steps):
-                y = METHOD.step(rates, start + step * h, y, h).y
-                if self._rigid and self._hits(y):
-                    self.impacts += 1
-                    return None
-        except (ArithmeticError, ValueError):
-            return None
-        return y if all(map(math.isfinite, y)) else None
+        """
+        times, lengths, drives = course.start_ns / NANOSECONDS, course.lengths, course.drives
+        reached = np.full((len(times), len(y)), np.nan)
+        if self.compiled:
+            drives = np.ascontiguousarray(drives)
+            given = times, lengths, counts, drives, self._ends, np.array(y), reached
+            done, hit = self._module.ride(*given)
+            return reached[:done], hit
+        state = list(y)
+        columns = (each.tolist() for each in (times, lengths, counts, drives))
+        rows = zip(*columns, strict=True)
+        for k, row in enumerate(rows):
+            end: list[list[float]] = [[0.0] * len(y)]
+            try:
+                done, hit = self._module.ride(*([each] for each in row), self._ends, state, end)
+            except (ArithmeticError, ValueError):
+                done, hit = 0, False
+            if not done:
+                return reached[:k], hit
+            reached[k] = end[0]
+        return reached, False
 
-    def _hits(self, y: Vector) -> bool:
-        joints = kernel.joints(self.model, y)
-        angles = (*joints.gamma, *joints.mu, *joints.beta)
-        return any(end.margin(angles) < -TOUCHING for end in self._rigid)
+
+def held(recording: Recording) -> Course:
+    """Return the recorded ticks, torques within the limit of the actuators."""
+    ticks, dynamics = recording.ticks, Dynamics(recording.scene)
+    limit = _limit(recording.scene)
+    torque = ticks.torque if limit is None else np.clip(ticks.torque, -limit, limit)
+    if dynamics.moved and ticks.moment is not None:
+        torque = np.hstack([torque, ticks.moment])
+    return Course(ticks.start_ns, ticks.end_ns, torque)
+
+
+def module(
+    program: Program, dynamics: Dynamics, size: int, drive: int, *, compiled: bool
+) -> ModuleType:
+    """Put the loops of `ride` behind DOP853 and a derivative with the inputs t, state, drive."""
+    texts = backend.source(program, None, dynamics.joints_program, DOP853, size, drive)
+    texts += [inspect.getsource(ride.ride), inspect.getsource(ride.work_done)]
+    # Lag and share concern error estimates, which nobody looks at here.
+    constants = {"SIZE": size, "LAG": 0, "SHARE": 1.0, "TOUCHING": TOUCHING}
+    return backend.load(texts, constants, numba=compiled, nogil=True)
+
+
+def _limit(scene: Scene) -> float | None:
+    return scene.actuators.torque_limit if scene.actuators else None
+
+
+def _held(dynamics: Dynamics) -> Any:
+    size = len(dynamics.state)
+
+    def slope(_: Any, *inputs: Any) -> Sequence[Any]:
+        drive = inputs[size:]
+        return kernel.derivative(dynamics.model, inputs[:size], drive[:3], drive[3:] or None)
+
+    return slope
+
+
+def _free(dynamics: Dynamics, torque: SineTorque, limit: float | None) -> Any:
+    rows = list(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
+
+    def slope(t: Any, *state: Any) -> Sequence[Any]:
+        asked = [a * sin(f * t + p) for a, f, p in rows]
+        if limit is not None:
+            asked = [limit - positive(2.0 * limit - positive(tau + limit)) for tau in asked]
+        return kernel.derivative(dynamics.model, state, (asked[0], asked[1], asked[2]))
+
+    return slope

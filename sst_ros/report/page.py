@@ -15,11 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from sst_ros.mechanism.geometry import Array
 from sst_ros.report.figures import BLUE, GREEN, GREY, LINES, STYLE, VERMILION
 from sst_ros.report.jitter import Timing
 from sst_ros.report.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.table import made_line, table
+from sst_ros.report.thinning import extremes, floor
 
 SMALLEST = 1e-17
 
@@ -39,17 +41,19 @@ def draw(
     summary: dict[str, Any],
     path: Path,
 ) -> None:
-    """Write the page as one PNG with six pictures."""
+    """Write the page as one PNG with eight pictures."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(12.0, 10.2))
-        grid = figure.subplots(3, 2)
+        figure = Figure(figsize=(12.0, 13.4))
+        grid = figure.subplots(4, 2)
         _error(grid[0, 0], recording, integration)
         _energy(grid[0, 1], recording, timing)
-        _pace(grid[1, 0], recording, timing)
+        _pace(grid[1, 0], timing)
         _histogram(grid[1, 1], timing)
-        _losses(grid[2, 0], recording, timing, summary)
-        _latency(grid[2, 1], recording, timing)
-        for axes in (*grid[:, 0], grid[0, 1], grid[2, 1]):
+        _losses(grid[2, 0], recording, timing)
+        _latency(grid[2, 1], timing)
+        _late(grid[3, 0], recording, timing)
+        _effort(grid[3, 1], recording)
+        for axes in (*grid[:, 0], *grid[[0, 2, 3], 1]):
             axes.set_xlabel("time t [s]")
             axes.set_xlim(0.0, recording.seconds[-1])
         seconds = f"{recording.seconds[-1]:g} s, {len(recording.time_ns)} samples"
@@ -60,14 +64,14 @@ def draw(
 
 def _error(axes: Axes, recording: Recording, integration: Comparison) -> None:
     axes.set_title("Integration error, against the same torques", loc="left")
-    own, error = integration.own, integration.error
-    floor = np.fmax.reduce([own.gamma, own.gamma_dot, own.orientation])
-    axes.fill_between(recording.seconds, SMALLEST, np.fmax(floor, SMALLEST), color=GREY,
-                      alpha=0.3, linewidth=0.0, label="reference's own")  # fmt: skip
+    lowest, error = floor(integration.own), integration.error
+    rows = extremes([lowest], len(lowest))
+    axes.fill_between(recording.seconds[rows], SMALLEST, np.fmax(lowest[rows], SMALLEST),
+                      color=GREY, alpha=0.3, linewidth=0.0, label="reference's own")  # fmt: skip
     quantities = (("γ [rad]", error.gamma), ("γ̇ [rad/s]", error.gamma_dot),
                   ("orientation [rad]", error.orientation))  # fmt: skip
     for (name, values), line in zip(quantities, LINES, strict=True):
-        axes.plot(recording.seconds, np.where(values > 0.0, values, np.nan), label=name, **line)
+        _line(axes, recording.seconds, np.where(values > 0.0, values, np.nan), label=name, **line)
     axes.set_yscale("log")
     axes.set_ylim(bottom=SMALLEST)
     axes.set_ylabel("largest difference")
@@ -82,11 +86,11 @@ def _energy(axes: Axes, recording: Recording, timing: Timing) -> None:
     axes.set_ylabel("energy residual [J]")
     if timing.energy is None or not np.isfinite(timing.energy).any():
         return _nothing(axes, "not known")
-    axes.plot(recording.seconds, timing.energy, color=BLUE, linewidth=1.4)
+    _line(axes, recording.seconds, timing.energy, color=BLUE, linewidth=1.4)
     return None
 
 
-def _pace(axes: Axes, recording: Recording, timing: Timing) -> None:
+def _pace(axes: Axes, timing: Timing) -> None:
     axes.set_title("Pace by the recorder's clock", loc="left")
     axes.set_ylabel("real-time factor")
     if not len(timing.pace):
@@ -123,30 +127,63 @@ def _histogram(axes: Axes, timing: Timing) -> None:
     return None
 
 
-def _losses(axes: Axes, recording: Recording, timing: Timing, summary: dict[str, Any]) -> None:
+def _losses(axes: Axes, recording: Recording, timing: Timing) -> None:
     axes.set_title("Losses so far", loc="left")
     axes.set_ylabel("count")
-    rows = (("samples lost", timing.lost_s), ("gaps between applied torques", timing.gaps_s))
-    for (name, times), line in zip(rows, LINES, strict=False):
-        steps = np.concatenate([[0.0], np.sort(times), [recording.seconds[-1]]])
-        counts = np.concatenate([np.arange(len(times) + 1), [len(times)]])
-        axes.step(steps, counts, where="post", label=f"{name}: {len(times)}", **line)
-    missed = summary["ticks_missed"]
-    told = "not recorded" if missed is None else f"{missed}"
-    axes.plot([], [], " ", label=f"ticks missed, by the simulator: {told}")
-    axes.set_ylim(0.0, max(1.0, 1.6 * max(len(timing.lost_s), len(timing.gaps_s))))
+    rows = [(name, np.sort(times), np.arange(1.0, len(times) + 1.0), len(times))
+            for name, times in (("samples lost", timing.lost_s),
+                                ("gaps between applied torques", timing.gaps_s))]  # fmt: skip
+    if len(timing.missed):
+        last = int(timing.missed[-1])
+        rows.append(("ticks missed, by the simulator", timing.missed_s, timing.missed, last))
+    else:
+        axes.plot([], [], " ", label="ticks missed: not recorded")
+    for (name, times, counts, last), line in zip(rows, LINES, strict=False):
+        few = extremes([counts], len(counts)) if len(counts) else slice(0)
+        steps = np.concatenate([[0.0], times[few], [recording.seconds[-1]]])
+        shown = np.concatenate([[0.0], counts[few], [last]])
+        axes.step(steps, shown, where="post", label=f"{name}: {last}", **line)
+    axes.set_ylim(0.0, max(1.0, 1.6 * max(last for *_, last in rows)))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(fontsize=8, loc="upper left")
 
 
-def _latency(axes: Axes, recording: Recording, timing: Timing) -> None:
-    axes.set_title("From a command's reception to the stamp of its tick", loc="left")
+def _latency(axes: Axes, timing: Timing) -> None:
+    axes.set_title("From a command's reception to the step that applies it", loc="left")
     axes.set_ylabel("latency [µs]")
-    if not len(timing.latency_us):
+    found = timing.latency
+    if not len(found.time_s):
         return _nothing(axes, "not known")
-    axes.plot(timing.latency_s, timing.latency_us, ".", color=BLUE, markersize=3)
-    axes.set_xlim(0.0, recording.seconds[-1])
+    rows = extremes([found.received_us], len(found.time_s))
+    axes.plot(found.time_s[rows], found.received_us[rows], ".", color=BLUE, markersize=3)
+    axes.set_ylim(bottom=min(0.0, 1.05 * float(found.received_us.min())))
     return None
+
+
+def _late(axes: Axes, recording: Recording, timing: Timing) -> None:
+    axes.set_title("How far samples come behind the promptest one", loc="left")
+    axes.set_ylabel("received later, by its stamp [ms]")
+    _line(axes, recording.seconds, timing.late_us / 1e3, color=BLUE, linewidth=1.2)
+
+
+def _effort(axes: Axes, recording: Recording) -> None:
+    axes.set_title("Effort of joint_states against the applied torque", loc="left")
+    axes.set_ylabel("largest difference [N m]")
+    off = recording.effort_difference
+    if not np.isfinite(off).any():
+        return _nothing(axes, "not known")
+    _line(axes, recording.seconds, off, color=BLUE, linewidth=1.4)
+    axes.set_ylim(bottom=0.0)
+    if not np.nanmax(off):
+        axes.set_ylim(0.0, 1.0)
+        _nothing(axes, "none")
+    return None
+
+
+def _line(axes: Axes, seconds: Array, values: Array, **style: Any) -> None:
+    """Draw a curve with no more points than can be seen."""
+    rows = extremes([values], len(values))
+    axes.plot(seconds[rows], values[rows], **style)
 
 
 def _nothing(axes: Axes, words: str) -> None:
@@ -161,7 +198,7 @@ def write(summary: dict[str, Any], page: Path, pictures: Sequence[Path], out: Pa
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
         f"<title>Run of {name}</title><style>{_STYLE}</style></head><body>",
         f"<h1>Run of {name}</h1>",
-        _picture(page, "error, energy, pace, jitter, losses and latency over the run"),
+        _picture(page, "error, energy, pace, jitter, losses, latency and efforts over the run"),
         f"<h2>What the recording does not tell</h2><ul>{told}</ul>" if told else "",
         f"<h2>Numbers</h2><pre>{html.escape(table(summary))}</pre>",
         "<h2>Motion</h2><div class='some'>",

@@ -3,7 +3,8 @@
 
 The method is DOP853 with two or more steps a tick, on the kernel's equations; nothing of
 `Simulation` takes part. Every comparison integrates twice, with different step sizes; the
-difference of the two is the reference's own error.
+difference of the two is the reference's own error. Long runs are compiled; where there is no numba
+only their first minute or so is compared, and `Comparison.reasons` says so.
 
 Actuators that lag are part of the state, and torques are held to the scene's limit. Impacts are
 not solved a second time: after one, the reference begins again at the next recorded sample. A
@@ -13,21 +14,28 @@ moment from a topic must be recorded; without it there is nothing to compare wit
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control.torque import Profile, sine
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.progress import slices
 from sst_ros.report import states
-from sst_ros.report.motion import Motion
+from sst_ros.report.motion import COMPILED_FROM, Course, Motion, held
 from sst_ros.report.recording import Recording
+from sst_ros.report.rows import NANOSECONDS, Integers, places
 from sst_ros.report.states import Vector
 
-LONGEST_STEP_NS = 500_000
-"""Steps of the reference are not longer than this [ns]."""
+LONGEST_STEP_NS, LONGEST_IDEAL_STEP_NS = 500_000, 1_000_000
+"""The coarse steps of the reference are not longer than this [ns]. What hold and transport cost is
+larger than what an integrator gets wrong, and can be told with longer steps."""
+
+PLAIN_TICKS = 60_000
+"""So many ticks are compared in plain Python, a minute's work."""
+
+CHUNK = 100_000
+"""So many ticks at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,11 @@ class Deviation:
     gamma: Array
     gamma_dot: Array
     orientation: Array
+
+    @classmethod
+    def none(cls, count: int) -> Deviation:
+        """Nothing to say about `count` samples."""
+        return cls(*np.full((3, count), np.nan))
 
 
 @dataclass(frozen=True)
@@ -82,7 +95,15 @@ def integration(recording: Recording) -> Comparison:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    return _compare(recording, lambda motion, steps: _held(recording, motion, steps))
+    begun = states.begins(recording)
+    start = states.initial(recording.scene) if begun else None
+    course, moment = held(recording), recording.scene.moment
+    if moment is not None and moment.topic and recording.ticks.moment is None:
+        count = len(recording.time_ns)
+        reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
+        return Comparison(Deviation.none(count), Deviation.none(count), (), 0, (reason,))
+    motion = Motion(recording.scene, None, compiled=len(course.start_ns) > COMPILED_FROM)
+    return _compare(recording, motion, course, start, LONGEST_STEP_NS, again=True)
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -99,38 +120,109 @@ def ideal(recording: Recording) -> Comparison | None:
     moment = recording.scene.moment
     if torque is None or (moment and moment.topic) or not states.begins(recording):
         return None
-    profile = sine(torque)
-    return _compare(recording, lambda motion, steps: (_free(recording, motion, profile, steps), ()))
+    time = recording.time_ns
+    course = Course(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
+    many = len(recording.ticks.start_ns) > COMPILED_FROM
+    motion = Motion(recording.scene, torque, compiled=many)
+    start = states.initial(recording.scene)
+    return _compare(recording, motion, course, start, LONGEST_IDEAL_STEP_NS, again=False)
 
 
 def _compare(
-    recording: Recording, solve: Callable[[Motion, int], tuple[Array, tuple[int, ...]]]
+    recording: Recording,
+    motion: Motion,
+    course: Course,
+    start: Vector | None,
+    longest_ns: int,
+    *,
+    again: bool,
 ) -> Comparison:
-    motion = Motion(recording.scene)
-    model = motion.model
-    coarse = max(2, math.ceil(recording.ticks.period_ns / LONGEST_STEP_NS))
-    fine = math.ceil(1.5 * coarse)
-    rough = states.outputs(model, solve(motion, coarse)[0])
-    solved, restarts = solve(motion, fine)
-    reference = states.outputs(model, solved)
-    sampled = (recording.quaternion, recording.gamma, recording.gamma_dot)
-    error = _deviation(sampled, reference)
+    """Go through a course twice, in fine and in coarse steps, and compare at the samples.
+
+    Args:
+        recording: what is compared.
+        motion: how it moves.
+        course: the ticks.
+        start: state at time zero; None where it is not known.
+        longest_ns: longest coarse step [ns].
+        again: begin again at a sample where the way was lost.
+
+    """
+    tick = recording.ticks.period_ns
+    coarse = math.ceil(tick / longest_ns)
+    fine = max(coarse + 1, math.ceil(1.5 * coarse))
+    time, geometry = recording.time_ns, Geometry.of(recording.scene)
+    breaks = 1 + np.flatnonzero(course.start_ns[1:] != course.end_ns[:-1])
+    error, own = Deviation.none(len(time)), Deviation.none(len(time))
+    restarts: list[int] = []
+    impacts = clock = 0
+    now: list[Vector] = []
+    if start is not None:
+        now = [start, start]
+        _note(error, own, recording, motion, np.array([0]), [np.array([start])] * 2)
+    total = len(course.start_ns)
+    plain = int(PLAIN_TICKS * tick // np.median(course.end_ns - course.start_ns))
+    judged = total if motion.compiled else min(total, plain)
+    for part in slices(judged, CHUNK, "reference", shown=again and total > CHUNK):
+        here = course.part(part)
+        at_end, at_start = places(time, here.end_ns), places(time, here.start_ns)
+        anew = np.flatnonzero((at_start >= 0) & np.isfinite(recording.quaternion[at_start, 0]))
+        ticks_in = np.ceil((here.end_ns - here.start_ns) / tick).astype(np.int64)
+        k, count = 0, len(at_end)
+        while k < count:
+            if clock != here.start_ns[k]:
+                now = []
+            if not now:
+                next_start = int(np.searchsorted(anew, k))
+                if not again or next_start == len(anew):
+                    break
+                k = int(anew[next_start])
+                now = [tuple(states.recorded(geometry, recording, [int(at_start[k])])[0])] * 2
+                restarts.append(int(here.start_ns[k]))
+            after = int(np.searchsorted(breaks, part.start + k, side="right"))
+            stop = min(count, int(breaks[after]) - part.start if after < len(breaks) else count)
+            (first, hit), (second, hit_too) = (
+                motion.follow(y, here.part(slice(k, stop)), ticks_in[k:stop] * steps)
+                for y, steps in zip(now, (fine, coarse), strict=True)
+            )
+            done = min(len(first), len(second))
+            rows = at_end[k : k + done]
+            reached = [way[:done][rows >= 0] for way in (first, second)]
+            _note(error, own, recording, motion, rows[rows >= 0], reached)
+            if k + done < stop:
+                # Of two ways one may meet an impact at the end of a tick, the other in the next.
+                impacts += hit or hit_too
+                now = []
+                k += done + 1 + (abs(len(first) - len(second)) == 1)
+            else:
+                now = [tuple(way[-1].tolist()) for way in (first, second)]
+                k, clock = stop, int(here.end_ns[stop - 1])
+    reasons = []
+    if impacts:
+        reasons.append(f"{impacts} impacts: the reference begins again after each")
+    if judged < total:
+        until = course.end_ns[judged - 1] / NANOSECONDS
+        reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
     for values in (error.gamma, error.gamma_dot, error.orientation):
-        values[np.isin(recording.time_ns, restarts)] = np.nan
-    own = _deviation(rough, reference)
-    return Comparison(error, own, restarts, fine, tuple(_reasons(recording, motion)))
+        values[np.isin(time, restarts)] = np.nan
+    return Comparison(error, own, tuple(restarts), fine, tuple(reasons))
 
 
-def _reasons(recording: Recording, motion: Motion) -> Iterator[str]:
-    if motion.impacts:
-        yield f"{motion.impacts} impacts: the reference begins again after each"
-    if _unknown_moment(recording):
-        yield "the moment on the star came from a topic and is not recorded: nothing is compared"
-
-
-def _unknown_moment(recording: Recording) -> bool:
-    moment = recording.scene.moment
-    return moment is not None and moment.topic and recording.ticks.moment is None
+def _note(
+    error: Deviation,
+    own: Deviation,
+    recording: Recording,
+    motion: Motion,
+    rows: Integers,
+    reached: list[Array],
+) -> None:
+    """Write down how far samples are from the states that were reached finely and coarsely."""
+    fine, coarse = (states.outputs(motion.dynamics, way) for way in reached)
+    sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
+    for deviation, one in ((error, sampled), (own, coarse)):
+        found = _deviation(one, fine)
+        deviation.gamma[rows], deviation.gamma_dot[rows] = found.gamma, found.gamma_dot
+        deviation.orientation[rows] = found.orientation
 
 
 def _deviation(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array]) -> Deviation:
@@ -143,56 +235,3 @@ def _deviation(first: tuple[Array, Array, Array], second: tuple[Array, Array, Ar
         np.abs(first[2] - second[2]).max(axis=1),
         angle_between(first[0], second[0]),
     )
-
-
-def _held(recording: Recording, motion: Motion, steps: int) -> tuple[Array, tuple[int, ...]]:
-    """States at the samples, one a row, under the recorded torques, and the restarts [ns]."""
-    result = np.full((len(recording.time_ns), motion.size), np.nan)
-    sample_at = {int(time): row for row, time in enumerate(recording.time_ns)}
-    geometry = Geometry.of(recording.scene)
-    restarts: list[int] = []
-    motion.impacts = now = 0
-    y: Vector | None = None
-    if _unknown_moment(recording):
-        return result, ()
-    if states.begins(recording):
-        y = states.initial(recording.scene)
-        result[0] = y
-    ticks = recording.ticks
-    moments = [None] * len(ticks.start_ns) if ticks.moment is None else ticks.moment.tolist()
-    for start, end, row, moment in zip(
-        ticks.start_ns.tolist(), ticks.end_ns.tolist(), ticks.torque.tolist(), moments, strict=True
-    ):
-        if y is None or now != start:
-            sample = sample_at.get(start)
-            y = None if sample is None else states.recorded(geometry, recording, sample)
-            if y is None:
-                continue
-            restarts.append(start)
-        y = motion.advance(_constant(row), moment, start, end, y, steps)
-        now = end
-        if y is not None and end in sample_at:
-            result[sample_at[end]] = y
-    return result, tuple(restarts)
-
-
-def _free(recording: Recording, motion: Motion, profile: Profile, steps: int) -> Array:
-    """States at the samples, one a row, under a continuous torque."""
-    times, tick = recording.time_ns.tolist(), recording.ticks.period_ns
-    result = np.full((len(times), motion.size), np.nan)
-    y = states.initial(recording.scene)
-    result[0] = y
-    motion.impacts = 0
-    for row in range(1, len(times)):
-        start, end = times[row - 1], times[row]
-        count = steps * math.ceil((end - start) / tick)
-        moved = motion.advance(profile, None, start, end, y, count)
-        if moved is None:
-            break
-        result[row] = y = moved
-    return result
-
-
-def _constant(torque: Sequence[float]) -> Profile:
-    first, second, third = torque
-    return lambda _: (first, second, third)

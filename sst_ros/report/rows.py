@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +19,26 @@ NANOSECONDS = 1_000_000_000
 
 
 class Rows:
-    """Stamped rows of numbers, kept compact: an hour at 500 Hz has 1.8 million of them."""
+    """Stamped rows of numbers, kept compact: an hour at 500 Hz has 1.8 million of them.
 
-    def __init__(self, path: Path, topic: str, width: int) -> None:
+    Args:
+        path, topic: for the words of errors.
+        width: numbers in a row.
+        received: keep when they were received.
+
+    """
+
+    def __init__(self, path: Path, topic: str, width: int, *, received: bool = False) -> None:
         self._path, self._topic, self._width = path, topic, width
-        self._stamps, self._received, self._values = array("q"), array("q"), array("d")
+        self._stamps, self._values = array("q"), array("d")
+        self._received = array("q") if received else None
 
-    def add(self, received_ns: int, stamp_ns: int, values: Sequence[float]) -> None:
-        """Append one row."""
-        self._stamps.append(stamp_ns)
-        self._received.append(received_ns)
-        self._values.extend(values)
+    def add(self, received_ns: Integers, stamp_ns: Integers, values: Array) -> None:
+        """Append rows, shapes (n,), (n,) and (n, width)."""
+        self._stamps.frombytes(np.ascontiguousarray(stamp_ns, dtype=np.int64).tobytes())
+        self._values.frombytes(np.ascontiguousarray(values, dtype=float).tobytes())
+        if self._received is not None:
+            self._received.frombytes(np.ascontiguousarray(received_ns, dtype=np.int64).tobytes())
 
     def sorted(self) -> tuple[Integers, Integers, Array]:
         """Return stamps, receive times [ns] and values in order of the stamps.
@@ -39,10 +47,11 @@ class Rows:
             InputError: a value is not finite, or two rows have one stamp.
 
         """
-        stamps = np.array(self._stamps, dtype=np.int64)
-        values = np.array(self._values, dtype=float).reshape(-1, self._width)
-        order = np.argsort(stamps, kind="stable")
-        stamps, values = stamps[order], values[order]
+        stamps, received, values = self.unsorted()
+        if np.any(stamps[1:] < stamps[:-1]):
+            order = np.argsort(stamps, kind="stable")
+            stamps, values = stamps[order], values[order]
+            received = received[order] if len(received) else received
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             stamp, row = int(stamps[bad][0]), values[bad][0].tolist()
@@ -51,15 +60,33 @@ class Rows:
         if len(twice):
             allowed = f"stamp {stamps[twice[0]]} ns comes twice; record one simulator a bag"
             raise refused(self._path, self._topic, len(twice), allowed)
-        return stamps, np.array(self._received, dtype=np.int64)[order], values
+        return stamps, received, values
+
+    def unsorted(self) -> tuple[Integers, Integers, Array]:
+        """Return stamps, receive times [ns], none where they were not kept, and values."""
+        return (
+            np.frombuffer(self._stamps, dtype=np.int64),
+            np.frombuffer(self._received or b"", dtype=np.int64),
+            np.frombuffer(self._values, dtype=float).reshape(-1, self._width),
+        )
 
 
 def aligned(wanted_ns: Integers, stamps_ns: Integers, _: Integers, rows: Array) -> Array:
     """Pick the rows at the wanted stamps; nan where there is none."""
+    if np.array_equal(wanted_ns, stamps_ns):
+        return rows
     result = np.full((len(wanted_ns), rows.shape[1]), np.nan)
-    _, here, there = np.intersect1d(wanted_ns, stamps_ns, True, True)
-    result[here] = rows[there]
+    there = places(stamps_ns, wanted_ns)
+    result[there >= 0] = rows[there[there >= 0]]
     return result
+
+
+def places(among_ns: Integers, wanted_ns: Integers) -> Integers:
+    """Find where each wanted time stands among ascending ones; -1 where it does not."""
+    if not len(among_ns):
+        return np.full(len(wanted_ns), -1)
+    at = np.minimum(np.searchsorted(among_ns, wanted_ns), len(among_ns) - 1)
+    return np.where(among_ns[at] == wanted_ns, at, -1)
 
 
 def usual(lengths_ns: Integers) -> int:

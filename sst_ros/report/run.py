@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+
 from sst_ros.errors import InputError, Problem
 from sst_ros.report import figures, formulation, jitter, page, recording, reference, summary
+from sst_ros.report.thinning import thinned
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
@@ -27,14 +31,19 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
     run = recording.read(bag)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        integration, ideal = reference.integration(run), reference.ideal(run)
-        result = summary.summarise(run, integration, ideal, formulation.check(run))
         told = jitter.timing(run)
+        # Compiled loops let go of the interpreter: the two comparisons run beside each other.
+        with ThreadPoolExecutor(1) as pool:
+            beside = pool.submit(reference.ideal, run)
+            integration, ideal = reference.integration(run), beside.result()
+        result = summary.summarise(run, integration, ideal, formulation.check(run))
         result |= jitter.numbers(told)
-        pictures = figures.draw(run, integration, ideal, out)
+        # Long jagged curves in one piece take hundreds of megabytes to draw.
+        with mpl.rc_context({"agg.path.chunksize": 1000}):
+            pictures = figures.draw(*thinned(run, integration, ideal), out)
+            page.draw(run, integration, told, result, out / PAGE)
         result["pictures"] = [path.name for path in pictures]
         result["page"] = [PAGE, HTML]
-        page.draw(run, integration, told, result, out / PAGE)
         page.write(result, out / PAGE, pictures, out / HTML)
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(text, encoding="utf-8")

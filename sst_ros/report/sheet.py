@@ -54,6 +54,8 @@ def _run(scene: Scene) -> Iterator[tuple[str, str]]:
         tau = scene.torque
         rows = zip(tau.amplitude, tau.frequency, tau.phase, strict=True)
         yield "torque", ", ".join(f"{a:g} sin({f:g} t + {p:.6g})" for a, f, p in rows) + " N m"
+    if scene.motion is not None:
+        yield "motion", f"{scene.motion.kind}; `python -m sst_ros plan check` says what it asks for"
     yield "duration", "open" if scene.duration is None else f"{scene.duration:g} s"
 
 

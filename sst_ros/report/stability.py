@@ -21,9 +21,12 @@ from sst_ros.integration.machine import Machine, Method
 from sst_ros.integration.tableaux import METHODS
 from sst_ros.integration.walk import Walk
 from sst_ros.progress import slices
+from sst_ros.report import states
 from sst_ros.report.catalogue import Case, cases, run
+from sst_ros.report.states import Vector
 from sst_ros.report.trial import Trial
 from sst_ros.scene import Scene
+from sst_ros.simulation import Simulation
 from sst_ros.terms import Friction, JointFriction
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
@@ -108,11 +111,20 @@ def judge(case: Case) -> Verdict:
             sound = deviation <= case.bound
     energy = closure = None
     if simulation is not None:
-        scale = max(abs(simulation._stored()), abs(simulation._energy), 1e-300)
+        now, begun = simulation.state, states.initial(simulation.scene)[:7]
+        ends = (_stored(simulation, y) for y in ((*now.quaternion, *now.body_rate), begun))
+        scale = max(*map(abs, ends), 1e-300)
         energy, closure = abs(simulation.energy_residual) / scale, simulation.closure_residual
     wall = time.perf_counter() - began
     return Verdict(case.name, case.expected, came, deviation, case.bound, energy, closure, wall,
                    sound)  # fmt: skip
+
+
+def _stored(simulation: Simulation, y: Vector) -> float:
+    """Kinetic and potential energy [J] of a quaternion and a body rate."""
+    dynamics = simulation.dynamics
+    rest = (0.0,) * (len(dynamics.state) - 7 + len(dynamics.drive))
+    return float(sum(dynamics.energies(*y, *rest)[:2]))
 
 
 def largest_step(trial: Trial, method: Method) -> float:

@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import numpy as np
 
-from sst_ros.mechanism import kernel
+from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.start import initial_state
+from sst_ros.mechanism.trace import Program
 from sst_ros.report.recording import Recording
+from sst_ros.report.rows import Integers
 from sst_ros.scene import Scene
 
 Vector = tuple[float, ...]
+Places: TypeAlias = "slice | list[int] | Integers"
+
+_TOGETHER = 8192
 
 SAME_START = 1e-9
 """Largest difference [rad], [rad/s] between a first sample and the start that its scene asks for,
@@ -37,25 +44,33 @@ def lags(scene: Scene) -> bool:
     return scene.actuators is not None and scene.actuators.time_constant is not None
 
 
-def recorded(geometry: Geometry, recording: Recording, sample: int) -> Vector | None:
-    """State at a sample, or None where its orientation was lost.
+def recorded(geometry: Geometry, recording: Recording, samples: Places) -> Array:
+    """States at samples, shape (n, 7 or 10); nan where the orientation was lost.
 
-    W follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
-    that could be singular; the mean of the three is taken. Torques that lag are its effort.
+    Torques that lag are the efforts.
     """
-    quaternion = recording.quaternion[sample]
-    if not np.all(np.isfinite(quaternion)):
-        return None
-    t, w = geometry.e, geometry.w @ rotation_matrix(quaternion)  # rows in {E}
+    quaternion = recording.quaternion[samples]
+    rates = (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
+    rate = body_rates(geometry, quaternion, *(joint[samples] for joint in rates))
+    lagged = [recording.effort[samples]] if lags(recording.scene) else []
+    return np.hstack([quaternion, rate, *lagged])
+
+
+def body_rates(
+    geometry: Geometry, quaternion: Array, gamma_dot: Array, mu_dot: Array, beta_dot: Array
+) -> Array:
+    """Compute W in {E} [rad/s], shape (..., 3), from the rates of the joints [rad/s], (..., 3).
+
+    It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
+    that could be singular; the mean of the three is taken. Where the orientation is nan, it is.
+    """
+    known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
+    rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
+    t, w = geometry.e, geometry.w @ rotation  # rows in {E}
     r = np.cross(t, w)
-    r /= np.linalg.norm(r, axis=1)[:, None]
-    gamma_dot, mu_dot, beta_dot = (
-        rate[sample][:, None]
-        for rate in (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
-    )
-    rate = (w * gamma_dot - r * mu_dot - t * beta_dot).mean(axis=0)
-    lagged = recording.effort[sample].tolist() if lags(recording.scene) else ()
-    return (*quaternion.tolist(), *rate.tolist(), *lagged)
+    r /= np.linalg.norm(r, axis=-1)[..., None]
+    of_legs = w * gamma_dot[..., None] - r * mu_dot[..., None] - t * beta_dot[..., None]
+    return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
 
 
 def begins(recording: Recording) -> bool:
@@ -74,14 +89,25 @@ def begins(recording: Recording) -> bool:
     return bool(np.max(off) < SAME_START)
 
 
-def outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
+def outputs(dynamics: Dynamics, states: Array) -> tuple[Array, Array, Array]:
     """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states.
 
     Rows of nan stay nan.
     """
     quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    gamma, gamma_dot = np.full((2, len(states), 3), np.nan)
-    for row in np.flatnonzero(np.isfinite(states).all(axis=1)):
-        joints = kernel.joints(model, tuple(states[row].tolist()))
-        gamma[row], gamma_dot[row] = joints.gamma, joints.gamma_dot
-    return quaternion, gamma, gamma_dot
+    joints = by_columns(dynamics.joints_program, states[:, :7])
+    return quaternion, joints[:, :3], joints[:, 9:12]
+
+
+def by_columns(program: Program, inputs: Array) -> Array:
+    """Run a program for many inputs at once, shape (n, inputs); returns shape (n, outputs)."""
+    names: dict[str, Any] = {name: getattr(np, name) for name in ("sqrt", "tanh", "exp", "sin")}
+    names |= {"cos": np.cos, "atan2": np.arctan2, "max": np.maximum}
+    exec(program.source("function"), names)
+    result = np.empty((len(inputs), len(program.outputs)))
+    with np.errstate(all="ignore"):
+        for start in range(0, len(inputs), _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            for column, values in enumerate(names["function"](*inputs[part].T.copy())):
+                result[part, column] = values
+    return result

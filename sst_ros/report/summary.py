@@ -50,7 +50,7 @@ def summarise(
     summary |= {
         "formulation_difference_relative": formulation.relative,
         "formulation_states": formulation.states,
-        "effort_difference_max_N_m": _effort_difference(recording),
+        **_effort(recording),
         "topics_missing": list(recording.missing),
         "notes": list(_notes(recording, integration, ideal)),
         "report": made_on(),
@@ -74,7 +74,7 @@ def _run(recording: Recording) -> dict[str, Any]:
         "simulator_error_estimate": _number(told, "error_estimate"),
         "commands_received": _count(told, "commands_received"),
         "commands_dropped": _count(told, "commands_dropped"),
-        "commands_recorded": recording.commands,
+        "commands_recorded": len(recording.commands.torque),
     }
 
 
@@ -117,13 +117,13 @@ def _largest(name: str, deviation: Deviation, seconds: Array | None = None) -> d
     return result
 
 
-def _effort_difference(recording: Recording) -> float | None:
-    """Largest difference between a sample's effort and the torque of the tick that ends at it."""
-    ticks = recording.ticks
-    _, here, there = np.intersect1d(recording.time_ns, ticks.end_ns, True, True)
-    if not len(here):
-        return None
-    return float(np.abs(recording.effort[here] - ticks.torque[there]).max())
+def _effort(recording: Recording) -> dict[str, Any]:
+    """Largest difference of efforts and applied torques, and when."""
+    off = recording.effort_difference
+    known = bool(np.isfinite(off).any())
+    largest = float(np.nanmax(off)) if known else None
+    at = float(recording.seconds[np.nanargmax(off)]) if largest else None
+    return {"effort_difference_max_N_m": largest, "effort_difference_largest_at_s": at}
 
 
 def _notes(recording: Recording, integration: Comparison, ideal: Comparison | None) -> list[str]:

@@ -41,11 +41,15 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield ""
     for name, key in (
         ("period of reception", "period"),
-        ("command to stamp of tick", "command_latency"),
+        ("command to its step", "command_latency"),
+        ("stamp of command to tick", "command_stamp_to_tick"),
     ):
         for word in ("min", "mean", "p99", "p99_9", "max"):
             label = f"{name}, {word.replace('_', '.')}"
             yield _row(label, summary[f"{key}_{word}_us"], ".1f", "us")
+    moment = summary["effort_difference_largest_at_s"]
+    where = "N m" if moment is None else f"N m (at {moment:g} s)"
+    yield _row("effort against applied torque", summary["effort_difference_max_N_m"], ".2e", where)
     yield _row("energy residual, largest", summary["energy_residual_max_J"], ".2e", "J")
     yield ""
     heads = (f"{name} [{unit.replace('_per_', '/')}]" for name, unit in QUANTITIES.items())

@@ -29,6 +29,8 @@ JOINTS, ORIENTATION, EULER = (
 )
 APPLIED, SCENE = "/sst_simulator/applied_torques", "/sst_simulator/scene"
 DIAGNOSTICS, COMMANDS = "/diagnostics", "/sst_simulator/commands"
+DESIRED, ERROR = "/sst_inverse_dynamics/reference", "/sst_inverse_dynamics/tracking_error"
+STAMPED = "/sst_simulator/commands_stamped"
 KINDS = {
     JOINTS: "sensor_msgs/msg/JointState",
     ORIENTATION: "geometry_msgs/msg/QuaternionStamped",
@@ -37,6 +39,9 @@ KINDS = {
     SCENE: "std_msgs/msg/String",
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     COMMANDS: "std_msgs/msg/Float64MultiArray",
+    STAMPED: "sensor_msgs/msg/JointState",
+    DESIRED: "sensor_msgs/msg/JointState",
+    ERROR: "sensor_msgs/msg/JointState",
 }
 
 
@@ -176,6 +181,31 @@ def simulated(scene, seconds: float) -> list[Entry]:
         )
     )
     return sorted(entries, key=lambda entry: entry.received_ns)
+
+
+def tracked(entries: list[Entry], desired) -> list[Entry]:
+    """Add what a controller publishes; `desired` gives angles and rates at t [s], shape (2, 3)."""
+    more = []
+    for entry in entries:
+        if entry.topic == JOINTS and entry.sample >= 0:
+            stamp = entry.content.header.stamp.sec * 10**9 + entry.content.header.stamp.nanosec
+            wanted = np.array(desired((stamp - START_NS) / 1e9))
+            measured = np.array([entry.content.position[:3], entry.content.velocity[:3]])
+            effort = entry.content.effort[:3]
+            for topic, (position, velocity), torque in (
+                (DESIRED, wanted, 0.75 * effort),
+                (ERROR, wanted - measured, 0.25 * effort),
+            ):
+                content = make(
+                    "sensor_msgs/JointState",
+                    header=header(stamp),
+                    name=NAMES[:3],
+                    position=position,
+                    velocity=velocity,
+                    effort=torque,
+                )
+                more.append(Entry(topic, entry.received_ns + 1, content, entry.sample))
+    return sorted([*entries, *more], key=lambda entry: entry.received_ns)
 
 
 def write(path: Path, entries: list[Entry], *, sqlite: bool = False, namespace: str = "") -> Path:

@@ -132,6 +132,15 @@ def test_failures_stay_in_sight(tmp_path):
     draw(found, tmp_path / "picture.png")
 
 
+def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
+    """No method errs there, and a logarithm of that does not exist."""
+    resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
+    found = study(resting, compiled=False, longest_s=0.002)
+    assert found.reference.own.gamma_dot == 0.0
+    assert any(row.largest and row.largest.gamma_dot == 0.0 for row in found.rows)
+    draw(found, tmp_path / "picture.png")
+
+
 def test_a_run_that_stops_is_compared_up_to_its_end():
     trial = Trial(scene.load("example2_thin"))
     assert trial.seconds == pytest.approx(0.9) and "gamma_1 >" in trial.ends

@@ -15,12 +15,13 @@ from sst_ros.report import jitter, recording, reference
 from sst_ros.report.run import report
 from sst_ros.report.table import table
 
-LATENCY_NS = 250_000
+LATENCY_NS = 400_000
+SENT_NS = 50_000
 
 
 @pytest.fixture(scope="module")
 def lively(bags, example2):
-    """Receptions with a known jitter, and the command of every tick a quarter of a ms before it."""
+    """Receptions with a known jitter, and the command of every tick 0.4 ms before its step."""
     entries = []
     for entry in example2:
         late = 30_000 if entry.sample > 0 and entry.sample % 10 == 0 else 0
@@ -32,7 +33,8 @@ def lively(bags, example2):
             layout=bags.make("std_msgs/MultiArrayLayout", dim=[], data_offset=0),
             data=np.array(profile(tick * bags.TICK_NS / 1e9)),
         )
-        received = bags.START_NS + tick * bags.TICK_NS - LATENCY_NS
+        # The step of a tick begins when it ends, which is told SENT_NS later.
+        received = bags.START_NS + (tick + 1) * bags.TICK_NS + SENT_NS - LATENCY_NS
         entries.append(bags.Entry(bags.COMMANDS, received, command))
     return sorted(entries, key=lambda entry: entry.received_ns)
 
@@ -49,7 +51,10 @@ def test_periods_and_latency_are_what_they_were_made(tmp_path, bags, lively):
     assert numbers["period_mean_us"] == pytest.approx(2000.0, abs=0.5)
     assert numbers["period_p99_9_us"] == pytest.approx(2030.0)
     assert numbers["commands_followed"] == 300
-    assert numbers["command_latency_min_us"] == numbers["command_latency_max_us"] == 250.0
+    assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
+    assert numbers["command_latency_max_us"] == pytest.approx(430.0, abs=1e-2)  # a late sample's
+    assert numbers["command_latency_mean_us"] == pytest.approx(403.0, abs=0.1)
+    assert numbers["command_stamp_to_tick_mean_us"] is None
     assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
     assert numbers["energy_residual_max_J"] < 1e-12
     assert not len(found.lost_s) and not len(found.gaps_s) and numbers["not_told"] == []
@@ -104,7 +109,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     assert len(pictures) == 1 + len(summary["pictures"])
     assert base64.b64decode(pictures[0]) == (out / "page.png").read_bytes()
     assert "http" not in re.sub(r"base64,[^']+", "", text)
-    assert "command to stamp of tick, mean" in text
+    assert "command to its step, mean" in text
     assert "What the recording does not tell" in text
     assert "Not told: no diagnostics" in table(summary)
 
@@ -117,8 +122,65 @@ def test_what_is_missing_is_said(tmp_path, bags, example2):
     assert any("no diagnostics" in words for words in numbers["not_told"])
 
 
-def test_clocks_that_differ_are_not_compared(tmp_path, bags, lively):
+def test_stamps_of_another_clock_do_not_matter(tmp_path, bags, lively):
     entries = [dataclasses.replace(e, received_ns=e.received_ns - 10**15) for e in lively]
     numbers = jitter.numbers(_timing(bags, tmp_path, entries))
-    assert numbers["command_latency_mean_us"] is None and numbers["period_max_us"] == 2030.0
-    assert any("not of the recorder's clock" in words for words in numbers["not_told"])
+    assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
+    assert numbers["period_max_us"] == 2030.0
+
+
+def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(tmp_path, bags, example2):
+    """The torque of every other tick answers the sample of two milliseconds before it."""
+    profile, entries = sine(scene.load("example2").torque), list(example2)
+    for tick in range(2, 300, 2):
+        command = bags.make(
+            "sensor_msgs/JointState",
+            header=bags.header(bags.START_NS + (tick - 2) * bags.TICK_NS),
+            name=["gamma_2", "gamma_1", "gamma_3"],
+            position=np.empty(0),
+            velocity=np.empty(0),
+            effort=np.array(profile(tick * bags.TICK_NS / 1e9))[[1, 0, 2]],
+        )
+        received = bags.START_NS + tick * bags.TICK_NS
+        entries.append(bags.Entry(bags.STAMPED, received, command))
+    found = _timing(bags, tmp_path, sorted(entries, key=lambda entry: entry.received_ns))
+    numbers = jitter.numbers(found)
+    assert numbers["commands_followed"] == 149
+    for word in ("min", "mean", "max"):
+        assert numbers[f"command_stamp_to_tick_{word}_us"] == 2000.0
+    assert numbers["command_latency_mean_us"] == pytest.approx(1050.0, abs=1e-2)
+
+
+def test_ticks_that_were_missed_show_when_they_were(tmp_path, bags, example2):
+    """At 0.1 s the simulator falls behind by seven ticks, and says so from then on."""
+    entries = [
+        dataclasses.replace(e, received_ns=e.received_ns + 7 * bags.TICK_NS * (e.sample > 50))
+        for e in bags.without(example2, bags.DIAGNOSTICS)
+    ]
+    reports = {0.04: 0, 0.08: 0, 0.12: 7, 0.16: 7, 0.2: 7}
+    for seconds, missed in reports.items():
+        received = bags.START_NS + round(seconds * 1e9) + SENT_NS + missed * bags.TICK_NS
+        entries.append(bags.diagnostics_entry(received, phase="running", ticks_missed=missed))
+    found = _timing(bags, tmp_path, sorted(entries, key=lambda entry: entry.received_ns))
+    assert found.missed_s == pytest.approx(list(reports), abs=1e-9)
+    assert found.missed.tolist() == list(reports.values())
+    assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
+    assert not len(found.lost_s)
+    assert numbers_of_run(tmp_path)["ticks_missed"] == 7
+
+
+def numbers_of_run(folder):
+    return report(folder / "bag", folder / "out")
+
+
+def test_an_altered_effort_of_joint_states_shows_when_it_was(tmp_path, bags, example2):
+    def altered(message):
+        return dataclasses.replace(message, effort=message.effort + 1e-9 * np.eye(9)[1])
+
+    path = bags.write(tmp_path / "bag", bags.edited(example2, bags.JOINTS, 75, altered))
+    off = recording.read(path).effort_difference
+    assert np.isnan(off[0]) and np.flatnonzero(off > 0.0).tolist() == [75]
+    summary = numbers_of_run(tmp_path)
+    assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
+    assert summary["effort_difference_largest_at_s"] == 0.15
+    assert "(at 0.15 s)" in table(summary)

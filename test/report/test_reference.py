@@ -123,7 +123,7 @@ def test_a_wrong_start_is_an_error(run):
 def test_states_of_samples_are_whole(run):
     model = kernel.model_of(run.scene)
     for sample in (0, 75, 150):
-        y = states.recorded(Geometry.of(run.scene), run, sample)
+        y = states.recorded(Geometry.of(run.scene), run, [sample])[0].tolist()
         joints = kernel.joints(model, y)
         for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"):
             assert np.allclose(getattr(joints, name), getattr(run, name)[sample], atol=1e-13)

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a long run: how long `report run` takes for an hour at 500 Hz, and how much memory.
+
+python -m benchmark.long_bag [--seconds 3600] [--bag FOLDER] [--sqlite] [--json FILE]
+
+The bag is a true run: Example 2 with springs and friction in its actuators, so that it stays inside
+for ever, solved by single steps at 1 kHz. Every message is what the nodes would send, made by
+writing numbers into the bytes of one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from benchmark import machine
+from sst_ros import document
+from sst_ros import scene as scenes
+from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.mechanism.geometry import Array
+from sst_ros.progress import slices
+from sst_ros.report.messages import JOINTS
+from sst_ros.report.motion import Course, Motion
+from sst_ros.report.states import by_columns, initial
+from sst_ros.scene import Scene
+from sst_ros.terms import Friction, JointFriction, Spring
+
+AT_MOST_S, AT_MOST_GB = 120.0, 1.5
+START_NS, TICK_NS, TICKS_A_SAMPLE = 1_700_000_000_000_000_000, 1_000_000, 2
+SENT_NS, ANSWER_NS = 150_000, 400_000
+"""Receptions of a sample, and of the command that answers it, after the sample's stamp."""
+
+STORE = get_typestore(Stores.ROS2_KILTED)
+
+_CHUNK = 5000
+_MARK = 1.2345678901234567e300
+
+
+def endless() -> Scene:
+    """Return a scene whose motion goes on inside for ever."""
+    example = scenes.load("example2")
+    springs = tuple(Spring(joint=f"gamma_{k}", stiffness=40.0, rest=math.pi / 4) for k in (1, 2, 3))
+    friction = JointFriction(gamma=Friction(viscous=1.0))
+    return dataclasses.replace(
+        example, name="endless", springs=springs, friction=friction, duration=None
+    )
+
+
+def write(path: Path, seconds: float, *, sqlite: bool = False, shown: bool = False) -> Path:
+    """Write the bag of a run of the endless scene; its folder must not exist."""
+    scene, samples = endless(), round(seconds * 1e9 / TICK_NS / TICKS_A_SAMPLE)
+    kinds = {
+        "/joint_states": _joint_state(),
+        "/sst_simulator/orientation": _of_stamped("Quaternion", "quaternion", "xyzw"),
+        "/sst_simulator/euler_zyz": _of_stamped("Vector3", "vector", "xyz"),
+        "/sst_simulator/applied_torques": _trajectory(),
+        "/sst_simulator/commands": _command(),
+    }
+    plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {
+            topic: writer.add_connection(topic, message.__msgtype__, typestore=STORE)
+            for topic, message in kinds.items()
+        }
+        raw = {t: bytes(STORE.serialize_cdr(m, m.__msgtype__)) for t, m in kinds.items()}
+        text = _make("std_msgs/String", data=document.dump(scene))
+        told = writer.add_connection("/sst_simulator/scene", text.__msgtype__, typestore=STORE)
+        writer.write(told, START_NS, STORE.serialize_cdr(text, text.__msgtype__))
+        for rows, run in _run(scene, samples, shown):
+            stamps = START_NS + np.arange(rows.start, rows.stop) * TICK_NS * TICKS_A_SAMPLE
+            before = stamps - TICK_NS * TICKS_A_SAMPLE
+            numbers = {
+                "/joint_states": (stamps, run["joints"]),
+                "/sst_simulator/orientation": (stamps, run["quaternion"]),
+                "/sst_simulator/euler_zyz": (stamps, run["euler"]),
+                "/sst_simulator/applied_torques": (before, run["torque"]),
+                "/sst_simulator/commands": (None, run["torque"][:, -3:]),
+            }
+            first = int(rows.start == 0)  # a start has no torques before it
+            patched = {t: _patched(raw[t], *numbers[t]) for t in numbers}
+            for k, stamp in enumerate(stamps.tolist()):
+                for topic, connection in connections.items():
+                    if k >= first or topic.endswith(("states", "orientation", "zyz")):
+                        late = ANSWER_NS - 2 * TICK_NS if topic.endswith("commands") else SENT_NS
+                        writer.write(connection, stamp + late, patched[topic][k].tobytes())
+    return path
+
+
+def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[str, Array]]]:
+    """Solve the scene; yield rows of samples in turn, and what the messages of each hold."""
+    torque = scene.torque
+    assert torque is not None
+    motion = Motion(scene, None, compiled=True)
+    y = initial(scene)
+    for rows in slices(samples + 1, _CHUNK, "writing a run", shown):
+        number = np.arange(rows.start, rows.stop)
+        # Each sample is answered by a torque, which is held until the next one.
+        answered = np.maximum(number - 1, 0)[:, None] * (TICKS_A_SAMPLE * TICK_NS / 1e9)
+        held = torque.amplitude * np.sin(torque.frequency * answered + torque.phase)
+        ticks = np.arange((rows.start - 1) * TICKS_A_SAMPLE, (rows.stop - 1) * TICKS_A_SAMPLE)
+        run = ticks >= 0
+        start = ticks[run] * TICK_NS
+        course = Course(start, start + TICK_NS, np.repeat(held, TICKS_A_SAMPLE, axis=0)[run])
+        reached, _ = motion.follow(y, course, np.ones(len(start), dtype=np.int64))
+        state = reached[TICKS_A_SAMPLE - 1 :: TICKS_A_SAMPLE]
+        if not rows.start:
+            state = np.vstack([y, state])
+        y = tuple(state[-1].tolist())
+        angles = by_columns(motion.dynamics.joints_program, state)
+        effort = np.zeros((len(state), 9))
+        effort[:, :3] = held * (number > 0)[:, None]
+        yield (
+            rows,
+            {
+                "joints": np.hstack([angles, effort]),
+                "quaternion": state[:, :4],
+                "euler": zyz_angles(rotation_matrix(state[:, :4])),
+                "torque": np.tile(held, TICKS_A_SAMPLE),
+            },
+        )
+
+
+def _patched(raw: bytes, stamps: Any, numbers: Array) -> Array:
+    """Copies of a serialized message with other stamps and numbers in the places of the marks."""
+    rows = np.tile(np.frombuffer(raw, np.uint8), (len(numbers), 1))
+    mark = np.float64(_MARK).tobytes()
+    at = -8
+    for column in numbers.T:
+        at = raw.index(mark, at + 8)
+        rows[:, at : at + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
+    if stamps is not None:
+        time_ns = np.stack([stamps // 10**9, stamps % 10**9], axis=1).astype("<u4")
+        rows[:, 4:12] = time_ns.view(np.uint8)
+    return rows
+
+
+def _make(kind: str, **fields: Any) -> Any:
+    package, name = kind.split("/")
+    return STORE.types[f"{package}/msg/{name}"](**fields)
+
+
+def _time(nanoseconds: int, kind: str = "Time") -> Any:
+    return _make(f"builtin_interfaces/{kind}", sec=0, nanosec=nanoseconds)
+
+
+def _header() -> Any:
+    return _make("std_msgs/Header", stamp=_time(0), frame_id="base")
+
+
+def _joint_state() -> Any:
+    marks = {name: np.full(9, _MARK) for name in ("position", "velocity", "effort")}
+    return _make("sensor_msgs/JointState", header=_header(), name=list(JOINTS), **marks)
+
+
+def _of_stamped(kind: str, field: str, letters: Sequence[str]) -> Any:
+    inner = _make(f"geometry_msgs/{kind}", **dict.fromkeys(letters, _MARK))
+    return _make(f"geometry_msgs/{kind}Stamped", header=_header(), **{field: inner})
+
+
+def _trajectory() -> Any:
+    none = {name: np.empty(0) for name in ("positions", "velocities", "accelerations")}
+    points = [
+        _make("trajectory_msgs/JointTrajectoryPoint", **none, effort=np.full(3, _MARK),
+              time_from_start=_time((k + 1) * TICK_NS, "Duration"))
+        for k in range(TICKS_A_SAMPLE)
+    ]  # fmt: skip
+    names = list(JOINTS[:3])
+    return _make(
+        "trajectory_msgs/JointTrajectory", header=_header(), joint_names=names, points=points
+    )
+
+
+def _command() -> Any:
+    layout = _make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
+    return _make("std_msgs/Float64MultiArray", layout=layout, data=np.full(3, _MARK))
+
+
+def reported(bag: Path, out: Path) -> tuple[float, float, float]:
+    """Report a bag in a process of its own; wall time, processor time [s], peak memory [GB]."""
+    command = [sys.executable, "-m", "sst_ros", "report", "run", str(bag), "--out", str(out)]
+    began = time.perf_counter()
+    child = os.posix_spawn(command[0], command, dict(os.environ))
+    _, status, used = os.wait4(child, 0)
+    if status:
+        raise SystemExit(f"report run has failed: {os.waitstatus_to_exitcode(status)}")
+    wall = time.perf_counter() - began
+    return wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the bag, report it, print what that took and the verdict; the exit status is 0."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.long_bag", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--bag", type=Path, help="write it there and keep it; used if it exists")
+    parser.add_argument("--sqlite", action="store_true")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        bag = options.bag or Path(folder) / "bag"
+        if not bag.exists():
+            write(bag, options.seconds, sqlite=options.sqlite, shown=True)
+        size = sum(file.stat().st_size for file in bag.iterdir()) / 1e9
+        wall, busy, memory = reported(bag, Path(folder) / "report")
+        told = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
+    found = {
+        "samples": told["samples_recorded"],
+        "ticks": told["ticks_recorded"],
+        "samples_compared": told["samples_compared"],
+        "bag_GB": size,
+        "wall_s": wall,
+        "processor_s": busy,
+        "peak_GB": memory,
+        "integration_error_gamma_rad": told["integration_error_gamma_rad"],
+        "integration_reference_error_gamma_rad": told["integration_reference_error_gamma_rad"],
+    }
+    for name, value in found.items():
+        print(f"{name:40} {value:.4g}" if isinstance(value, float) else f"{name:40} {value}")
+    good = wall < AT_MOST_S and memory < AT_MOST_GB
+    print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
+    told_machine = machine.described("numpy", "numba", "rosbags", "matplotlib")
+    print(machine.line(told_machine))
+    if options.json:
+        text = json.dumps({"found": found, "machine": told_machine}, indent=2)
+        options.json.write_text(text + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

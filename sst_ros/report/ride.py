@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
+"""Loops of the report over many ticks, as text: `motion` puts them behind a scene's functions.
+
+Like `integration.loops`, whose `march` they call, they run as plain Python and under numba.
+"""
+# ruff: noqa: F821
+
+from __future__ import annotations
+
+
+def ride(times, lengths, counts, drives, ends, y, reached):
+    """Take y through ticks, tick k by counts[k] steps; reached[k] becomes the state at its end.
+
+    A row of ends is (joint, sign, angle): there is an impact where sign (q - angle) < -TOUCHING.
+
+    Returns how many ticks were done, and whether it was an impact that ended it; y is then beyond.
+    """
+    joints = vector(18)
+    for k in range(len(times)):
+        h = lengths[k] / counts[k]
+        for i in range(counts[k]):
+            march(times[k] + i * h, h, 1, y, drives[k], y)
+            if len(ends):
+                joints_of(y, joints)
+                for end in ends:
+                    if end[1] * (joints[int(end[0])] - end[2]) < -TOUCHING:
+                        return k, True
+        total = 0.0
+        for i in range(SIZE):
+            total += y[i]
+            reached[k][i] = y[i]
+        if total - total != 0.0:
+            return k, False
+    return len(times), False
+
+
+def work_done(states, first, lengths, drives, work):
+    """Work over the ticks first[k] to first[k + 1] from states[k] on, one step each: work[k]."""
+    y = vector(SIZE)
+    for k in range(len(work)):
+        for i in range(SIZE - 1):
+            y[i] = states[k][i]
+        y[SIZE - 1] = 0.0
+        for row in range(first[k], first[k + 1]):
+            march(0.0, lengths[row], 1, y, drives[row], y)
+        work[k] = y[SIZE - 1]
