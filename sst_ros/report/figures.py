@@ -17,7 +17,8 @@ from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report.recording import Recording
 from sst_ros.report.reference import Comparison, Deviation
-from sst_ros.report.rows import NANOSECONDS
+from sst_ros.report.rows import NANOSECONDS, Integers
+from sst_ros.scene import Scene
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """Colours that the colour-blind can tell apart (Okabe and Ito); line styles tell them apart too."""
@@ -68,40 +69,64 @@ def draw(
     recording: Recording, integration: Comparison, ideal: Comparison | None, out: Path
 ) -> list[Path]:
     """Write all pictures of a run as PNG files into the folder `out` and return their paths."""
-    rotation = np.full((len(recording.time_ns), 3, 3), np.nan)
-    whole = np.isfinite(recording.quaternion[:, 0])
-    rotation[whole] = rotation_matrix(recording.quaternion[whole])
-    position = recording.scene.star.radius * rotation[:, :, 2]
-    angles = np.where(np.isfinite(recording.euler), recording.euler, zyz_angles(rotation))
-    degrees = np.degrees(_unwrapped(angles))
-    seconds = recording.seconds
+    scene, seconds, ticks = recording.scene, recording.seconds, recording.ticks
+    position = scene.star.radius * rotations(recording.quaternion)[:, :, 2]
+    degrees = angles(recording.quaternion, recording.euler)
     pictures: dict[str, Callable[[], Figure]] = {
-        "path_of_E": lambda: _path(recording, position),
-        "position_of_E": lambda: _curves(
-            seconds, position, ("x", "y", "z"), "position of E in {B} [m]", 0.05
-        ),
-        "theta": lambda: _curves(seconds, degrees[:, :1], ("θ",), "θ [deg]", 1.0),
-        "phi": lambda: _curves(seconds, degrees[:, 1:2], ("φ",), "φ [deg]", 1.0),
-        "psi": lambda: _curves(seconds, degrees[:, 2:], ("ψ",), "ψ [deg]", 1.0),
-        "torques": lambda: _torques(recording),
+        "path_of_E": lambda: path(scene, position),
+        "position_of_E": lambda: position_of_e(seconds, position),
+        "theta": lambda: angle(seconds, degrees, 0),
+        "phi": lambda: angle(seconds, degrees, 1),
+        "psi": lambda: angle(seconds, degrees, 2),
+        "torques": lambda: torques(ticks.start_ns, ticks.end_ns, ticks.torque),
         "error": lambda: _errors(seconds, integration, ideal),
     }
-    numbers = NUMBERS.get(recording.scene.name, {})
     paths = []
     with mpl.rc_context(STYLE):
         for name, make in pictures.items():
             figure = make()
-            title = f"{TITLES[name]}, {recording.scene.name}"
-            if name in numbers:
-                title += f" (Fig. {numbers[name]} of the paper)"
-                name = f"fig{numbers[name]:02d}_{name}"
+            numbered, title = named(name, scene.name)
             figure.suptitle(title, fontsize=11)
-            paths.append(out / f"{name}.png")
+            paths.append(out / f"{numbered}.png")
             figure.savefig(paths[-1])
     return paths
 
 
-def _curves(
+def named(name: str, scene: str | None) -> tuple[str, str]:
+    """Name the file and the title of one of TITLES; the paper's figures bear their numbers."""
+    title = TITLES[name] + (f", {scene}" if scene else "")
+    number = NUMBERS.get(scene or "", {}).get(name)
+    if number is None:
+        return name, title
+    return f"fig{number:02d}_{name}", f"{title} (Fig. {number} of the paper)"
+
+
+def rotations(quaternion: Array) -> Array:
+    """Rotations R, shape (n, 3, 3), of quaternions (n, 4); nan stays nan."""
+    result = np.full((len(quaternion), 3, 3), np.nan)
+    whole = np.isfinite(quaternion[:, 0])
+    result[whole] = rotation_matrix(quaternion[whole])
+    return result
+
+
+def angles(quaternion: Array, euler: Array) -> Array:
+    """ZYZ angles [deg] without jumps, shape (n, 3): as recorded, else of the orientation."""
+    recorded = np.where(np.isfinite(euler), euler, zyz_angles(rotations(quaternion)))
+    return np.asarray(np.degrees(_unwrapped(recorded)))
+
+
+def position_of_e(seconds: Array, position: Array) -> Figure:
+    """Draw the coordinates of E [m], shape (n, 3), over time."""
+    return curves(seconds, position, ("x", "y", "z"), "position of E in {B} [m]", 0.05)
+
+
+def angle(seconds: Array, degrees: Array, which: int) -> Figure:
+    """Draw one of the ZYZ angles [deg], shape (n, 3), over time."""
+    letter = "θφψ"[which]
+    return curves(seconds, degrees[:, which : which + 1], (letter,), f"{letter} [deg]", 1.0)
+
+
+def curves(
     seconds: Array, values: Array, names: Sequence[str], label: str, least_span: float
 ) -> Figure:
     """Draw columns over time; an axis never shows less than `least_span`, so rounding is flat."""
@@ -117,27 +142,30 @@ def _curves(
     axes.set_xlabel("time t [s]")
     axes.set_ylabel(label)
     if len(names) > 1:
-        _legend_above(axes)
+        legend_above(axes)
     return figure
 
 
-def _torques(recording: Recording) -> Figure:
-    """Draw the torques as they were held; what is not recorded is a gap."""
-    ticks = recording.ticks
-    times = np.stack([ticks.start_ns, ticks.end_ns], axis=1).ravel() / NANOSECONDS
-    held = np.repeat(ticks.torque, 2, axis=0)
-    gaps = 2 * (np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1]) + 1)
-    times, held = np.insert(times, gaps, times[gaps]), np.insert(held, gaps, np.nan, axis=0)
-    return _curves(times, held, ("τ₁", "τ₂", "τ₃"), "torque τ [N m]", 0.1)
+def torques(start_ns: Integers, end_ns: Integers, torque: Array) -> Figure:
+    """Draw the torques of ticks [N m], shape (n, 3), as they were held."""
+    return curves(*held(start_ns, end_ns, torque), ("τ₁", "τ₂", "τ₃"), "torque τ [N m]", 0.1)
 
 
-def _path(recording: Recording, position: Array) -> Figure:
+def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:
+    """Return times [s] and values that draw what each tick held; a gap is nan."""
+    times = np.stack([start_ns, end_ns], axis=1).ravel() / NANOSECONDS
+    steps = np.repeat(values, 2, axis=0)
+    gaps = 2 * (np.flatnonzero(start_ns[1:] != end_ns[:-1]) + 1)
+    return np.insert(times, gaps, times[gaps]), np.insert(steps, gaps, np.nan, axis=0)
+
+
+def path(scene: Scene, position: Array) -> Figure:
     """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
     figure = Figure(figsize=(6.4, 5.8))
     axes = figure.add_subplot(projection="3d")
-    geometry = Geometry.of(recording.scene)
-    base, star = recording.scene.base.radius, recording.scene.star.radius
-    outline = _triangle(geometry)
+    geometry = Geometry.of(scene)
+    base, star = scene.base.radius, scene.star.radius
+    outline = triangle(geometry)
     axes.plot(*(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃")
     if star != base:
         image = "its image on the sphere of E"
@@ -195,12 +223,12 @@ def _columns(deviation: Deviation) -> tuple[Array, Array, Array]:
     return deviation.gamma, deviation.gamma_dot, deviation.orientation
 
 
-def _legend_above(axes: Axes) -> None:
+def legend_above(axes: Axes) -> None:
     """Put the legend where no curve can be."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=3, borderaxespad=0.2)
 
 
-def _triangle(geometry: Geometry) -> Array:
+def triangle(geometry: Geometry) -> Array:
     """Points of the closed base triangle on the unit sphere, shape (n, 3)."""
     share = np.linspace(0.0, 1.0, 40)[:, None]
     sides = []

@@ -41,7 +41,7 @@ def draw(
 
 
 def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
-    view = _View(chart.geometry)
+    view = View(chart.geometry)
     poses = singularities.parallel(chart)
     share = f"E reaches {100 * _reached(chart, faces):.0f} % of the triangle"
     worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
@@ -82,7 +82,7 @@ def _reached(chart: OrientationMap, faces: NDArray[np.intp]) -> float:
 
 def _panel(
     axes: Axes,
-    view: _View,
+    view: View,
     chart: OrientationMap,
     faces: NDArray[np.intp],
     values: Array,
@@ -122,7 +122,7 @@ def _panel(
             color=_INK, ha="center",
             bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75},
         )  # fmt: skip
-    _frame(axes, view)
+    frame(axes, view)
 
 
 def _contours(
@@ -139,7 +139,7 @@ def _contours(
         axes.clabel(lines, fontsize=7.5, fmt="%g" if limits[1] else "%g°")
 
 
-def _frame(axes: Axes, view: _View) -> None:
+def frame(axes: Axes, view: View) -> None:
     """Draw the base triangle with its corners and the sense of gamma along its arcs."""
     geometry = view.geometry
     reach = max(float(np.hypot(*view.flat(v))) for v in geometry.v)
@@ -168,7 +168,7 @@ def _beside(axes: Axes, point: Array, label: str) -> None:
     axes.text(x, y, label, fontsize=12, color=_INK, ha="center", va="center")
 
 
-class _View:
+class View:
     """Equal-area projection about the middle of the base triangle, P_1 upward."""
 
     def __init__(self, geometry: Geometry) -> None:

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several runs in one picture, and how far they are apart.
+
+Runs are laid on each other by the time since the start of each, in whole nanoseconds; only samples
+that both have are compared, nothing is interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot import sphere
+from sst_ros.plot.catalogue import known, save
+from sst_ros.plot.control import torques
+from sst_ros.plot.panels import legend, stack, three
+from sst_ros.report.contents import SCENE
+from sst_ros.report.figures import BLUE, GREEN, STYLE, VERMILION
+from sst_ros.report.signals import Signals
+
+STYLES: tuple[dict[str, Any], ...] = (
+    {"color": BLUE, "linestyle": "-", "linewidth": 3.0},
+    {"color": VERMILION, "linestyle": "--", "linewidth": 1.9},
+    {"color": GREEN, "linestyle": ":", "linewidth": 2.0},
+    {"color": "#CC79A7", "linestyle": "-.", "linewidth": 1.5},
+    {"color": "#E69F00", "linestyle": (0, (5, 1)), "linewidth": 1.2},
+    {"color": "#000000", "linestyle": "-", "linewidth": 0.8},
+)
+"""A run each; thinner above thicker, so that runs that coincide can all be seen."""
+
+
+class Difference(NamedTuple):
+    """How far a run is from the first one.
+
+    Attributes:
+        name: of the run.
+        common: samples that both have.
+        of: samples of the run.
+        gamma: largest difference of an angle gamma_k, and root of the mean square over samples and
+            legs [rad]; nan where nothing is common.
+        gamma_dot: the same of the rates [rad/s].
+        turn: largest angle between the orientations of the star [rad].
+
+    """
+
+    name: str
+    common: int
+    of: int
+    gamma: tuple[float, float]
+    gamma_dot: tuple[float, float]
+    turn: float
+
+
+class Overlay(NamedTuple):
+    """A picture of several runs: title, topics needed, quantity, its letter and unit."""
+
+    title: str
+    needs: tuple[str, ...]
+    quantity: str = ""
+    letter: str = ""
+    unit: str = ""
+    scale: float = 1.0
+
+
+JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
+PICTURES = {
+    "gamma": Overlay("Actuator angles", (JOINTS,), "gamma", "γ", "deg", 180.0 / np.pi),
+    "gamma_dot": Overlay("Actuator rates", (JOINTS,), "gamma_dot", "γ̇", "rad/s"),
+    "tracking_error": Overlay("Desired less measured angles", (ERROR,), "gamma_error", "Δγ", "rad"),
+    "torques": Overlay("Applied torques", (TICKS,), "tau", "τ", "N m"),
+    "difference": Overlay("Differences from the first run", (JOINTS,)),
+    "sphere": Overlay("Path of E in the workspace", (TURN, SCENE.key)),
+}
+
+
+def draw(
+    runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
+) -> tuple[list[Path], dict[str, str]]:
+    """Write the pictures of several runs into `out`, as `catalogue.draw` does of one.
+
+    Raises:
+        InputError: there are more runs than can be told apart, a name is unknown, or `out` cannot
+            be written.
+
+    """
+    if not 2 <= len(runs) <= len(STYLES):
+        allowed = f"must be 2 to {len(STYLES)} bags, which can be told apart"
+        raise InputError("plot", [Problem("compare", len(runs), allowed)])
+    names = labels(runs)
+    paths: list[Path] = []
+    missing: dict[str, str] = {}
+    for name in known(only, PICTURES) or list(PICTURES):
+        picture = PICTURES[name]
+        able = [not set(picture.needs) & set(run.missing) for run in runs]
+        left = [label for label, can in zip(names, able, strict=True) if not can]
+        if left:
+            missing[name] = f"without {', '.join(left)}: no {' or '.join(picture.needs)} there"
+        if not any(able) or (name == "difference" and not (able[0] and any(able[1:]))):
+            missing[name] = f"not drawn: {missing[name]}"
+            continue
+        make = {"difference": _difference, "sphere": _sphere}.get(name, _overlay)
+        drawn = [
+            (run, label, style)
+            for run, label, style, can in zip(runs, names, STYLES, able, strict=False)
+            if can
+        ]
+        with mpl.rc_context(STYLE):
+            paths += save(make(picture, drawn), picture.title, out, f"compare_{name}")
+    return paths, missing
+
+
+Drawn = Sequence[tuple[Signals, str, dict[str, Any]]]
+
+
+def _overlay(picture: Overlay, runs: Drawn) -> Figure:
+    labels = [f"{letter} [{picture.unit}]" for letter in three(picture.letter)]
+    figure, panels = stack(labels)
+    for run, label, style in runs:
+        if picture.quantity == "tau":
+            seconds, values = torques(run)
+        else:
+            seconds, values = run.seconds(), picture.scale * run.legs(picture.quantity)
+        for axes, column in zip(panels, values.T, strict=True):
+            axes.plot(seconds, column, label=label, **style)
+    legend(panels[0])
+    return figure
+
+
+def _difference(_: Overlay, runs: Drawn) -> Figure:
+    figure, panels = stack(["largest |Δγₖ| [rad]", "largest |Δγ̇ₖ| [rad/s]"], 2.6)
+    first = runs[0][0]
+    for axes, name in zip(panels, ("gamma", "gamma_dot"), strict=True):
+        some = False
+        for run, label, style in runs[1:]:
+            here, there = _common(first, run)
+            apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
+            largest = apart.max(axis=1, initial=0.0)
+            shown = np.where(largest > 0.0, largest, np.nan)
+            axes.plot(run.seconds()[there], shown, label=label, **style)
+            some |= bool((apart > 0.0).any())
+        if some:
+            axes.set_yscale("log")
+        else:
+            axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")
+    legend(panels[0])
+    return figure
+
+
+def _sphere(_: Overlay, runs: Drawn) -> Figure:
+    scene = runs[0][0].scene
+    assert scene is not None
+    figure, axes, view = sphere.ground(scene)
+    for run, label, style in runs:
+        axes.plot(*view.flat(sphere.directions(run)), label=label, **style)
+    axes.legend(loc="upper left", fontsize=8, frameon=False)
+    return figure
+
+
+def differences(runs: Sequence[Signals]) -> list[Difference]:
+    """Compare each run with the first one, at the stamps that both have."""
+    return [
+        _compared(runs[0], run, name)
+        for run, name in list(zip(runs, labels(runs), strict=True))[1:]
+    ]
+
+
+def _compared(first: Signals, run: Signals, name: str) -> Difference:
+    here, there = _common(first, run)
+    of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
+    numbers: list[float] = []
+    for quantity in ("gamma", "gamma_dot"):
+        if "joint_states" in first.missing or "joint_states" in run.missing:
+            numbers += [np.nan, np.nan]
+            continue
+        apart = run.legs(quantity)[there] - first.legs(quantity)[here]
+        apart = apart[np.isfinite(apart)]
+        squares = float(np.mean(apart**2)) if len(apart) else np.nan
+        numbers += [_largest(np.abs(apart)), float(np.sqrt(squares))]
+    turn = np.nan
+    if "orientation" not in (*first.missing, *run.missing):
+        q = ("q_x", "q_y", "q_z", "q_w")
+        turn = _largest(angle_between(first.take(*q)[here], run.take(*q)[there]))
+    return Difference(name, len(here), of, (numbers[0], numbers[1]), (numbers[2], numbers[3]), turn)
+
+
+def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Places of the samples that two runs have at the same time since their starts."""
+    if "samples" not in first.tables or "samples" not in run.tables:
+        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
+    both = np.intersect1d(first.time_ns("samples"), run.time_ns("samples"), True, True)
+    return both[1], both[2]
+
+
+def _largest(values: Array) -> float:
+    known_values = values[np.isfinite(values)]
+    return float(known_values.max()) if len(known_values) else float("nan")
+
+
+def labels(runs: Sequence[Signals]) -> list[str]:
+    """Name each run by the shortest end of its path that no other has."""
+    parts = [run.path.resolve().parts for run in runs]
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{index}: {run.path}" for index, run in enumerate(runs, 1)]
+
+
+def table(runs: Sequence[Signals]) -> str:
+    """Write the differences as text."""
+    head = (
+        f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
+        "the start of each run\n(whole nanoseconds, nothing interpolated):\n"
+    )
+    units = ("", "samples", "γ max [rad]", "γ rms [rad]", "γ̇ max [rad/s]", "γ̇ rms [rad/s]",
+             "turn max [rad]")  # fmt: skip
+    rows: list[tuple[str, ...]] = [units]
+    for found in differences(runs):
+        numbers = (
+            "-" if np.isnan(x) else f"{x:.3e}" for x in (*found.gamma, *found.gamma_dot, found.turn)
+        )
+        rows.append((found.name, f"{found.common} of {found.of}", *numbers))
+    widths = [max(_width(row[place]) for row in rows) for place in range(len(units))]
+    text = []
+    for row in rows:
+        first, *others = (" " * (w - _width(cell)) for cell, w in zip(row, widths, strict=True))
+        padded = (pad + cell for pad, cell in zip(others, row[1:], strict=True))
+        text.append("  ".join([row[0] + first, *padded]).rstrip())
+    return "\n".join([head, *text, ""])
+
+
+def _width(text: str) -> int:
+    """Columns that a text takes: the dot above a letter takes none."""
+    return len(text.replace("\u0307", ""))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a run: all that the bag allows, with units, told apart without colour, as vectors."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros import __main__ as cli
+from sst_ros import scene
+from sst_ros.plot import catalogue, energy
+from sst_ros.plot.catalogue import PICTURES, draw
+from sst_ros.report import balance, recording, signals
+from sst_ros.simulation import Simulation
+
+GAMMA = math.pi / 4
+
+
+def sway(t):
+    angle, rate = 0.2 * math.sin(3 * t), 0.6 * math.cos(3 * t)
+    return np.full(3, GAMMA + angle), np.full(3, rate)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, bags, example2):
+    path = bags.write(tmp_path_factory.mktemp("plot") / "bag", bags.tracked(example2, sway))
+    return signals.read(path)
+
+
+@pytest.fixture(scope="module")
+def drawn(run, tmp_path_factory):
+    """All pictures of a run: the figures by name, and the folder."""
+    kept, out = {}, tmp_path_factory.mktemp("pictures")
+    whole = catalogue.save
+
+    def keep(figure, title, folder, stem):
+        kept[stem] = figure
+        return whole(figure, title, folder, stem)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalogue, "save", keep)
+        paths, missing = draw(run, out)
+    assert missing == {}
+    assert {path.stem for path in paths} == set(kept) and len(kept) == len(PICTURES)
+    return kept, out
+
+
+def test_every_picture_shows_something_and_is_a_vector_too(drawn):
+    figures, out = drawn
+    for name in figures:
+        pixels = image.imread(out / f"{name}.png")
+        assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 300, f"{name} shows no curve"
+        content = (out / f"{name}.pdf").read_bytes()
+        assert content.startswith(b"%PDF") and b"/Subtype /Image" not in content
+
+
+def test_every_axis_has_its_unit(drawn):
+    for name, figure in drawn[0].items():
+        for axes in figure.axes:
+            if name == "sphere":
+                assert not axes.axison  # a map, with the joints' names along its sides
+                continue
+            shared = axes.get_shared_x_axes().get_siblings(axes)
+            labels = [axes.get_ylabel(), next(filter(None, (a.get_xlabel() for a in shared)))]
+            assert all(re.search(r"\[[^\]]+\]$", label) for label in labels), (name, labels)
+
+
+def test_curves_are_told_apart_without_colour(drawn):
+    for name, figure in drawn[0].items():
+        for axes in figure.axes:
+            lines = [line for line in axes.lines if not line.get_label().startswith("_")]
+            looks = [(x.get_linestyle(), x.get_marker(), x.get_linewidth()) for x in lines]
+            assert len(set(looks)) == len(looks), name
+
+
+def test_the_paths_are_those_of_the_paper(drawn):
+    numbered = sorted(name for name in drawn[0] if name.startswith("fig"))
+    assert numbered == [
+        "fig10_path_of_E", "fig11_position_of_E", "fig12_theta", "fig13_phi", "fig14_psi",
+    ]  # fmt: skip
+
+
+def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
+    desired, measured = drawn[0]["tracking"].axes[0].lines
+    np.testing.assert_allclose(
+        desired.get_ydata(), [np.degrees(sway(t)[0][0]) for t in run.seconds()], rtol=1e-12
+    )
+    np.testing.assert_allclose(measured.get_ydata(), np.degrees(run.legs("gamma")[:, 0]))
+
+
+def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
+    """The states of the bag are exact; the cubic between 2 ms samples errs by h^4."""
+    kinetic, potential = energy.energies(run, run.scene)
+    simulation = Simulation(run.scene)
+    zero = (0.0, 0.0, 0.0)
+    for tick in range(300):
+        at = tuple(run.legs("tau", "ticks")[tick])
+        state = simulation.step(at, 1_000_000)
+        if tick % 100 == 99:
+            sample = (tick + 1) // 2
+            parts = simulation.dynamics.energies(*state.quaternion, *state.body_rate, *zero)
+            assert kinetic[sample] == pytest.approx(parts[0], rel=1e-12)
+            assert potential[sample] == parts[1] == 0.0
+    left = kinetic - kinetic[0] - energy.work(run).sum(axis=1)
+    assert np.abs(left).max() < 1e-9 * kinetic.max()
+    assert energy.work(run)[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
+    loaded = scene.load("friction")
+    run = signals.read(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
+    kinetic, potential = energy.energies(run, loaded)
+    left = kinetic + potential - kinetic[0] - potential[0] - energy.work(run).sum(axis=1)
+    assert left[-1] < -1e-3 * kinetic.max()
+    assert (np.diff(left) < 1e-9).all()
+
+
+def test_work_is_not_known_beyond_a_lost_torque(tmp_path, bags, example2):
+    kept = [e for e in example2 if (e.topic, e.sample) != (bags.APPLIED, 80)]
+    run = signals.read(bags.write(tmp_path / "bag", kept))
+    known = np.isfinite(energy.work(run)).all(axis=1)
+    assert known[:80].all() and not known[80:].any()
+
+
+def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
+    """As where a recorder hears joint_states first: SciPy refuses quaternions of nan."""
+    kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
+    bag = bags.write(tmp_path / "bag", kept)
+    assert np.flatnonzero(np.isnan(energy.energies(*whole(bag))[0])).tolist() == [60]
+    left = balance.residual(recording.read(bag), [])
+    assert np.flatnonzero(np.isnan(left)).tolist() == [60]
+    assert np.nanmax(np.abs(left)) < 1e-9
+
+
+def whole(bag):
+    run = signals.read(bag)
+    return run, run.scene
+
+
+def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2, capsys):
+    kept = bags.without(example2, bags.ORIENTATION, bags.EULER, bags.APPLIED, bags.COMMANDS)
+    bag, out = bags.write(tmp_path / "bag", kept), tmp_path / "out"
+    assert cli.main(["plot", str(bag), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert {path.stem for path in out.iterdir()} == {
+        "power", "joint_angles", "joint_rates", "phase", "margins",
+    }  # fmt: skip
+    assert "tracking: the bag has no reference\n" in said
+    assert "energy: the bag has no orientation, no applied_torques\n" in said
+
+
+def test_one_picture_may_be_asked_for(run, tmp_path, capsys):
+    words = ["plot", str(run.path), "--out", str(tmp_path), "--only", "phase"]
+    assert cli.main(words) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["phase.pdf", "phase.png"]
+    assert cli.main([*words, "nothing"]) == 1
+    assert "only = 'nothing': must be one of path_of_E" in capsys.readouterr().err
+
+
+def test_the_list_names_all(capsys):
+    assert cli.main(["plot", "--list"]) == 0
+    said = capsys.readouterr().out
+    assert [line.split()[0] for line in said.splitlines()][:-1] == list(PICTURES)
