@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study of feedforward: it finds what theory predicts, and it repeats to the last bit."""
+
+import csv
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros.control.control_settings import MODES, ControlSettings
+from sst_ros.control.motions import motion_of
+from sst_ros.errors import InputError
+from sst_ros.scene import load
+from sst_ros.study import limits
+from sst_ros.study.channel import Channel
+from sst_ros.study.feedforward import RESTLESS, Plan, study
+from sst_ros.study.feedforward_figure import draw
+from sst_ros.study.feedforward_run import page
+from sst_ros.study.feedforward_table import COLUMNS, as_csv, as_json, of_instant, order, text
+from sst_ros.study.limits import ideal, limit, stable
+from sst_ros.study.loop import Loop, follow
+from sst_ros.study.model_errors import SHARE, model_errors
+from sst_ros.study.sampled import ORDERS, largest
+
+REACH = load("reach")
+SPIRAL = dataclasses.replace(REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4)
+SHORT = dataclasses.replace(REACH, motion=dataclasses.replace(REACH.motion, spiral=SPIRAL))
+PERIOD_NS = 1_000_000
+
+
+def errors(*names):
+    return tuple(error for error in model_errors() if error.name in ("nominal", *names))
+
+
+def held(scene, delay, damping=1.0):
+    settings = ControlSettings(mode="computed_torque", damping_ratio=damping)
+    return Loop(scene, scene, motion_of(scene), settings, PERIOD_NS, Channel(delay=delay))
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A study of 0.4 s with one failure in it: delay 5 at 180 rad/s."""
+    plan = Plan(
+        SHORT, bandwidths=(180.0,), errors=errors("inertia +20%", "inertia -20%", "delay 5"),
+        delays=(0,),
+    )  # fmt: skip
+    return study(plan, workers=1)
+
+
+@pytest.mark.parametrize("at", ORDERS)
+def test_the_error_of_held_torques_falls_at_the_order_of_theory(small, at):
+    assert order(of_instant(small, at)) == pytest.approx(ORDERS[at], abs=0.1)
+
+
+def test_torques_that_are_not_held_reach_the_floor_of_the_integrator(small):
+    """Both are rounding: some 1e4 operations at 1e-16 each."""
+    assert small.exact.error < 1e-12 and small.exact.estimate < 1e-11
+    assert small.exact.error < 10.0 * small.exact.estimate + 1e-14
+
+
+@pytest.mark.parametrize("sign", "+-")
+def test_feedforward_helps_a_wrong_model_as_linear_theory_says(small, sign):
+    """1 / SHARE, less what the hold adds; the curvature of the mechanism may take 5 %."""
+    error = f"inertia {sign}20%"
+    benefit, bound = small.benefit(error, 180.0), small.least_benefit(error, 180.0)
+    assert 4.5 < bound < 1.0 / SHARE
+    assert 0.95 * bound < benefit < 1.1 / SHARE
+
+
+def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
+    (found, _), *_ = small.limits
+    assert found.theory == pytest.approx(1e9 / PERIOD_NS, rel=1e-5)  # Jury: 1 / zeta
+    assert found.simulated == pytest.approx(found.theory, rel=0.02)
+
+
+def test_with_delay_the_limit_lies_where_theory_says():
+    loop, bound = held(ideal(SHORT), 2), largest(1.0, 2) * 1e9 / PERIOD_NS
+    assert stable(loop, 0.97 * bound) and not stable(loop, 1.03 * bound)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", range(6))
+def test_the_limit_is_found_at_every_delay(delay):
+    found = limit(held(ideal(SHORT), delay))
+    assert found.simulated == pytest.approx(found.theory, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [0.7, 1.0])
+@pytest.mark.parametrize("delay", range(6))
+def test_every_bandwidth_up_to_the_limit_is_stable(delay, damping):
+    loop = held(ideal(SHORT), delay, damping)
+    bound = largest(damping, delay) * 1e9 / PERIOD_NS
+    assert all(stable(loop, share * bound) for share in (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.98))
+    assert not any(stable(loop, share * bound) for share in (1.02, 1.1, 1.5, 3.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", range(6))
+def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
+    bound = largest(1.0, delay) * 1e9 / PERIOD_NS
+    near, beyond = (
+        follow(
+            dataclasses.replace(
+                held(ideal(SHORT), delay),
+                settings=ControlSettings(mode="computed_torque", bandwidth=share * bound),
+                lost=0.05,
+            )
+        )
+        for share in (0.9, 1.2)
+    )
+    assert not near[2] and np.abs(near[0].error).max() < 1e-3
+    assert beyond[2]
+
+
+def test_a_loop_that_is_lost_says_so():
+    loop = dataclasses.replace(held(SHORT, 5), lost=0.01, offset=1e-3)
+    track, limited, failure = follow(
+        dataclasses.replace(loop, settings=dataclasses.replace(loop.settings, bandwidth=400.0))
+    )
+    assert failure.endswith("off by more than 0.01 rad")
+    assert len(track.time) == len(limited) < 400
+
+
+def test_the_same_bits_on_any_number_of_workers():
+    plan = Plan(
+        SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2), delays=(),
+    )  # fmt: skip
+    first, second = (study(plan, workers=n) for n in (1, 2))
+    assert as_csv(first) == as_csv(second)
+    assert first.holds == second.holds and first.exact == second.exact
+    other = study(dataclasses.replace(plan, seed=9), workers=1)
+    assert as_csv(first).replace(",8,", ",9,") != as_csv(other)
+
+
+def test_failures_stay_with_their_reason(small):
+    failed = [outcome for outcome in small.outcomes if outcome.failure]
+    assert {(o.error, o.bandwidth) for o in failed} == {("delay 5", 180.0)}
+    assert {o.mode for o in failed} == set(MODES) - {"feedforward"}
+    assert all(RESTLESS in o.failure or "stopped" in o.failure for o in failed)
+    said = text(small)
+    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed[-1].failure}" in said
+    assert sum(row["failure"] != "" for row in csv.DictReader(io.StringIO(as_csv(small)))) == 4
+
+
+def test_what_it_writes_can_be_read(small, tmp_path):
+    rows = list(csv.DictReader(io.StringIO(as_csv(small))))
+    assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
+    document = json.loads(as_json(small))
+    assert [float(row["rms_rad"] or "nan") for row in rows] == pytest.approx(
+        [row["rms_rad"] or np.nan for row in document["loops"]], nan_ok=True
+    )
+    assert {row["seed"] for row in document["loops"]} == {8}
+    assert document["report"]["numpy"] == np.__version__
+    for said in (text(small), page(small)):
+        assert "seed 8" in said and f"NumPy {np.__version__}" in said and "theory 2" in said
+    draw(small, tmp_path / "picture.png")
+    pixels = image.imread(tmp_path / "picture.png")
+    assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
+
+
+def test_errors_that_a_scene_cannot_have_are_told():
+    bare = dataclasses.replace(SHORT, friction=None)
+    plan = Plan(bare, 4 * PERIOD_NS, (40.0,), errors=errors("friction unknown"), multiples=(1,),
+                delays=())  # fmt: skip
+    found = study(plan, workers=1)
+    assert found.left_out == ("friction unknown",)
+    assert "Left out: friction unknown" in text(found)
+
+
+def test_a_scene_without_a_motion_is_refused():
+    with pytest.raises(InputError, match="the scene has no desired motion"):
+        study(Plan(load("example2")))
+
+
+def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
+    rest = limits.Rest(motion_of(SHORT), 0.1)
+    assert rest.at(0.05) == rest.at(0.0) and rest.at(0.0).gamma == motion_of(SHORT).at(0.0).gamma
+
+
+def command(*words):
+    return subprocess.run(
+        [sys.executable, "-m", "sst_ros", "study", "feedforward", *words],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+
+
+def test_the_command_tells_what_it_takes():
+    said = command("--help").stdout
+    assert all(word in said for word in ("--scene", "--period", "--bandwidths", "--out", "[rad/s]"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--period", "0"], "--period = 0.0: must be from"),
+        (["--workers", "0"], "--workers = 0: must be >= 1"),
+        (["--bandwidths", "-3"], "bandwidth = -3.0: must be"),
+        (["--scene", "nowhere"], "must be a readable .yaml file or one of"),
+        (["--scene", "example2"], "the scene has no desired motion"),
+    ],
+)
+def test_what_is_not_allowed_is_told_without_a_traceback(words, said):
+    done = command(*words)
+    assert done.returncode == 1
+    assert said in done.stderr and "Traceback" not in done.stderr
