@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene as URDF, for robot_state_publisher, RViz and engines that read it.
+
+The tree's joints are those of joint_states, the passive ones included, so that the loops of what is
+shown are as closed as those of the simulation. URDF has no loops, no springs, no elastic or impact
+ends and no Stribeck friction: whoever simulates by the file must add them. No shape is meant for
+collisions.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+
+from sst_ros.description.inertials import Body, bodies
+from sst_ros.description.shapes import Ball, Box, Colour, Shape, shapes
+from sst_ros.description.tree import BASE, Joint, tree
+from sst_ros.limits import limits_of, ranges_of
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene import LARGEST, Friction, Scene
+from sst_ros.terms import JOINTS
+
+_NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
+     star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they
+     and star are one. """
+_ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radius^2), with
+     the centre at O, about which all turns: they change no motion. The tensors are the scene's. """
+
+
+def urdf(scene: Scene) -> str:
+    """Write a scene as a URDF document."""
+    geometry = Geometry.of(scene)
+    joints, drawn = tree(geometry), shapes(scene)
+    owned = bodies(scene)
+    root = ET.Element("robot", name=_name(scene.name))
+    root.append(ET.Comment(_NOTE.format(name=_name(scene.name))))
+    if assumed := ", ".join(body.name for body in owned if body.assumed):
+        root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
+    own = {body.name: body for body in owned}
+    for name in (BASE, *(joint.child for joint in joints)):
+        _link(root, name, own.pop(name, None), drawn.get(name, ()))
+    for body in own.values():
+        _link(root, body.name, body, ())
+    ranges = {joint: (low, high) for joint, low, high in ranges_of([*limits_of(scene, geometry)])}
+    for joint in joints:
+        _joint(root, scene, joint, ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf)))
+    for body in own.values():
+        fixed = ET.SubElement(root, "joint", name=f"{body.name}_fixed", type="fixed")
+        ET.SubElement(fixed, "parent", link=body.link)
+        ET.SubElement(fixed, "child", link=body.name)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """Angles (r, p, y) [rad] of R = Rz(y) Ry(p) Rx(r), shape (3,), exact at p = pi/2 too."""
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    sine, cosine = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    roll = np.arctan2(
+        sine * rotation[0, 2] - cosine * rotation[1, 2],
+        cosine * rotation[1, 1] - sine * rotation[0, 1],
+    )
+    return np.array([roll, pitch, yaw])
+
+
+def _link(root: ET.Element, name: str, body: Body | None, drawn: Iterable[Shape]) -> None:
+    link = ET.SubElement(root, "link", name=name)
+    if body is not None:
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "origin", xyz=_exact(body.centre))
+        ET.SubElement(inertial, "mass", value=_exact([body.mass]))
+        entries = {
+            f"i{'xyz'[i]}{'xyz'[j]}": body.tensor[i, j] for i in range(3) for j in range(i, 3)
+        }
+        ET.SubElement(inertial, "inertia", {key: _exact([x]) for key, x in entries.items()})
+    for shape in drawn:
+        _draw(link, shape)
+
+
+def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, float]) -> None:
+    limited = bool(np.all(np.isfinite(ends)))
+    kind = "revolute" if limited else "continuous"
+    element = ET.SubElement(root, "joint", name=joint.name, type=kind)
+    ET.SubElement(element, "parent", link=joint.parent)
+    ET.SubElement(element, "child", link=joint.child)
+    ET.SubElement(element, "origin", xyz="0 0 0", rpy=_exact(roll_pitch_yaw(joint.origin)))
+    ET.SubElement(element, "axis", xyz=_exact(joint.axis))
+    motor = scene.actuators if joint.name.startswith("gamma") else None
+    effort = motor.torque_limit if motor is not None else None
+    velocity = motor.velocity_limit if motor is not None else None
+    bounds = {"lower": _exact(ends[:1]), "upper": _exact(ends[1:])} if limited else {}
+    bounds |= {"effort": _exact([effort or LARGEST]), "velocity": _exact([velocity or LARGEST])}
+    ET.SubElement(element, "limit", bounds)
+    friction = _friction(scene, joint.name)
+    if friction is not None:
+        values = {"damping": friction.viscous, "friction": friction.coulomb}
+        ET.SubElement(element, "dynamics", {key: _exact([x]) for key, x in values.items()})
+
+
+def _friction(scene: Scene, joint: str) -> Friction | None:
+    found: Friction | None = getattr(scene.friction, joint.split("_")[0], None)
+    return found
+
+
+def _draw(link: ET.Element, shape: Shape) -> None:
+    if isinstance(shape, Ball):
+        geometry = _visual(link, shape.centre, np.zeros(3), shape.colour, shape.opacity)
+        ET.SubElement(geometry, "sphere", radius=_short([shape.radius]))
+    elif isinstance(shape, Box):
+        geometry = _visual(link, shape.centre, np.zeros(3), shape.colour)
+        ET.SubElement(geometry, "box", size=_short(shape.size))
+    else:
+        for begin, end in pairwise(shape.points):
+            x, y, z = end - begin
+            # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
+            turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+            geometry = _visual(link, (begin + end) / 2.0, turn, shape.colour)
+            length = float(np.linalg.norm(end - begin)) + 0.1 * shape.radius
+            size = {"radius": _short([shape.radius]), "length": _short([length])}
+            ET.SubElement(geometry, "cylinder", size)
+
+
+def _visual(
+    link: ET.Element, at: Array, turn: Array, colour: Colour, opacity: float = 1.0
+) -> ET.Element:
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=_short(at), rpy=_short(turn))
+    geometry = ET.SubElement(visual, "geometry")
+    name = "_".join(f"{round(255 * part):02x}" for part in (*colour, opacity))
+    material = ET.SubElement(visual, "material", name=f"rgba_{name}")
+    ET.SubElement(material, "color", rgba=_short((*colour, opacity)))
+    return geometry
+
+
+def _exact(values: Iterable[float]) -> str:
+    return " ".join(repr(float(x) + 0.0) for x in values)
+
+
+def _short(values: Iterable[float]) -> str:
+    return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
+
+
+def _name(name: str) -> str:
+    """Give the scene's name as an XML name."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page: a local web server by viser, fed from a source some thirty times a second."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import socket
+import threading
+import time
+import webbrowser
+from collections.abc import Iterator
+
+import numpy as np
+from viser import ViserServer
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Scene
+from sst_ros.view.buttons import ReelButtons, RunButtons, buttons
+from sst_ros.view.drawing import Drawing
+from sst_ros.view.panel import Panel
+from sst_ros.view.source import Sample, Source
+
+LOCAL = "127.0.0.1"
+PORT = 8080
+PERIOD_S = 1.0 / 30.0
+_SHOW_EVERY, _DRAW_EVERY = 3, 6
+_PANEL_WIDTH = 400.0
+
+
+class LocalServer(ViserServer):
+    """viser without its way to publish the page through a server elsewhere."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse: the page drives a machine."""
+        return None
+
+
+class Page:
+    """One source on one page. `close` ends it.
+
+    Attributes:
+        url: where it is.
+
+    Raises:
+        InputError: the host is none of this machine's addresses.
+
+    """
+
+    def __init__(self, source: Source, host: str = LOCAL, port: int = PORT) -> None:
+        self._source = source
+        self._server = _serve(host, port)
+        self.url = f"http://{self._server.get_host()}:{self._server.get_port()}"
+        self._parts: tuple[Drawing, Panel, RunButtons | ReelButtons] | None = None
+        self._scene: Scene | None = None
+        self._sample: Sample | None = None
+        self._waiting = self._server.gui.add_markdown("Waiting for a simulator ...")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._live, name="page", daemon=True)
+        self._thread.start()
+
+    def announce(self, *, opened: bool) -> None:
+        """Say where the page is; `opened` also opens it, where there is a desktop."""
+        print(f"the page is at {self.url}", flush=True)
+        if opened and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            webbrowser.open(self.url)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._stop.set()
+        self._thread.join()
+        with _silence():
+            self._server.stop()
+
+    def _live(self) -> None:
+        for count in _beats(self._stop):
+            self._update(count)
+
+    def _update(self, count: int) -> None:
+        scene = self._source.scene
+        if scene is not None and scene != self._scene:
+            self._build(scene)
+        if self._parts is None:
+            return
+        drawing, panel, pressed = self._parts
+        with self._server.atomic():
+            for sample in self._source.samples():
+                drawing.follow(sample)
+                panel.follow(sample)
+                self._sample = sample
+            if self._sample is not None:
+                drawing.show(self._sample)
+            if count % _SHOW_EVERY == 0:
+                health = self._source.health()
+                pressed.show(self._sample, health)
+                if self._sample is not None:
+                    panel.show(self._sample, health)
+            if count % _DRAW_EVERY == 0:
+                panel.draw()
+
+    def _build(self, scene: Scene) -> None:
+        """Show another scene."""
+        for part in self._parts or ():
+            part.remove()
+        self._waiting.visible = False
+        self._scene, self._sample = scene, None
+        server = self._server
+        self._parts = (
+            Drawing(server, scene),
+            Panel(server, scene),
+            buttons(server, scene, self._source.controls()),
+        )
+        middle = Geometry.of(scene).v.sum(axis=0)
+        middle /= np.linalg.norm(middle)
+        size = max(scene.base.radius, scene.star.radius)
+        camera = server.initial_camera
+        camera.fov = np.radians(35.0)
+        camera.look_at = 0.28 * size * middle
+        camera.position = size * (3.9 * middle + np.array([0.35, -0.55, 0.5]))
+        for client in server.get_clients().values():
+            client.camera.position, client.camera.look_at = camera.position, camera.look_at
+            client.camera.fov = camera.fov
+
+
+def _serve(host: str, port: int) -> ViserServer:
+    try:  # viser would look for a free port for ever
+        for family, kind, _, _, address in socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM):
+            with socket.socket(family, kind) as probe:
+                probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        allowed = f"must be an address of this machine ({error})"
+        raise InputError("view", [Problem("host", host, allowed)]) from None
+    with _silence():
+        server = LocalServer(host, port, label="sst_ros", verbose=False)
+    server.gui.configure_theme(
+        show_logo=False, show_share_button=False, brand_color=(0, 114, 178), control_width="large"
+    )
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(_PANEL_WIDTH)
+    server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.set_up_direction("+z")
+    return server
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep viser's own words from the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def _beats(stop: threading.Event) -> Iterator[int]:
+    """Count at the rate of the page until it is stopped; beats that are late are dropped."""
+    count, due = 0, time.monotonic()
+    while not stop.is_set():
+        yield count
+        count += 1
+        due = max(due + PERIOD_S, time.monotonic())
+        stop.wait(max(0.0, due - time.monotonic()))

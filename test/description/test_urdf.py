@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The URDF of a scene, read by Pinocchio's and MuJoCo's parsers: poses, inertias, motion."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loaded_scenes import loaded
+from models import seeded_samples
+
+from sst_ros.__main__ import main
+from sst_ros.description.tree import LEGS, STAR, STARS, actuated, intermediate
+from sst_ros.description.urdf import roll_pitch_yaw, urdf
+from sst_ros.mechanism import kinematics, rates, virtual_work
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Actuators, load, names
+
+EXACT = 2e-14  # a product of nine rotations, each rounded
+LINKS = {STAR, *map(actuated, LEGS), *map(intermediate, LEGS)}
+
+
+class Read:
+    """A URDF as Pinocchio reads it."""
+
+    def __init__(self, scene):
+        self.pin = pytest.importorskip("pinocchio", reason="Pinocchio is missing: pip install pin")
+        self.model = self.pin.buildModelFromXML(urdf(scene))
+        self.data = self.model.createData()
+
+    def configuration(self, angles):
+        """q in Pinocchio's order; a joint without ends is given by cosine and sine."""
+        q = np.zeros(self.model.nq)
+        for name, angle in angles.items():
+            joint = self.model.joints[self.model.getJointId(name)]
+            told = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+            q[joint.idx_q : joint.idx_q + joint.nq] = told
+        return q
+
+    def rotation(self, angles, link):
+        self.pin.framesForwardKinematics(self.model, self.data, self.configuration(angles))
+        placement = self.data.oMf[self.model.getFrameId(link, self.pin.FrameType.BODY)]
+        assert not placement.translation.any()
+        return placement.rotation
+
+
+def angles_of(gamma, mu, beta):
+    kinds = {"gamma": gamma, "mu": mu, "beta": beta}
+    return {f"{kind}_{k + 1}": float(x[k]) for kind, x in kinds.items() for k in range(3)}
+
+
+def passive(geometry, gamma, rotation):
+    return kinematics.assembly_of(geometry, gamma, rotation)
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_poses_of_all_links(isotropic):
+    for sample in seeded_samples(11, 8, isotropic):
+        read = Read(sample.scene)
+        at = sample.posture
+        assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+        angles = angles_of(sample.gamma, assembly.mu, assembly.beta)
+        expected = dict.fromkeys(STARS, sample.rotation)
+        for k, leg in enumerate(LEGS):
+            r, t, w = at.r[k], at.t[k], at.w[k]
+            expected[actuated(leg)] = np.stack([r, np.cross(w, r), w], axis=1)
+            expected[intermediate(leg)] = np.stack([r, np.cross(t, r), t], axis=1)
+        for link, rotation in expected.items():
+            assert np.abs(read.rotation(angles, link) - rotation).max() < EXACT
+
+
+def test_a_wrong_angle_opens_the_loops():
+    sample = seeded_samples(11, 1)[0]
+    read = Read(sample.scene)
+    assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+    angles = angles_of(sample.gamma, -assembly.mu, assembly.beta)
+    first, second, _ = (read.rotation(angles, star) for star in STARS)
+    assert np.abs(first - second).max() > 0.1
+
+
+@pytest.mark.parametrize("name", names())
+def test_inertias_of_every_scene(name):
+    scene = load(name)
+    read = Read(scene)
+    found = {
+        read.model.names[joint]: read.model.inertias[joint]
+        for joint in range(1, read.model.njoints)
+    }
+    about_o = {joint: inertia.matrix()[3:, 3:] for joint, inertia in found.items()}
+    expected = {"beta_1": scene.star_inertia}
+    for k, leg in enumerate(LEGS):
+        expected[f"gamma_{leg}"] = scene.actuated_inertias[k]
+        expected[f"mu_{leg}"] = scene.intermediate_inertias[k]
+    scale = np.abs(scene.star_inertia).max()
+    for joint, tensor in expected.items():
+        assert np.abs(about_o[joint] - tensor).max() < 1e-15 * scale
+    for joint in ("beta_2", "beta_3"):
+        assert found[joint].mass == 0.0 and not about_o[joint].any()
+
+
+def test_a_rotor_weighs_about_its_axis_alone():
+    scene = replace(load("example2"), actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0))
+    read = Read(scene)
+    tensor = read.model.inertias[read.model.getJointId("gamma_1")].matrix()[3:, 3:]
+    own = scene.actuated_links[0].inertia.matrix
+    assert tensor[2, 2] == pytest.approx(own[2, 2] + 0.01, rel=1e-15)
+    assert np.linalg.eigvalsh(tensor - own)[0] > 0.0  # and some rigid body has it
+
+
+def test_masses_are_those_of_the_scene_or_said_to_be_assumed():
+    weighed, bare = load("gravity_payload"), load("example2")
+    masses = {
+        name.get("name"): float(name.find("inertial/mass").get("value"))
+        for name in ET.fromstring(urdf(weighed)).iter("link")
+        if name.find("inertial") is not None
+    }
+    assert masses[STAR] == 2.6 and masses["payload"] == 0.8
+    assert "has no masses" not in urdf(weighed)
+    assert "has no masses" in urdf(bare)
+    # Thin arcs on the sphere: the printed masses come back.
+    read = Read(bare)
+    assert read.model.inertias[read.model.getJointId("gamma_1")].mass == pytest.approx(0.3)
+
+
+def closed(read, geometry):
+    """Lock the frames without bodies; tie a point of the axis t_k on legs 2 and 3 to the star."""
+    pin = read.pin
+    locked = [read.model.getJointId(name) for name in ("beta_2", "beta_3")]
+    model = pin.buildReducedModel(read.model, locked, pin.neutral(read.model))
+    ties, data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    for k in (1, 2):
+        at_star = pin.SE3(np.eye(3), geometry.e[k])
+        at_link = pin.SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+        tie = pin.RigidConstraintModel(
+            pin.ContactType.CONTACT_3D,
+            model,
+            model.getJointId("beta_1"),
+            at_star,
+            model.getJointId(f"mu_{k + 1}"),
+            at_link,
+        )
+        ties.append(tie)
+        data.append(tie.createData())
+    return model, ties, data
+
+
+def acceleration(scene, angles, rate_of, torque):
+    """W_dot of the star in {E} by Pinocchio, from the URDF alone."""
+    read = Read(scene)
+    pin, geometry = read.pin, Geometry.of(scene)
+    model, ties, tied = closed(read, geometry)
+    read.model, read.data = model, model.createData()
+    gravity = scene.gravity.acceleration if scene.gravity else (0.0, 0.0, 0.0)
+    model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
+    open_joints = {name: angle for name, angle in angles.items() if model.existJointName(name)}
+    q, v, u = read.configuration(open_joints), np.zeros(model.nv), np.zeros(model.nv)
+    for name in open_joints:
+        v[model.joints[model.getJointId(name)].idx_v] = rate_of[name]
+    for k, leg in enumerate(LEGS):
+        u[model.joints[model.getJointId(f"gamma_{leg}")].idx_v] = torque[k]
+    try:
+        pin.initConstraintDynamics(model, read.data, ties, tied)
+    except TypeError:  # before Pinocchio 4
+        pin.initConstraintDynamics(model, read.data, ties)
+    proximal = pin.ProximalSettings(1e-16, 1e-3, 30)
+    a = pin.constraintDynamics(model, read.data, q, v, u, ties, tied, proximal)
+    pin.forwardKinematics(model, read.data, q, v, a)
+    return read.data.a[model.getJointId("beta_1")].angular
+
+
+def test_motion_of_random_mechanisms():
+    for sample in seeded_samples(5, 4):
+        answer = virtual_work.direct_dynamics(
+            sample.mechanism, sample.posture, sample.gamma_dot, sample.torque, np.zeros(3)
+        )
+        motion = rates.of_actuators(sample.posture, sample.gamma_dot, answer)
+        assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+        rate_of = angles_of(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
+        angles = angles_of(sample.gamma, assembly.mu, assembly.beta)
+        found = acceleration(sample.scene, angles, rate_of, sample.torque)
+        expected = sample.rotation.T @ motion.omega_dot
+        assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
+
+
+def test_motion_under_gravity_with_payload_and_rotors():
+    geared = Actuators(rotor_inertia=1e-4, gear_ratio=10.0)
+    scene = replace(loaded(), friction=None, moment=None, actuators=geared)
+    geometry, gamma = Geometry.of(scene), np.add(scene.initial.gamma, [0.05, -0.03, 0.02])
+    at = virtual_work.posture(geometry, gamma)
+    gamma_dot, torque = np.array([1.0, -2.0, 0.5]), np.array([0.3, -1.0, 2.0])
+    motion = rates.of_actuators(at, gamma_dot)
+    assembly = passive(geometry, gamma, at.rotation)
+    angles = angles_of(gamma, assembly.mu, assembly.beta)
+    for spring in scene.springs:  # URDF has none
+        torque[LEGS.index(int(spring.joint[-1]))] -= spring.stiffness * (
+            angles[spring.joint] - spring.rest
+        )
+    rate_of = angles_of(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
+    found = acceleration(scene, angles, rate_of, torque)
+    state = (*quaternion_of(at.rotation), *(at.rotation.T @ motion.omega))
+    expected = np.array(Dynamics(replace(scene, springs=())).acceleration(*state, *torque))
+    assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
+
+
+def test_mujoco_reads_it():
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    sample = seeded_samples(3, 1)[0]
+    # MuJoCo takes no bodies without mass: the two frames get some.
+    asked = '<mujoco><compiler boundmass="1e-9" boundinertia="1e-12" fusestatic="false"/></mujoco>'
+    text = urdf(sample.scene).replace("</robot>", f"{asked}</robot>")
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+    for name, angle in angles_of(sample.gamma, assembly.mu, assembly.beta).items():
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    for star in STARS:
+        found = data.xmat[model.body(star).id].reshape(3, 3)
+        assert np.abs(found - sample.rotation).max() < EXACT
+    assert not LINKS - {model.body(i).name for i in range(model.nbody)}
+
+
+def test_angles_of_a_rotation_at_the_pole():
+    for pitch in (np.pi / 2, -np.pi / 2, 1.5707963, 0.3):
+        for roll, yaw in ((0.4, -1.1), (0.0, 2.0)):
+            expected = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+            r, p, y = roll_pitch_yaw(expected)
+            assert np.abs(turn(2, y) @ turn(1, p) @ turn(0, r) - expected).max() < 1e-15
+
+
+def turn(axis, angle):
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = np.cos(angle)
+    matrix[j, i], matrix[i, j] = np.sin(angle), -np.sin(angle)
+    return matrix
+
+
+def test_ends_limits_and_friction_are_in_it():
+    root = ET.fromstring(urdf(load("friction")))
+    joints = {joint.get("name"): joint for joint in root.iter("joint")}
+    first = joints["gamma_1"]
+    assert float(first.find("limit").get("upper")) == pytest.approx(np.pi / 2)
+    friction = load("friction").friction.gamma
+    assert float(first.find("dynamics").get("damping")) == friction.viscous
+    limited = replace(load("example2"), actuators=Actuators(torque_limit=4.0))
+    effort = ET.fromstring(urdf(limited)).find("joint[@name='gamma_2']/limit").get("effort")
+    assert float(effort) == 4.0
+
+
+def test_command_line(capsys):
+    assert main(["describe", "--scene", "general"]) == 0
+    assert capsys.readouterr().out == urdf(load("general"))
+    assert main(["describe", "--scene", "none"]) == 1

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag on the page: the source by itself, and the page in headless Chromium."""
+
+import re
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report import bags
+
+from sst_ros.report.recording import read
+from sst_ros.scene import load
+
+pytest.importorskip("viser", reason="needs viser: pip install .[view]")
+pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
+
+from sst_ros.view import replay
+from sst_ros.view.browser import browse, chromium
+
+PICTURES = Path(__file__).parents[2] / "view_out"
+RIGHT, HOME = "\ue014", "\ue011"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return bags.write(
+        tmp_path_factory.mktemp("replay") / "bag", bags.simulated(load("example2"), 0.3)
+    )
+
+
+class Clock:
+    def __init__(self, monkeypatch):
+        self.now = 100.0
+        monkeypatch.setattr(replay.time, "monotonic", lambda: self.now)
+
+
+def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
+    clock, run = Clock(monkeypatch), read(bag)
+    reel = replay.Replay(bag)
+    seen = list(reel.samples())
+    while reel.playing:
+        clock.now += 1.0 / 30.0
+        seen += reel.samples()
+    assert [sample.time for sample in seen] == run.seconds.tolist()
+    assert np.array([sample.gamma for sample in seen]) == pytest.approx(run.gamma, abs=0.0)
+    assert np.array([sample.torque for sample in seen]) == pytest.approx(run.effort, abs=0.0)
+
+
+def test_hold_seek_and_speed(bag, monkeypatch):
+    clock = Clock(monkeypatch)
+    reel = replay.Replay(bag)
+    reel.speed(0.5)
+    clock.now += 0.2
+    assert reel.samples()[-1].time == pytest.approx(0.1)
+    reel.play(False)
+    clock.now += 10.0
+    assert not reel.samples()
+    reel.seek(0.25)
+    assert reel.samples()[-1].time == pytest.approx(0.25)
+    reel.seek(0.02)  # back: the path begins anew
+    back = reel.samples()
+    assert back[0].time == 0.0 and back[-1].time == pytest.approx(0.02)
+    reel.seek(99.0)
+    reel.play(True)  # from the beginning, as it has ended
+    assert reel.samples()[-1].time == 0.0
+
+
+@pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
+@pytest.mark.timeout(300)
+def test_the_page_of_a_bag(bag):
+    command = [sys.executable, "-m", "sst_ros", "view", str(bag), "--port", "18180"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as process:
+        try:
+            assert select.select([process.stdout], [], [], 60)[0]
+            url = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline()).group()
+            with browse(url, (960, 640)) as page:
+                page.until(lambda: page.text("#sst-phase") == "recording, held", "end of the bag")
+                assert page.time() == 0.3
+                page.slide("t [s]", HOME)
+                page.until(lambda: page.time() == 0.0, "beginning of the bag")
+                page.slide("t [s]", RIGHT * 20)
+                page.until(lambda: page.time() > 0.0, "later time")
+                page.press("Play")
+                page.until(lambda: page.time() == 0.3, "end of the bag")
+                page.picture(PICTURES / "recording.png")
+                assert page.complaints() == []
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+            assert process.returncode == 0 and "Traceback" not in errors
+        finally:
+            if process.poll() is None:
+                process.kill()
