@@ -1,25 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: the paper's examples through real nodes, recorded, and judged from the recording."""
+"""The demos: runs through real nodes, recorded, and judged from the recording."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from sst_ros import scene
+from sst_ros.control.motions import motion_of
 from sst_ros.errors import SstError
 from sst_ros.integration import backend
+from sst_ros.report import tracking_run
 from sst_ros.report.run import report
 from sst_ros.report.table import table
 
 EXAMPLES = ("example1", "example2")
+FOLLOWED = "reach"
+MODES = ("feedforward", "feedforward_pd")
+HOLD_S = 0.3
+CONTROL_RATE = 500
 _READY_S = 30.0
 _END_S = 30.0
 
@@ -31,14 +38,51 @@ def demo(out: Path) -> int:
     """
     for name in EXAMPLES:
         folder = out if name == "example2" else out / name
-        bag = folder / "bag"
-        if bag.exists():
-            shutil.rmtree(bag)
-        folder.mkdir(parents=True, exist_ok=True)
+        bag = _room(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
         print(table(report(bag, folder)), flush=True)
     return 0
+
+
+def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -> int:
+    """Follow a scene's motion in lockstep, a run for each mode, and judge how well.
+
+    The first of the default modes is the paper's double check: nothing but the torques of the
+    inverse dynamics. Each run lies in `out`/mode.
+
+    Raises:
+        SstError: the scene's motion is refused, or a node failed; says which.
+
+    """
+    seconds = motion_of(scene.load(name)).duration + HOLD_S
+    for mode in modes:
+        bag = _room(out / mode)
+        print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
+        follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
+        print(tracking_run.report(bag, out / mode), flush=True)
+    return 0
+
+
+def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
+    """Have the companion follow a scene's motion for some time [s], and record the run.
+
+    Raises:
+        SstError: a node failed or did not end in time; says which.
+
+    """
+    with _node("recorder", output=str(bag)) as recorder:
+        run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
+        with _node("simulator", publish_rate=CONTROL_RATE, **run) as simulator:
+            _wait_until_ready(recorder)
+            followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
+            followed |= {"stamped": True, "feedforward_at": "middle"}
+            waits = {"wait_for_subscribers": 2, "wait_for_recorder": True}
+            with _node("inverse_dynamics", **followed, **waits) as companion:
+                _wait_for_end("inverse_dynamics", companion, 20.0 * seconds + _END_S)
+                _wait_for_end("simulator", simulator, _END_S)
+        recorder.send_signal(signal.SIGINT)
+        _wait_for_end("recorder", recorder, _END_S)
 
 
 def record(name: str, bag: Path) -> None:
@@ -59,6 +103,15 @@ def record(name: str, bag: Path) -> None:
                 _wait_for_end("simulator", simulator, _END_S)
         recorder.send_signal(signal.SIGINT)
         _wait_for_end("recorder", recorder, _END_S)
+
+
+def _room(folder: Path) -> Path:
+    """Make room for a bag; one of an earlier demo gives way."""
+    bag = folder / "bag"
+    if bag.exists():
+        shutil.rmtree(bag)
+    folder.mkdir(parents=True, exist_ok=True)
+    return bag
 
 
 @contextmanager

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The companion's work without its node: when it begins, goes on, ends, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sst_ros import scene
+from sst_ros.control.controller import ControlStopped, Measured
+from sst_ros.control.tracking import BAND
+from sst_ros.desired_motions import DesiredMotion, Spiral, ToAngles
+from sst_ros.errors import InputError, SstError
+from sst_ros.nodes.companion_pursuit import Pursuit, Stage
+from sst_ros.nodes.companion_settings import CompanionParameters
+from sst_ros.scene import Actuators, Initial
+from sst_ros.simulation import Simulation
+
+PERIOD_NS = 2_000_000
+START_NS = 1_700_000_000_123_456_789
+MOVE = DesiredMotion(spiral=Spiral(phi=0.02, theta=0.5, psi=0.03, duration=0.05))
+MODEL = dataclasses.replace(scene.load("example2"), motion=MOVE, torque=None)
+
+
+def seen(state):
+    return Measured(state.joints.gamma, state.joints.gamma_dot)
+
+
+def test_it_follows_holds_and_ends_with_zero_torque():
+    pursuit = Pursuit(MODEL, CompanionParameters(hold=0.01, feedforward_at="middle"))
+    simulation = Simulation(MODEL)
+    assert pursuit.stage is Stage.READY and pursuit.judged() is None
+    first = pursuit.preview(seen(simulation.state))
+    stages, commands = [], []
+    for k in range(40):
+        command = pursuit.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
+        if command is None:
+            break
+        stages.append(pursuit.stage)
+        commands.append(command)
+        simulation.step(command.torque, PERIOD_NS)
+    assert commands[0].torque == first.torque
+    assert stages == [Stage.FOLLOWING] * 25 + [Stage.HOLDING] * 5 + [Stage.ENDED]
+    assert commands[-1].torque == (0.0, 0.0, 0.0) and pursuit.samples == 31
+    judged = pursuit.judged()
+    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / BAND
+    assert pursuit.largest == judged.largest.max()
+    assert pursuit.rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
+
+
+def test_samples_that_come_twice_or_late_are_told_apart():
+    pursuit = Pursuit(MODEL, CompanionParameters())
+    here = Measured(MODEL.initial.gamma, (0.0, 0.0, 0.0))
+    for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
+        assert (pursuit.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
+    assert (pursuit.samples, pursuit.irregular) == (3, 1)
+
+
+def test_a_reset_of_the_simulator_begins_the_motion_anew():
+    pursuit = Pursuit(MODEL, CompanionParameters(mode="pd", integral_rate=1.0))
+    here = Measured(tuple(np.add(MODEL.initial.gamma, 0.01)), (0.0, 0.0, 0.0))
+    told = [pursuit.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
+    pursuit.anew()
+    assert pursuit.stage is Stage.READY and pursuit.judged() is None
+    again = [pursuit.answer(START_NS + (100 + k) * PERIOD_NS, here) for k in range(5)]
+    assert [one.torque for one in again] == [one.torque for one in told]
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "reason"),
+    [
+        ({"motion": None}, {}, "motion"),
+        ({"motion": DesiredMotion(to_angles=ToAngles(gamma=(1.7, 0.8, 0.8), duration=1.0))}, {},
+         "gamma_1"),
+        ({"motion": DesiredMotion(to_angles=ToAngles(gamma=(0.35, 0.3, 1.35), duration=1.0))}, {},
+         "beta_"),
+        ({"actuators": Actuators(torque_limit=0.5)}, {}, "exceeds the limit 0.5 N m"),
+        ({"actuators": Actuators(torque_limit=50.0)}, {"torque_limit": 0.5}, "limit 0.5 N m"),
+        ({"actuators": Actuators(torque_limit=0.5)}, {"torque_limit": 50.0}, "limit 0.5 N m"),
+        ({}, {"integral_rate": 100.0, "mode": "pd"}, "integral_rate"),
+    ],
+    ids=["no motion", "stroke", "workspace", "actuators", "limit", "both limits", "unstable"],
+)  # fmt: skip
+def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason):
+    with pytest.raises(SstError, match=reason):
+        Pursuit(dataclasses.replace(MODEL, **model), CompanionParameters(**settings))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"mode": "pid"},
+        {"bandwidth": 0.0},
+        {"damping": (1.0, -1.0, 1.0)},
+        {"stiffness": (1.0, np.nan, 1.0)},
+        {"rate": 7},
+        {"mode": "computed_torque", "space": "so3", "stiffness": (1.0, 1.0, 1.0)},
+        {"damping": (1.0, 1.0, 1.0), "integral_rate": 1.0},
+    ],
+)
+def test_bad_parameters_are_refused(given):
+    with pytest.raises(InputError):
+        CompanionParameters(**given)
+
+
+def test_it_begins_only_near_the_start_of_the_motion():
+    off = dataclasses.replace(
+        MODEL, initial=Initial(gamma=tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0))))
+    )
+    state = Simulation(off).state
+    near = CompanionParameters(start_tolerance=0.07)
+    assert Pursuit(MODEL, near).answer(START_NS, seen(state)) is not None
+    for ask in (lambda p: p.preview(seen(state)), lambda p: p.answer(START_NS, seen(state))):
+        with pytest.raises(InputError, match="where the motion begins"):
+            ask(Pursuit(MODEL, CompanionParameters()))
+
+
+def test_what_is_not_finite_is_nowhere_near():
+    pursuit = Pursuit(MODEL, CompanionParameters())
+    here = Measured(MODEL.initial.gamma, (0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="where the motion begins"):
+        pursuit.preview(dataclasses.replace(here, gamma=(np.nan,) * 3))
+    pursuit.answer(START_NS, here)
+    with pytest.raises(ControlStopped, match="must be finite"):
+        pursuit.answer(START_NS + PERIOD_NS, dataclasses.replace(here, gamma_dot=(np.nan,) * 3))

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The companion node against the simulator, in lockstep and running free, and against bad input."""
+
+import dataclasses
+import signal
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from sst_ros import demo, document, scene
+from sst_ros.desired_motions import DesiredMotion, Spiral, ToAngles
+from sst_ros.report import recording, tracking_bag
+from sst_ros.scene import Actuators, Stroke, Workspace
+
+pytestmark = pytest.mark.ros
+NAMES = ["gamma_1", "gamma_2", "gamma_3"]
+HOME = scene.load("example2").initial.gamma
+MOVE = DesiredMotion(spiral=Spiral(phi=0.25, theta=3.0, psi=0.4, duration=0.3))
+
+
+def written(folder, name="example2", **changed):
+    """A scene with another motion, as a file."""
+    changed = {"motion": MOVE, "torque": None, "provenance": (), **changed}
+    path = folder / "scene.yaml"
+    path.write_text(document.dump(dataclasses.replace(scene.load(name), **changed)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory, domain_of_module):
+    """The same run of `make demo-feedforward`, two times; the folders of the bags."""
+    folder = tmp_path_factory.mktemp("companion")
+    path = written(folder)
+    for name in ("first", "second"):
+        assert demo.feedforward(folder / name, str(path), ("feedforward",)) == 0
+    return [folder / name / "feedforward" for name in ("first", "second")]
+
+
+def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
+    """The paper's double check, through the nodes: open loop, torques held over 2 ms.
+
+    What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
+    """
+    run = tracking_bag.read(twice[0] / "bag")
+    judged = tracking_bag.judged(run)
+    travel = np.ptp(run.track.gamma, axis=0).max()
+    assert travel > 0.2
+    assert judged.samples == 301 and judged.largest.max() < 1e-3 * travel
+    assert np.nanmax(run.orientation_error) < 1e-3 * travel
+    assert judged.feedforward == pytest.approx(1.0) and not judged.feedback.any()
+    assert judged.settling == 0.0 and judged.limited == 0
+
+
+def test_the_demo_shows_a_table_and_a_picture(twice):
+    told = (twice[0] / "tracking.txt").read_text()
+    assert "run time [s]" in told and "orientation, largest" in told and "nan" not in told
+    assert (twice[0] / "tracking.png").stat().st_size > 10_000
+
+
+def test_a_run_in_lockstep_is_repeated_exactly(twice):
+    first, second = (recording.read(folder / "bag") for folder in twice)
+    for name in ("time_ns", "gamma", "gamma_dot", "quaternion", "effort"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+    tracks = [tracking_bag.read(folder / "bag").track for folder in twice]
+    for field in dataclasses.fields(tracks[0]):
+        assert np.array_equal(*(getattr(track, field.name) for track in tracks)), field.name
+
+
+def trajectory(*points, names=NAMES, **given):
+    """Rows of time [s], positions, velocities."""
+    message = JointTrajectory(joint_names=list(names))
+    for time, positions, *velocities in points:
+        point = JointTrajectoryPoint(positions=list(map(float, positions)))
+        if velocities:
+            point.velocities = list(map(float, velocities[0]))
+        point.time_from_start.sec, point.time_from_start.nanosec = (
+            int(time // 1.0),
+            round(time % 1.0 * 1e9),
+        )
+        message.points.append(point)
+    for name, value in given.items():
+        setattr(message.points[0], name, value)
+    return message
+
+
+AWAY = tuple(np.add(HOME, (0.1, -0.05, 0.0)))
+BAD = {
+    "wrong names": (trajectory((1.0, AWAY), names=["a", "b", "c"]), "joint_names"),
+    "a name twice": (trajectory((1.0, AWAY), names=[NAMES[0], *NAMES[:2]]), "joint_names"),
+    "empty": (trajectory(), "points"),
+    "two numbers": (trajectory((1.0, AWAY[:2])), "positions[0]"),
+    "not finite": (trajectory((1.0, (np.nan, *AWAY[1:]))), "positions[0]"),
+    "infinite rate": (trajectory((0.5, AWAY, (np.inf, 0, 0)), (1.0, HOME)), "velocities[0]"),
+    "times that do not rise": (trajectory((1.0, AWAY), (1.0, HOME)), "times[1]"),
+    "an end that moves": (trajectory((1.0, AWAY, (0.1, 0, 0))), "velocities[0]"),
+    "a start elsewhere": (trajectory((0.0, np.add(HOME, 0.5)), (1.0, HOME)), "positions[0]"),
+    "out of the stroke": (trajectory((1.0, np.add(HOME, (0.9, 0.0, 0.0)))), "gamma_1"),
+    "out of the workspace": (trajectory((1.0, (0.35, 0.3, 1.35))), "beta_"),
+    "too fast": (trajectory((0.02, AWAY)), "exceeds the limit 8 N m"),
+    "torques given": (trajectory((1.0, AWAY), effort=[0.0] * 3), "points[0].effort"),
+}
+
+
+@pytest.fixture(scope="module")
+def deaf(tmp_path_factory, domain_of_module):
+    """A companion that waits for trajectories, and all that it has published."""
+    from .conftest import Nodes, Observer
+
+    nodes, observer = Nodes(), Observer(domain_of_module)
+    path = written(tmp_path_factory.mktemp("deaf"), actuators=Actuators(torque_limit=8.0))
+    commands = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    observer.listen(DiagnosticArray, "/diagnostics")
+    companion = nodes.run("inverse_dynamics", scene=path, motion="topic")
+    states = observer.publisher(JointState, "/joint_states")
+    publisher = observer.publisher(JointTrajectory, "/sst_inverse_dynamics/joint_trajectory")
+    yield observer, companion, states, publisher, commands
+    observer.close()
+    nodes.close()
+
+
+def idle(stamp_ns=0):
+    message = JointState(name=NAMES, position=list(HOME), velocity=[0.0] * 3)
+    message.header.stamp.nanosec = stamp_ns
+    return message
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_trajectory_is_refused_before_any_torque(deaf, case):
+    observer, companion, states, publisher, commands = deaf
+    message, reason = BAD[case]
+    before = int(observer.told("trajectories_refused", lambda _: True)["trajectories_refused"])
+    states.publish(idle())
+    publisher.publish(message)
+    said = observer.told("trajectories_refused", before + 1)
+    assert reason in said["last_refusal"], said
+    assert said["stage"] == "waiting for a trajectory"
+    states.publish(idle())
+    observer.told("samples", 0)
+    assert commands == [] and companion.poll() is None
+
+
+def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, observer, tmp_path):
+    path = written(tmp_path, motion=None)
+    reference = observer.listen(JointState, "/sst_inverse_dynamics/reference")
+    observer.listen(DiagnosticArray, "/diagnostics")
+    simulator = nodes.run(
+        "simulator", scene=path, sync="lockstep", real_time_factor=0.0, duration=0.6
+    )
+    observer.told("phase", "waiting")
+    given = {"mode": "computed_torque", "feedforward_at": "middle"}
+    companion = nodes.run("inverse_dynamics", scene=path, motion="topic", stamped="true", **given)
+    publisher = observer.publisher(JointTrajectory, "/sst_inverse_dynamics/joint_trajectory")
+    observer.until(lambda: companion_told(observer, "stage"), "the companion")
+    first, second = trajectory((0.3, AWAY[::-1])), trajectory((0.2, HOME))
+    first.joint_names = NAMES[::-1]
+    publisher.publish(first)
+    observer.until(lambda: len(reference) > 20, "the motion")
+    publisher.publish(second)  # while it moves: goes on from there
+    assert simulator.wait(timeout=60) == 0
+    out, err = companion.communicate(timeout=20)
+    assert companion.returncode == 0 and "Traceback" not in err
+    observer.until(lambda: len(reference) == 301, "all samples")
+    gamma = np.array([message.position for message in reference])
+    rate = np.array([message.velocity for message in reference])
+    assert np.abs(gamma - HOME).max() > 0.01
+    assert np.abs(gamma[-1] - HOME).max() < 1e-12 and not rate[-1].any()
+    # The reference is smooth through the change: its rate is the slope of its angles.
+    slope = np.diff(gamma, axis=0) / 0.002
+    assert np.abs(slope - 0.5 * (rate[1:] + rate[:-1])).max() < 1e-3
+    errors = [line.split()[-3:] for line in out.splitlines() if line.startswith("error, largest")]
+    assert len(errors) == 2 and np.array(errors, dtype=float).max() < 1e-4
+
+
+def companion_told(observer, key):
+    statuses = [message.status[0] for message in observer.heard["/diagnostics"]]
+    return [
+        {pair.key: pair.value for pair in status.values}[key]
+        for status in statuses
+        if status.name.endswith("control")
+    ]
+
+
+def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
+    nodes, observer, tmp_path
+):
+    motion = DesiredMotion(to_angles=ToAngles(gamma=AWAY, duration=20.0))
+    path, bag = written(tmp_path, motion=motion), tmp_path / "bag"
+    reference = observer.listen(JointState, "/sst_inverse_dynamics/reference")
+    recorder = nodes.run("recorder", output=bag)
+    simulator = nodes.run("simulator", scene=path, wait_for_command="true", command_timeout=0.1)
+    assert nodes.line(recorder).startswith("ready")
+    companion = nodes.run(
+        "inverse_dynamics", scene=path, mode="feedforward_pd", wait_for_subscribers=2
+    )
+    observer.until(lambda: len(reference) > 100, "the motion")
+    companion.send_signal(signal.SIGKILL)
+    said = observer.told("command_timeouts", lambda value: int(value) >= 1)
+    assert said["phase"] == "running"
+    assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
+    run = recording.read(bag)
+    assert not run.effort[-1].any() and run.effort[:100].any()  # let go
+    judged = tracking_bag.judged(tracking_bag.read(bag))
+    assert judged.samples > 50 and judged.largest.max() < 1e-3
+
+
+def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_path):
+    """The model does not know of the ends of the plant's stroke."""
+    out = DesiredMotion(to_angles=ToAngles(gamma=(1.7, HOME[1], HOME[2]), duration=0.3))
+    ignorant = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+    model = written(tmp_path, motion=out, **ignorant).rename(tmp_path / "model.yaml")
+    plant = written(tmp_path, motion=None)
+    simulator = nodes.run("simulator", scene=plant, sync="lockstep", real_time_factor=0.0)
+    companion = nodes.run("inverse_dynamics", scene=model, stamped="true")
+    out, err = companion.communicate(timeout=60)
+    assert companion.returncode == 1 and "the simulator stopped: fault: " in err
+    assert "Traceback" not in err and "error, largest" in out
+    nodes.stop(simulator)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"torque_limit": 0.5}, "exceeds the limit 0.5 N m"),
+        ({"stiffness": "[1.0, .nan, 1.0]"}, "stiff"),
+    ],
+    ids=["too weak", "nan gain"],
+)
+def test_what_cannot_be_followed_is_refused_at_the_start(nodes, tmp_path, given, reason):
+    """See test_companion_pursuit.py for more reasons."""
+    companion = nodes.run("inverse_dynamics", scene=written(tmp_path), **given)
+    _, err = companion.communicate(timeout=30)
+    assert companion.returncode == 1
+    assert reason in err and "Traceback" not in err
+
+
+def test_it_refuses_to_begin_where_the_manipulator_is_not(nodes, observer, tmp_path):
+    commands = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    companion = nodes.run("inverse_dynamics", scene=written(tmp_path))
+    states = observer.publisher(JointState, "/joint_states")
+    message = idle()
+    message.position[1] += 0.06
+    states.publish(message)
+    observer.until(lambda: companion.poll() is not None, "the end")
+    assert companion.returncode == 1
+    assert "where the motion begins" in companion.communicate()[1]
+    assert commands == []
+
+
+def test_silence_of_the_simulator_ends_it(nodes, tmp_path):
+    companion = nodes.run("inverse_dynamics", scene=written(tmp_path), timeout=0.5)
+    _, err = companion.communicate(timeout=20)
+    assert companion.returncode == 1
+    assert "no joint_states for" in err and "Traceback" not in err
+
+
+def test_what_is_not_finite_ends_it_with_zero_torque(nodes, observer, tmp_path):
+    commands = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    companion = nodes.run("inverse_dynamics", scene=written(tmp_path), mode="pd")
+    states = observer.publisher(JointState, "/joint_states")
+    states.publish(idle())
+    observer.until(lambda: len(commands) == 1, "an answer")
+    states.publish(idle(stamp_ns=1_000_000))
+    observer.until(lambda: len(commands) == 2, "an answer")
+    bad = idle(stamp_ns=3_000_000)
+    bad.velocity[2] = np.nan
+    states.publish(bad)
+    observer.until(lambda: companion.poll() is not None, "the end")
+    observer.until(lambda: len(commands) == 3, "zero torque")
+    assert companion.returncode == 1 and list(commands[-1].data) == [0.0] * 3
+    assert "control stopped at t = 0.002" in companion.communicate()[1]
