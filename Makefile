@@ -5,20 +5,36 @@ RUN = $(VENV)/bin/python
 # The ROS wheels: kilted (extra `ros`) or jazzy.
 ROS ?= ros
 EXTRAS = $(ROS),record,report,fast
-# Nodes share the machine's clock with nobody; the rest runs on all cores.
 PYTEST = $(RUN) -m pytest
+PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: demo test test-all lint format clean
+.PHONY: demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
 
 demo: $(VENV)/.demo
 	$(RUN) -m sst_ros demo
 
-test: $(VENV)/.test lint
-	$(PYTEST) --numprocesses auto --dist loadfile -m "not slow" --ignore test/ros
-	$(PYTEST) -m "not slow" test/ros
+demo-feedforward: $(VENV)/.demo
+	$(RUN) -m sst_ros demo feedforward
 
-test-all: $(VENV)/.test lint
-	$(PYTEST) --numprocesses auto --dist loadfile --ignore test/ros --timeout 600
+docs: $(VENV)/.docs
+	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs site
+
+view: $(VENV)/.view
+	@$(RUN) -m sst_ros view --scene swing --open
+
+test: $(VENV)/.test lint
+	$(PYTEST) $(PARALLEL) -m "not slow" --ignore test/ros
+	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
+
+# The nodes with the wheels of ROS 2 Jazzy, in an environment of their own.
+test-jazzy:
+	$(MAKE) test-ros VENV=.venv-jazzy ROS=jazzy
+
+test-ros: $(VENV)/.ros
+	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
+
+test-all: $(VENV)/.test lint test-jazzy
+	$(PYTEST) $(PARALLEL) --ignore test/ros --timeout 600
 	$(PYTEST) test/ros --timeout 600
 
 lint: $(VENV)/.test
@@ -41,9 +57,21 @@ $(VENV)/.demo: $(VENV)/.python setup.py
 	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
 	@touch $@
 
+$(VENV)/.view: $(VENV)/.python setup.py
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,view]"
+	@touch $@
+
+$(VENV)/.ros: $(VENV)/.python setup.py
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,report,view,test]"
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.python setup.py
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),export,docs]"
+	@touch $@
+
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),engines,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,export,docs,test]"
 	@touch $@
 
 clean:
-	rm -rf $(VENV) demo_out build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-jazzy demo_out view_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

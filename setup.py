@@ -6,8 +6,16 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "sst_ros"
-NODES = ("simulator", "torque_player", "recorder")
-ROS_MESSAGES = ("std", "sensor", "geometry", "trajectory", "diagnostic", "rosgraph")
+NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
+ROS_MESSAGES = (
+    "std",
+    "sensor",
+    "geometry",
+    "trajectory",
+    "diagnostic",
+    "rosgraph",
+    "visualization",
+)
 
 
 def wheels(distribution: str) -> list[str]:
@@ -49,7 +57,10 @@ setup(
         "jazzy": wheels("jazzy"),
         "record": ["rosbags>=0.11"],
         "report": ["rosbags>=0.11", "matplotlib>=3.5"],
+        "export": ["rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
+        "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
         "fast": ["numba>=0.57"],
+        "view": ["viser>=1.1"],
         "engines": ["mujoco>=4", "pin>=4"],
         "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
         "test": [
@@ -62,6 +73,7 @@ setup(
             "pytest-timeout",
             "pytest-xdist",
             "ruff",
+            "selenium",
             "types-PyYAML",
         ],
     },

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well the simulator keeps time: missed ticks, processor, memory; and its fastest speed.
 
-python benchmark/realtime.py --minutes 10        # the official figures, on an idle machine
+python -m benchmark.realtime --minutes 10 --write   # the official figures, on an idle machine
+python -m benchmark.realtime --fleet 10 --rate 200  # namespaced simulators side by side
 
 Runs simulator and recorder for so long, with SCHED_FIFO and without, then the simulator alone as
-fast as possible. The manipulator is kept moving by a damped PD controller in its own process.
+fast as possible, then a fleet. Commands of zero torque come at 100 Hz.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import shutil
 import signal
 import subprocess
@@ -20,162 +19,304 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
-NODE = "/sst_simulator"
+from benchmark import machine
+
+PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
 TICK = os.sysconf("SC_CLK_TCK")
+Figures = dict[str, str]
 
 
 class Watch:
-    """Hears the diagnostics and reads the kernel's account of a process."""
+    """Hears the diagnostics of every simulator, by its full name."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.node = rclpy.create_node("benchmark")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.said = {}
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+        self.said: dict[str, dict[str, str]] = {}
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 100)
 
-    def _hear(self, message):
-        self.said = {pair.key: pair.value for pair in message.status[0].values}
+    def _hear(self, message: DiagnosticArray) -> None:
+        name = message.status[0].name.removesuffix(": run")
+        self.said[name] = {pair.key: pair.value for pair in message.status[0].values}
 
-    def spin(self, seconds):
+    def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.1)
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
 
-    def until(self, condition, timeout=60.0):
+    def until(self, condition: Any, what: str, timeout: float = 120.0) -> None:
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end:
-                raise SystemExit("the nodes did not come up")
-            self.executor.spin_once(timeout_sec=0.1)
+                raise SystemExit(f"no {what} within {timeout:g} s")
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def phase(self, name: str) -> str:
+        return self.said.get(name, {}).get("phase", "")
 
 
-def processor_s(pid):
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICK
+class Process:
+    """A node in a process of its own, and the kernel's account of it."""
+
+    def __init__(self, command: str, namespace: str = "/", **given: Any) -> None:
+        words = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
+        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words]
+        argv += ["-r", f"__ns:={namespace}"]
+        self._process = subprocess.Popen(
+            argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+
+    def line(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
+
+    def processor_s(self) -> float:
+        text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8")
+        fields = text.rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / TICK
+
+    def memory_kb(self) -> int:
+        text = Path(f"/proc/{self._process.pid}/status").read_text(encoding="utf-8")
+        return next(int(row.split()[1]) for row in text.splitlines() if row.startswith("VmRSS"))
+
+    def end(self) -> None:
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.communicate(timeout=60)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
 
 
-def memory_kb(pid):
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+@contextmanager
+def commanded(watch: Watch, topic: str, readers: int) -> Iterator[None]:
+    """Publish zero torques at 100 Hz to a simulator, and perhaps a recorder."""
+    commands = watch.node.create_publisher(Float64MultiArray, topic, 10)
+    watch.until(lambda: commands.get_subscription_count() >= readers, f"readers of {topic}")
+    stop, message = threading.Event(), Float64MultiArray(data=[0.0, 0.0, 0.0])
 
+    def publish() -> None:
+        while not stop.wait(0.01):
+            commands.publish(message)
 
-def start(command, **given):
-    words = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
-    argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words]
-    return subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-
-def keep_time(watch, minutes, priority, given):
-    """1 kHz with the recorder attached and commands at 100 Hz."""
-    folder = Path(tempfile.mkdtemp())
-    recorder = start("recorder", output=folder / "bag")
-    watch.said = {}
-    simulator = start("simulator", realtime_priority=priority, wait_for_command="true", **given)
+    thread = threading.Thread(target=publish)
+    thread.start()
     try:
-        recorder.stdout.readline()
-        # Only now: the recorder is ready when it has heard all that speak.
-        commands = watch.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
-        watch.until(lambda: commands.get_subscription_count() >= 2)
-        stop = threading.Event()
-        message = Float64MultiArray(data=[0.0, 0.0, 0.0])
-
-        def command():
-            while not stop.wait(0.01):
-                commands.publish(message)
-
-        thread = threading.Thread(target=command)
-        thread.start()
-        watch.until(lambda: watch.said.get("phase") == "running")
-        memory, began = [], (time.monotonic(), processor_s(simulator.pid))
-        while time.monotonic() - began[0] < 60.0 * minutes:
-            watch.spin(min(5.0, 6.0 * minutes))
-            memory.append((time.monotonic() - began[0], memory_kb(simulator.pid)))
-        wall = time.monotonic() - began[0]
-        used = processor_s(simulator.pid) - began[1]
+        yield
+    finally:
         stop.set()
         thread.join()
-        simulator.send_signal(signal.SIGINT)
-        simulator.communicate(timeout=30)
-        watch.spin(1.5)
         watch.node.destroy_publisher(commands)
-        recorder.send_signal(signal.SIGINT)
-        recorder.communicate(timeout=60)
-        said = watch.said
-        later = [kb for at, kb in memory if at >= min(60.0, wall / 2)]
-        ticks, missed = int(said["ticks"]), int(said["ticks_missed"])
+
+
+def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
+    """1 kHz with the recorder attached."""
+    name, folder = "/sst_simulator", Path(tempfile.mkdtemp())
+    watch.said.clear()
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        recorder = Process("recorder", output=folder / "bag")
+        stack.callback(recorder.end)
+        simulator = Process("simulator", wait_for_command="true", **given)
+        stack.callback(simulator.end)
+        recorder.line()  # it is ready when it has heard all that speak
+        memory: list[tuple[float, int]] = []
+        with commanded(watch, f"{name}/commands", readers=2):
+            watch.until(lambda: watch.phase(name) == "running", "run")
+            began, used = time.monotonic(), simulator.processor_s()
+            while (passed := time.monotonic() - began) < 60.0 * minutes:
+                watch.spin(min(5.0, 6.0 * minutes))
+                memory.append((passed, simulator.memory_kb()))
+            wall, used = time.monotonic() - began, simulator.processor_s() - used
+        simulator.end()
+        watch.spin(1.5)
+        recorder.end()
+        said = watch.said[name]
         return {
             "scheduling": said["scheduling"],
-            "minutes": round(wall / 60.0, 2),
-            "ticks": ticks,
-            "missed_percent": round(100.0 * missed / (ticks + missed), 4),
-            "late_std_us": round(float(said["late_std_us"]), 1),
-            "late_max_us": round(float(said["late_max_us"]), 1),
-            "step_mean_us": round(float(said["step_mean_us"]), 1),
-            "processor_percent_of_a_core": round(100.0 * used / wall, 1),
-            "memory_kB": later[-1],
-            "memory_growth_after_first_minute_kB": max(later) - later[0],
-            "recorded": _lost(folder / "bag"),
+            "length [min]": f"{wall / 60.0:.1f}",
+            **_on_time([said]),
+            "processor [% of a core]": f"{100.0 * used / wall:.1f}",
+            "mean step [us]": f"{float(said['step_mean_us']):.1f}",
+            "memory [MB]": f"{memory[-1][1] / 1024.0:.0f}",
+            "its growth after the first minute [MB]": _growth(memory, wall),
+            "recorded": _recorded(folder / "bag"),
         }
-    finally:
-        for process in (simulator, recorder):
-            if process.poll() is None:
-                process.kill()
-            process.communicate()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
-def free_run(watch, seconds, given):
-    """As fast as possible; samples at 50 Hz of simulated time, control at 1 kHz."""
-    simulator = start("simulator", real_time_factor=0.0, publish_rate=50, **given)
-    watch.said = {}
+def free_run(watch: Watch, seconds: float, publish_rate: int, given: dict[str, Any]) -> Figures:
+    """As fast as possible, without a recorder."""
+    name = "/sst_simulator"
+    watch.said.clear()
+    simulator = Process("simulator", real_time_factor=0.0, publish_rate=publish_rate, **given)
     try:
-        watch.until(lambda: watch.said.get("phase") == "running")
+        watch.until(lambda: watch.phase(name) == "running", "run")
         watch.spin(seconds)
+        said = watch.said[name]
         return {
-            "free_run_factor": round(float(watch.said["real_time_factor_now"]), 1),
-            "step_mean_us": round(float(watch.said["step_mean_us"]), 2),
+            "publish_rate [Hz]": str(publish_rate),
+            "real-time factor": f"{float(said['real_time_factor_now']):.0f}",
+            "mean step [us]": f"{float(said['step_mean_us']):.2f}",
         }
     finally:
-        simulator.send_signal(signal.SIGINT)
-        simulator.communicate(timeout=30)
+        simulator.end()
 
 
-def _lost(bag):
+def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str, Any]) -> Figures:
+    """Namespaced simulators side by side, each publishing at its rate."""
+    names = [f"/sst_{k}/sst_simulator" for k in range(number)]
+    watch.said.clear()
+    nodes = [
+        Process("simulator", name.rpartition("/")[0], rate=rate, publish_rate=rate, **given)
+        for name in names
+    ]
+    try:
+        watch.until(lambda: all(watch.phase(name) == "running" for name in names), "fleet", 240.0)
+        watch.spin(5.0)  # until all have found each other
+        before, used = dict(watch.said), sum(node.processor_s() for node in nodes)
+        watch.spin(seconds)
+        used = sum(node.processor_s() for node in nodes) - used
+        since = [_since(before[name], watch.said[name]) for name in names]
+        worst = max(since, key=_missed)
+        return {
+            "simulators": str(number),
+            "rate [Hz]": str(rate),
+            "scheduling": watch.said[names[0]]["scheduling"],
+            "length [min]": f"{seconds / 60.0:.1f}",
+            "missed ticks, all [%]": f"{_missed_of(since):.3f}",
+            "missed ticks, worst of them [%]": f"{_missed(worst):.3f}",
+            "processor, all [% of a core]": f"{100.0 * used / seconds:.0f}",
+        }
+    finally:
+        for node in nodes:
+            node.end()
+
+
+def _since(before: dict[str, str], now: dict[str, str]) -> dict[str, str]:
+    return {key: str(int(now[key]) - int(before[key])) for key in ("ticks", "ticks_missed")}
+
+
+def _missed(said: dict[str, str]) -> float:
+    return _missed_of([said])
+
+
+def _missed_of(all_said: list[dict[str, str]]) -> float:
+    ticks = sum(int(said["ticks"]) for said in all_said)
+    missed = sum(int(said["ticks_missed"]) for said in all_said)
+    return 100.0 * missed / max(ticks + missed, 1)
+
+
+def _on_time(all_said: list[dict[str, str]]) -> Figures:
+    (said,) = all_said
+    return {
+        "missed ticks [%]": f"{_missed(said):.4f}",
+        "of ticks": str(int(said["ticks"]) + int(said["ticks_missed"])),
+        "lateness, mean [us]": f"{float(said['late_mean_us']):.0f}",
+        "lateness, standard deviation [us]": f"{float(said['late_std_us']):.0f}",
+        "lateness, largest [us]": f"{float(said['late_max_us']):.0f}",
+    }
+
+
+def _growth(memory: list[tuple[float, int]], wall: float) -> str:
+    later = [kb for at, kb in memory if at >= min(60.0, wall / 2.0)]
+    return f"{(max(later) - later[0]) / 1024.0:.2f}"
+
+
+def _recorded(bag: Path) -> str:
     from sst_ros.report import recording
 
     run = recording.read(bag)
-    expected = int(run.time_ns[-1] // run.period_ns) + 1
+    # The last sample is where the run was stopped, perhaps before its time.
+    expected = -int((run.time_ns[0] - run.time_ns[-1]) // run.period_ns) + 1
     return f"{len(run.time_ns)} of {expected} samples"
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=1.0)
+def table(columns: list[Figures]) -> str:
+    """Markdown: a row for each key, a column for each run."""
+    keys = list(dict.fromkeys(key for column in columns for key in column))
+    rows = [[key, *(column.get(key, "") for column in columns)] for key in keys]
+    rows.insert(1, ["---", *("---" for _ in columns)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=1.0, help="of each run at 1 kHz; 0: none")
     parser.add_argument("--scene", default="example2")
-    parser.add_argument("--compiled", action="store_true", help="run under numba")
-    parser.add_argument("--priority", type=int, default=20)
+    parser.add_argument("--plain", action="store_true", help="plain Python, no machine code")
+    parser.add_argument("--priority", type=int, default=20, help="of SCHED_FIFO")
+    parser.add_argument("--fleet", type=int, default=0, help="only so many simulators at once")
+    parser.add_argument("--rate", type=int, default=200, help="of the fleet [Hz]")
+    parser.add_argument("--write", action="store_true", help="write docs/realtime.md")
     options = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", str(101 - os.getpid() % 50))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    given = {"scene": options.scene, "compiled": str(options.compiled).lower()}
+    given = {"scene": options.scene, "compiled": str(not options.plain).lower()}
+    if not options.plain:
+        made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
+        subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
+    parts = list(_parts(options, given))
+    if options.write:
+        PAGE.write_text("\n\n".join([_HEAD, *parts]) + "\n", encoding="utf-8")
+
+
+def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
     rclpy.init()
     watch = Watch()
-    result = {"machine": platform.platform(), "processors": os.cpu_count(), **given}
-    for name, priority in (("fifo", options.priority), ("usual", 0)):
-        result[name] = keep_time(watch, options.minutes, priority, given)
-        print(json.dumps({name: result[name]}, indent=2), flush=True)
-    result["free"] = free_run(watch, 10.0, given)
-    print(json.dumps(result, indent=2))
+
+    def told(title: str, columns: list[Figures]) -> str:
+        part = f"## {title}\n\n{table(columns)}"
+        print(part, end="\n\n", flush=True)
+        return part
+
+    if not options.fleet:
+        if options.minutes:
+            both = [
+                {"": name, **keep_time(watch, options.minutes, {**given, **how})}
+                for name, how in (
+                    ("SCHED_FIFO asked for", {"realtime_priority": options.priority}),
+                    ("not", {"realtime_priority": 0}),
+                )
+            ]
+            yield told("1 kHz, 500 samples a second, recorder attached", both)
+        runs = [
+            {"": f"run {k + 1}", **free_run(watch, 8.0, rate, given)}
+            for k, rate in enumerate((1000, 500, 100, 50))
+        ]
+        yield told("As fast as possible, 1 kHz control, no recorder", runs)
+    number = options.fleet or (10 if options.minutes else 0)
+    if number:
+        seconds = min(60.0 * options.minutes, 60.0) or 20.0
+        found = fleet(watch, number, options.rate, seconds, given)
+        yield told("Namespaced simulators side by side", [{"": "fleet", **found}])
+    packages = ("rclpy", "numba", "numpy", "ros-rclpy", "ros-rmw-fastrtps-cpp")
+    said = f"Scene {options.scene}. {machine.line(machine.described(*packages))}."
+    print(said, flush=True)
+    yield said
     watch.node.destroy_node()
     rclpy.try_shutdown()
+
+
+_HEAD = """\
+# Keeping time
+
+Measured by `python -m benchmark.realtime --minutes 10 --write`; Python without a real-time kernel
+is soft real time. A tick is missed when the one before it, or the machine, makes it late by a
+whole period; simulated time then drops it and the diagnostics count it."""
 
 
 if __name__ == "__main__":

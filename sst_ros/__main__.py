@@ -9,8 +9,20 @@ import sys
 
 from sst_ros.errors import SstError
 
-COMMANDS = ("demo", "report", "recover", "scene")
-NODES = ("simulator", "torque_player", "recorder")
+COMMANDS = (
+    "compile",
+    "demo",
+    "describe",
+    "export",
+    "plan",
+    "plot",
+    "report",
+    "recover",
+    "scene",
+    "study",
+    "view",
+)
+NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -19,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     if given and given[0] in NODES:
         status: int = importlib.import_module(f"sst_ros.nodes.{given[0]}").main(given)
         return status
-    options = _parser().parse_args(given)
+    options = parser().parse_args(given)
     try:
         done: int = options.run(options) or 0
     except SstError as error:
@@ -28,16 +40,17 @@ def main(arguments: list[str] | None = None) -> int:
     return done
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Build the parser of all commands."""
+    result = argparse.ArgumentParser(
         prog="python -m sst_ros",
         description=__doc__,
         epilog=f"Nodes, which take --ros-args: {', '.join(NODES)}.",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = result.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:
         importlib.import_module(f"sst_ros.commands.{name}").add(commands)
-    return parser
+    return result
 
 
 if __name__ == "__main__":

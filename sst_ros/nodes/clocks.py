@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import endpoints
-from sst_ros.nodes.messages import set_time
+from sst_ros.nodes.template import Template
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must not stand still with simulated time."""
@@ -50,7 +50,7 @@ class OwnClock:
             allowed = f"/clock is published already, by {', '.join(others)}"
             raise InputError(origin, [Problem(given, True, allowed)])
         self._publisher = endpoints.CLOCK.publisher(node)
-        self._message = ClockMessage()
+        self._message = Template(ClockMessage())
         self.now_ns = node.get_clock().now().nanoseconds
 
     def tell(self, now_ns: int) -> None:
@@ -60,8 +60,7 @@ class OwnClock:
 
     def repeat(self) -> None:
         """Publish the time again, for those who come late."""
-        set_time(self._message.clock, self.now_ns)
-        self._publisher.publish(self._message)
+        self._publisher.publish(self._message.stamped(self.now_ns))
 
     def rivals(self) -> list[str]:
         """Names of other nodes that publish /clock."""

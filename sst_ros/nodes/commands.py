@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.scene import Actuators
 from sst_ros.simulation import NANOSECONDS, State, Triple
 
 ZERO: Triple = (0.0, 0.0, 0.0)
@@ -23,6 +24,14 @@ class Settings(Protocol):
     """Where the parameters are; they may change between two ticks."""
 
     parameters: SimulatorParameters
+
+
+class Moving(Protocol):
+    """What is braked."""
+
+    @property
+    def state(self) -> State:
+        """Its state now."""
 
 
 class Refused(Exception):
@@ -52,12 +61,14 @@ class CommandBoard:
     def __init__(
         self,
         settings: Settings,
-        limit: float | None,
+        actuators: Actuators | None,
         commands: Take,
         stamped: Take,
         moments: Take | None = None,
     ) -> None:
-        self._settings, self._limit = settings, limit
+        self._settings = settings
+        self._limit = actuators.torque_limit if actuators else None
+        self._damping = actuators.idle_damping if actuators else 0.0
         self._commands, self._stamped, self._moments = commands, stamped, moments
         self._lockstep = settings.parameters.sync == "lockstep"
         self.received = self.dropped = self.clamped = self.timeouts = 0
@@ -91,10 +102,15 @@ class CommandBoard:
         self._take()
         return self.begun
 
-    def torque(self, state: State) -> Triple:
-        """Torques of the tick that begins at `state` [N m]."""
+    @property
+    def brakes(self) -> bool:
+        """Whether torques now depend on the state: they are those of one tick only."""
+        return self.stale and self._damping > 0.0
+
+    def torque(self, moving: Moving) -> Triple:
+        """Torques of the tick that begins now [N m]."""
         self._take()
-        return self._held if not self._too_old() else self._braking(state)
+        return self._held if not self._too_old() else self._braking(moving)
 
     def answer(self, stamp_ns: int) -> Triple | None:
         """Torques that answer the sample of this stamp [N m], or None as long as there are none."""
@@ -142,11 +158,9 @@ class CommandBoard:
             self._drop(refused)
 
     def _accept(self, torque: Triple) -> Triple:
-        limit = self._limit
-        if limit is not None and max(map(abs, torque)) > limit:
-            first, second, third = (min(max(tau, -limit), limit) for tau in torque)
-            torque = (first, second, third)
-            self.clamped += 1
+        limited = self._limited(torque)
+        self.clamped += limited != torque
+        torque = limited
         self.received += 1
         self._held, self._since, self.begun = torque, time.monotonic(), True
         return torque
@@ -164,13 +178,17 @@ class CommandBoard:
         self.stale = old
         return old
 
-    def _braking(self, state: State) -> Triple:
-        damping, limit = self._settings.parameters.timeout_damping, self._limit or math.inf
-        if damping == 0.0:
+    def _braking(self, moving: Moving) -> Triple:
+        if not self._damping:
             return ZERO
-        first, second, third = (
-            min(max(-damping * rate, -limit), limit) for rate in state.joints.gamma_dot
+        first, second, third = moving.state.joints.gamma_dot
+        return self._limited(
+            (-self._damping * first, -self._damping * second, -self._damping * third)
         )
+
+    def _limited(self, torque: Triple) -> Triple:
+        limit = self._limit or math.inf
+        first, second, third = (min(max(tau, -limit), limit) for tau in torque)
         return (first, second, third)
 
     def _all(self, take: Take) -> Sequence[Any]:

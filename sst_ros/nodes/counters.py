@@ -35,15 +35,15 @@ class Counters:
             self._wall_s += time.monotonic() - self._resumed
             self._resumed = None
 
-    def stepped(self, took_s: float, late_ns: int) -> None:
-        """Note a step: what it took, and how late it began."""
-        self.ticks += 1
+    def stepped(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
+        """Note steps that were done at once: what they took, and how late they began."""
+        self.ticks += ticks
         self.step_total_s += took_s
-        if took_s > self.step_max_s:
-            self.step_max_s = took_s
+        if took_s > self.step_max_s * ticks:
+            self.step_max_s = took_s / ticks
         late = 1e-3 * late_ns
-        self._late_total += late
-        self._late_square += late * late
+        self._late_total += late * ticks
+        self._late_square += late * late * ticks
         if late > self._late_max:
             self._late_max = late
 

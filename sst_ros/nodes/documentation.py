@@ -13,12 +13,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from sst_ros.nodes import endpoints, health
-from sst_ros.nodes.endpoints import PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from sst_ros.nodes import endpoints, health, inverse_dynamics
+from sst_ros.nodes.companion_settings import CompanionParameters
+from sst_ros.nodes.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.nodes.settings import (
     PlayerParameters,
     RecorderParameters,
     SimulatorParameters,
+    ViewerParameters,
     default_topics,
 )
 from sst_ros.schema import Section, Spec, specs
@@ -55,14 +57,20 @@ class Described(NamedTuple):
 NODES = (
     Described("simulator", SIMULATOR, SimulatorParameters, endpoints.SIMULATOR),
     Described("torque_player", "sst_torque_player", PlayerParameters, endpoints.PLAYER),
+    Described("inverse_dynamics", "sst_inverse_dynamics", CompanionParameters, endpoints.COMPANION),
     Described("recorder", "sst_recorder", RecorderParameters, endpoints.RECORDER),
+    Described("viewer", "sst_viewer", ViewerParameters, endpoints.VIEWER),
 )
 
 
 def tables() -> dict[str, str]:
     """Give the text of every generated part of docs/nodes.md, by its name."""
     parts = {
-        "diagnostics": _table(("key", "what"), ((f"`{k}`", v) for k, v in health.KEYS.items()))
+        name: _table(("key", "what"), ((f"`{key}`", said) for key, said in keys.items()))
+        for name, keys in (
+            ("diagnostics", health.KEYS),
+            ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
+        )
     }
     for node in NODES:
         parts[f"{node.command} parameters"] = _table(
@@ -97,7 +105,7 @@ def policy(node: Described) -> str:
         reply |= {f"/{node.name}/{name}" for name in SIMULATION_INTERFACES}
     if node.command == "recorder":
         subscribe |= {*default_topics(), "/clock"}
-    if node.command == "torque_player":
+    if node.command in ("torque_player", "inverse_dynamics", "viewer"):
         subscribe.add("/clock")
     return "\n".join(
         [
@@ -112,6 +120,7 @@ def policy(node: Described) -> str:
             *_rules("topics", "topic", "publish", publish),
             *_rules("topics", "topic", "subscribe", subscribe),
             *_rules("services", "service", "reply", reply),
+            *_rules("services", "service", "request", _names(node, CALLS)),
             "        </profile>",
             "      </profiles>",
             "    </enclave>",
@@ -123,8 +132,11 @@ def policy(node: Described) -> str:
 
 
 def _rules(group: str, entry: str, right: str, names: Iterable[str]) -> Iterator[str]:
+    listed = sorted(names)
+    if not listed:
+        return
     yield f'          <{group} {right}="ALLOW">'
-    for name in sorted(names):
+    for name in listed:
         yield f"            <{entry}>{name}</{entry}>"
     yield f"          </{group}>"
 
@@ -141,8 +153,10 @@ def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
     for name, spec in specs(cls).items():
         value = getattr(defaults, name)
         shown = str(value).lower() if isinstance(value, bool) else value
-        if isinstance(value, tuple):
+        if spec.kind == "texts":
             shown = "those of config/topics.txt"
+        elif isinstance(value, tuple):
+            shown = list(value)
         may = "yes" if name in changeable else "no"
         yield f"`{name}`", f"{shown}", _allowed(spec), may, spec.doc
 

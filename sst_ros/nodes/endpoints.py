@@ -19,8 +19,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
-PUBLISHES, SUBSCRIBES, SERVES = "publishes", "subscribes", "serves"
+PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Endpoint:
     """One topic or service of a node.
 
     Attributes:
-        use: PUBLISHES, SUBSCRIBES or SERVES.
+        use: PUBLISHES, SUBSCRIBES, SERVES or CALLS.
         name: its name; {simulator} stands for the player's parameter.
         kind: type of its messages.
         doc: what it carries.
@@ -94,6 +95,23 @@ DIAGNOSTICS = Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of th
 CLOCK = Endpoint(
     PUBLISHES, "/clock", Clock, "simulated time", depth=1, when="publish_clock is true"
 )
+ROBOT_DESCRIPTION = Endpoint(
+    PUBLISHES,
+    "robot_description",
+    String,
+    "the scene as URDF",
+    depth=1,
+    latched=True,
+    when="publish_description is true",
+)
+MARKERS = Endpoint(
+    PUBLISHES,
+    "~/markers",
+    MarkerArray,
+    "the manipulator, the path of E, s and the torques, for RViz, in base",
+    depth=1,
+    when="the scene has markers",
+)
 COMMANDS = Endpoint(
     SUBSCRIBES, "~/commands", Float64MultiArray, "torques of gamma_1..3 [N m], held until the next"
 )
@@ -134,6 +152,8 @@ SIMULATOR = (
     PHASE,
     DIAGNOSTICS,
     CLOCK,
+    ROBOT_DESCRIPTION,
+    MARKERS,
     COMMANDS,
     COMMANDS_STAMPED,
     EXTERNAL_MOMENT,
@@ -160,6 +180,76 @@ PLAYER = (
     ),
     Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered"),
     Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
+)
+
+VIEWER = (
+    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is shown", depth=64),
+    Endpoint(SUBSCRIBES, "{simulator}/scene", String, "which manipulator is drawn", 1, True),
+    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "what the run does", 1, True),
+    Endpoint(SUBSCRIBES, "/diagnostics", DiagnosticArray, "health of the run"),
+    Endpoint(
+        PUBLISHES,
+        "{simulator}/commands",
+        Float64MultiArray,
+        "torques of the page's sliders [N m], 20 times a second",
+        when="a slider was moved and no other node publishes commands",
+    ),
+    Endpoint(CALLS, "{simulator}/pause", SetBool, "the button Pause, or Resume"),
+    Endpoint(CALLS, "{simulator}/step", Trigger, "the button Step"),
+    Endpoint(CALLS, "{simulator}/reset", Trigger, "the button Reset"),
+)
+
+REFERENCE = Endpoint(
+    PUBLISHES,
+    "~/reference",
+    JointState,
+    "desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m]; the stamp is that of "
+    "the joint_states it belongs to",
+    depth=1000,
+)
+TRACKING_ERROR = Endpoint(
+    PUBLISHES,
+    "~/tracking_error",
+    JointState,
+    "desired - measured [rad], [rad/s]; effort: feedback [N m]; stamp as of ~/reference",
+    depth=1000,
+)
+JOINT_TRAJECTORY = Endpoint(
+    SUBSCRIBES,
+    "~/joint_trajectory",
+    JointTrajectory,
+    "motion to follow, from now on and in place of the present one; refused as a whole where it "
+    "cannot be followed, and where motion is not topic",
+)
+
+COMPANION = (
+    Endpoint(
+        PUBLISHES,
+        "{simulator}/commands",
+        Float64MultiArray,
+        "torques [N m] that answer each joint_states",
+        when="stamped is false",
+    ),
+    Endpoint(
+        PUBLISHES,
+        "{simulator}/commands_stamped",
+        JointState,
+        "the same, by name and stamp",
+        when="stamped is true",
+    ),
+    REFERENCE,
+    TRACKING_ERROR,
+    Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of the control, at 1 Hz"),
+    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered; the newest counts", 1),
+    Endpoint(
+        SUBSCRIBES,
+        "{simulator}/phase",
+        String,
+        "begins anew at a reset, ends at a fault and at the end of the run",
+        10,
+        True,
+    ),
+    JOINT_TRAJECTORY,
 )
 
 RECORDER: tuple[Endpoint, ...] = ()

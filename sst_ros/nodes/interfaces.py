@@ -23,7 +23,7 @@ except ImportError:  # not part of every installation, nor of the wheels
 
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 UNSUPPORTED, DONE, _, INCORRECT_STATE, FAILED = range(5)
-ALREADY_THERE = 101
+ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
 SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
 FEATURES = (20, 22, 24, 25, 26, 31, 32)
 """Reset, reset of the state, get and set the state, pause, one step, many steps."""
@@ -52,6 +52,9 @@ class SimulationInterfaces:
         wanted = request.state.state
         if wanted == self._state():
             response.result.result = ALREADY_THERE
+        elif wanted == PAUSED and self._state() == STOPPED:
+            response.result.result = INCORRECT_TRANSITION
+            response.result.error_message = "a stopped simulation can be started, not paused"
         elif wanted == STOPPED:
             paused = self._loop.ask(partial(self._loop.pause, True))
             done = self._loop.ask(self._loop.reset)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the simulator, built once and filled in place."""
+"""Messages of the simulator, built once; afterwards only their numbers are written."""
 
 from __future__ import annotations
 
-from array import array
+import math
 from collections.abc import Sequence
 
 from builtin_interfaces.msg import Duration, Time
@@ -12,48 +12,98 @@ from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.errors import SstError
 from sst_ros.nodes.commands import ACTUATORS
+from sst_ros.nodes.template import Template, Write, marks
 from sst_ros.simulation import NANOSECONDS, State
 
 JOINTS = [*ACTUATORS, "mu_1", "mu_2", "mu_3", "beta_1", "beta_2", "beta_3"]
 MOMENTS = ["moment_x", "moment_y", "moment_z"]
 BASE_FRAME = "base"
+_NO_JOINTS = (0.0,) * len(JOINTS)
+
+
+class NotFinite(SstError):
+    """A state with a number in it that is none; it is not published."""
 
 
 class StateMessages:
-    """joint_states, orientation and euler_zyz of one instant."""
+    """joint_states, orientation and euler_zyz of one instant, as bytes."""
 
     def __init__(self) -> None:
-        self.joint_states = JointState(name=JOINTS)
-        for field in ("position", "velocity", "effort"):
-            setattr(self.joint_states, field, array("d", [0.0] * len(JOINTS)))
-        self.orientation, self.euler_zyz = QuaternionStamped(), Vector3Stamped()
-        self.orientation.header.frame_id = self.euler_zyz.header.frame_id = BASE_FRAME
-        self._stamps = [
-            message.header.stamp
-            for message in (self.joint_states, self.orientation, self.euler_zyz)
-        ]
+        count = len(JOINTS)
+        position, velocity, effort = (marks(count, k * count) for k in range(3))
+        quaternion, angles = marks(4), marks(3)
+        joints = JointState(name=JOINTS, position=position, velocity=velocity, effort=effort)
+        orientation, euler = QuaternionStamped(), Vector3Stamped()
+        orientation.header.frame_id = euler.header.frame_id = BASE_FRAME
+        q, vector = orientation.quaternion, euler.vector
+        q.x, q.y, q.z, q.w = quaternion
+        vector.x, vector.y, vector.z = angles
+        self._joints, self._orientation, self._euler = map(Template, (joints, orientation, euler))
+        places = (self._joints.place(values) for values in (position, velocity, effort))
+        self._position, self._velocity, self._effort = places
+        self._quaternion, self._angles = (
+            self._orientation.place(quaternion),
+            self._euler.place(angles),
+        )
+        for write in (self._position, self._velocity, self._effort):
+            write(*_NO_JOINTS)
 
-    def fill(self, state: State, stamp_ns: int) -> None:
-        """Take over a state; the effort is the torque over the step that ended at it."""
-        for stamp in self._stamps:
-            set_time(stamp, stamp_ns)
-        at, message = state.joints, self.joint_states
-        for k in range(3):
-            message.position[k], message.velocity[k] = at.gamma[k], at.gamma_dot[k]
-            message.position[k + 3], message.velocity[k + 3] = at.mu[k], at.mu_dot[k]
-            message.position[k + 6], message.velocity[k + 6] = at.beta[k], at.beta_dot[k]
-            message.effort[k] = state.torque[k]
-        q, vector = self.orientation.quaternion, self.euler_zyz.vector
-        q.x, q.y, q.z, q.w = state.quaternion
-        theta, phi, psi = zyz_angles(rotation_matrix(state.quaternion)).tolist()
-        vector.x, vector.y, vector.z = theta, phi, psi
+    def fill(self, state: State) -> None:
+        """Take over a state; the effort is the torque over the step that ended at it.
+
+        Raises:
+            NotFinite: nothing has been taken over.
+
+        """
+        gamma, mu, beta, gamma_dot, mu_dot, beta_dot = state.joints
+        angles = gamma + mu + beta
+        rates = gamma_dot + mu_dot + beta_dot
+        # One number that is not finite makes the sum so.
+        if not math.isfinite(sum(angles + rates + state.quaternion + state.torque)):
+            raise NotFinite(f"a state that is not finite is not published: {state}")
+        self._position(*angles)
+        self._velocity(*rates)
+        self._effort(*state.torque, *_NO_JOINTS[3:])
+        self._quaternion(*state.quaternion)
+        self._angles(*zyz_of(state.quaternion))
 
     def still(self) -> None:
         """Set all rates and efforts to zero: a state that is held."""
-        for k in range(len(JOINTS)):
-            self.joint_states.velocity[k] = self.joint_states.effort[k] = 0.0
+        self._velocity(*_NO_JOINTS)
+        self._effort(*_NO_JOINTS)
+
+    def stamped(self, stamp_ns: int) -> tuple[bytes, bytes, bytes]:
+        """Give joint_states, orientation and euler_zyz."""
+        return (
+            self._joints.stamped(stamp_ns),
+            self._orientation.stamped(stamp_ns),
+            self._euler.stamped(stamp_ns),
+        )
+
+
+def zyz_of(quaternion: Sequence[float]) -> tuple[float, float, float]:
+    """ZYZ angles of a quaternion (x, y, z, w), as `frames.zyz_angles` has them, of plain floats.
+
+    z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
+    """
+    x, y, z, w = quaternion
+    aside, along = math.hypot(x, y), math.hypot(z, w)
+    total = math.atan2(z, w) if along else 0.0
+    difference = math.atan2(-x, y) if aside else 0.0
+    if not (aside and along):
+        theta, psi = 0.0, 2.0 * (total - difference)
+    else:
+        theta, psi = total + difference, total - difference
+    return _wrapped(theta), 2.0 * math.atan2(aside, along), _wrapped(psi)
+
+
+def _wrapped(angle: float) -> float:
+    """In (-pi, pi], as atan2 gives it."""
+    if angle > math.pi:
+        return angle - 2.0 * math.pi
+    return angle if angle > -math.pi else angle + 2.0 * math.pi
 
 
 class TorqueLog:
@@ -62,37 +112,47 @@ class TorqueLog:
     Point i holds over tick i and says when that tick ends, relative to the header's stamp.
     """
 
-    def __init__(self, ticks: int, period_ns: int, *, moments: bool = False) -> None:
-        names = [*ACTUATORS, *(MOMENTS if moments else ())]
-        self.message = JointTrajectory(joint_names=names)
-        self.message.header.frame_id = BASE_FRAME
-        self._moments = moments
-        self._points = [
-            JointTrajectoryPoint(
-                effort=array("d", [0.0] * len(names)),
-                time_from_start=Duration(
-                    sec=(i + 1) * period_ns // NANOSECONDS,
-                    nanosec=(i + 1) * period_ns % NANOSECONDS,
-                ),
-            )
-            for i in range(ticks)
-        ]
-        self.count = 0
+    def __init__(self, usual: int, period_ns: int, *, moments: bool = False) -> None:
+        self._names = [*ACTUATORS, *(MOMENTS if moments else ())]
+        self._period_ns, self._moments = period_ns, moments
+        self._rows: list[tuple[float, ...]] = []
+        # One for each number of ticks: mostly the usual one, none where there is no run.
+        self._forms = {count: self._form(count) for count in (0, usual)}
 
-    def append(self, torque: Sequence[float], moment: Sequence[float]) -> None:
-        """Note the torque and the moment of one tick."""
-        effort = self._points[self.count].effort
-        effort[0], effort[1], effort[2] = torque
-        if self._moments:
-            effort[3], effort[4], effort[5] = moment
-        self.count += 1
+    def __len__(self) -> int:
+        return len(self._rows)
 
-    def take(self, stamp_ns: int) -> JointTrajectory:
+    def clear(self) -> None:
+        """Forget what was noted."""
+        self._rows.clear()
+
+    def append(self, torque: Sequence[float], moment: Sequence[float], ticks: int = 1) -> None:
+        """Note the torque and the moment of a tick, or of several."""
+        row = (*torque, *moment) if self._moments else tuple(torque)
+        self._rows.extend([row] * ticks)
+
+    def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks noted since stamp_ns and begin anew."""
-        set_time(self.message.header.stamp, stamp_ns)
-        self.message.points = self._points[: self.count]
-        self.count = 0
-        return self.message
+        count = len(self._rows)
+        if count not in self._forms:
+            self._forms[count] = self._form(count)
+        template, places = self._forms[count]
+        for write, row in zip(places, self._rows, strict=True):
+            write(*row)
+        self._rows.clear()
+        return template.stamped(stamp_ns)
+
+    def _form(self, count: int) -> tuple[Template, list[Write]]:
+        size = len(self._names)
+        efforts = [marks(size, i * size) for i in range(count)]
+        message = JointTrajectory(joint_names=self._names)
+        message.header.frame_id = BASE_FRAME
+        for i, effort in enumerate(efforts):
+            sec, nanosec = divmod((i + 1) * self._period_ns, NANOSECONDS)
+            after = Duration(sec=sec, nanosec=nanosec)
+            message.points.append(JointTrajectoryPoint(effort=effort, time_from_start=after))
+        template = Template(message)
+        return template, [template.place(effort) for effort in efforts]
 
 
 def diagnostics(

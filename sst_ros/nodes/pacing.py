@@ -63,8 +63,8 @@ class Pacer:
         self.speed = speed
         self.start()
 
-    def wait(self, interrupted: Callable[[], bool]) -> bool:
-        """Wait for the next deadline; False if interrupted before it came."""
+    def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
+        """Wait for the next deadline, or the last of several; False if interrupted before."""
         if self.speed == 0.0:
             self.late_ns = 0
             return not interrupted()
@@ -76,7 +76,7 @@ class Pacer:
                 self.start()
                 now = self._anchor
             self._seen = now
-            late = now - self._anchor - round(self._count * interval)
+            late = now - self._anchor - round((self._count + ticks - 1) * interval)
             if late >= 0:
                 break
             if interrupted():
@@ -87,6 +87,6 @@ class Pacer:
             self.missed += dropped
             self.overruns += 1
             self._count += dropped
-        self._count += 1
+        self._count += ticks
         self.late_ns = late
         return True

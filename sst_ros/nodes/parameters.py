@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from array import array
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -52,8 +53,9 @@ def declare(node: Node, cls: type[P], changed: Callable[[P], None] | None = None
     for name, spec in specs(cls).items():
         default = getattr(defaults, name)
         value = given.get(name, list(default) if isinstance(default, tuple) else default)
-        if spec.kind == "number" and type(value) is int:
-            value = float(value)  # "-p duration:=1" means 1.0
+        if spec.kind == "number":  # "-p duration:=1" means 1.0
+            value = float(value) if type(value) is int else value
+            value = list(map(float, value)) if isinstance(value, array) else value
         try:
             node.declare_parameter(
                 name, value, _descriptor(name, spec, name not in changeable), ignore_override=True
@@ -101,13 +103,13 @@ def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
     unit = f" [{spec.unit}]" if spec.unit else ""
     descriptor = ParameterDescriptor(
         name=name,
-        type=_TYPES[spec.kind].value,
+        type=(Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value,
         description=spec.doc + unit,
         additional_constraints=spec.allowed(),
         read_only=read_only,
     )
     low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
-    if spec.kind == "number":
+    if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
         low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]

@@ -9,6 +9,7 @@ only add switches between threads.
 
 from __future__ import annotations
 
+import contextlib
 import time
 
 from rclpy.duration import Duration
@@ -19,7 +20,8 @@ from sst_ros.document import dump
 from sst_ros.nodes import endpoints
 from sst_ros.nodes.clocks import OwnClock
 from sst_ros.nodes.commands import Settings
-from sst_ros.nodes.messages import StateMessages, TorqueLog
+from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
+from sst_ros.nodes.template import sender
 from sst_ros.scene import Scene
 from sst_ros.simulation import State, Triple
 
@@ -38,10 +40,9 @@ class Publications:
         self._clock = OwnClock(node) if given.publish_clock else None
         samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
-        self._joint_states = endpoints.JOINT_STATES.publisher(node, depth)
-        self._orientation = endpoints.ORIENTATION.publisher(node, depth)
-        self._euler_zyz = endpoints.EULER_ZYZ.publisher(node, depth)
-        self._applied = endpoints.APPLIED_TORQUES.publisher(node, depth)
+        topics = (endpoints.JOINT_STATES, endpoints.ORIENTATION, endpoints.EULER_ZYZ)
+        self._send_state = [sender(topic.publisher(node, depth)) for topic in topics]
+        self._send_torques = sender(endpoints.APPLIED_TORQUES.publisher(node, depth))
         self._phase = endpoints.PHASE.publisher(node)
         self._scene = endpoints.SCENE.publisher(node)
         self._scene.publish(String(data=dump(scene)))
@@ -52,35 +53,41 @@ class Publications:
 
     def begin_ns(self, earliest_ns: int) -> int:
         """Give the stamp of a new start; 0 as long as the clock that is followed has no time."""
-        self._log.count = 0
+        self._log.clear()
         if self._clock is not None:
             return max(self._clock.now_ns, earliest_ns)
         now = self._node.get_clock().now().nanoseconds
         return max(now, earliest_ns) if now else 0
 
-    def tick(self, torque: Triple, moment: Triple) -> None:
-        """Note what acts over a tick."""
-        self._log.append(torque, moment)
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        """Note what acted over some ticks."""
+        self._log.append(torque, moment, count)
 
     def sample(self, state: State, stamp_ns: int) -> None:
-        """Publish a sample of the run and the torques that led to it."""
+        """Publish a sample of the run and the torques that led to it.
+
+        Raises:
+            NotFinite: nothing has been published.
+
+        """
+        self._messages.fill(state)
         if self._clock is not None:
             self._clock.tell(stamp_ns)
-        if self._log.count:
-            self._applied.publish(self._log.take(stamp_ns - self._log.count * self._period_ns))
-        self._messages.fill(state, stamp_ns)
-        self._publish_state()
+        if self._log:
+            self._send_torques(self._log.take(stamp_ns - len(self._log) * self._period_ns))
+        self._publish_state(stamp_ns)
 
     def idle(self, state: State, *, still: bool) -> None:
         """Show a state that is no sample: stamped zero, `still` with zero rates."""
         if self._clock is not None:
             self._clock.repeat()
-        self._log.count = 0
-        self._applied.publish(self._log.take(0))
-        self._messages.fill(state, 0)
+        self._log.clear()
+        self._send_torques(self._log.take(0))
+        with contextlib.suppress(NotFinite):  # then the last one that was is shown
+            self._messages.fill(state)
         if still:
             self._messages.still()
-        self._publish_state()
+        self._publish_state(0)
 
     def changed(self, phase: str) -> None:
         """Tell a change of the phase."""
@@ -106,7 +113,6 @@ class Publications:
             left = max(0.0, deadline - time.monotonic())
             publisher.wait_for_all_acked(Duration(seconds=left))
 
-    def _publish_state(self) -> None:
-        self._joint_states.publish(self._messages.joint_states)
-        self._orientation.publish(self._messages.orientation)
-        self._euler_zyz.publish(self._messages.euler_zyz)
+    def _publish_state(self, stamp_ns: int) -> None:
+        for send, message in zip(self._send_state, self._messages.stamped(stamp_ns), strict=True):
+            send(message)

@@ -6,10 +6,8 @@ Others ask for changes by `ask`. They happen between two samples, in the run's o
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-import threading
 import time
 import traceback
 from collections import deque
@@ -18,6 +16,7 @@ from collections.abc import Callable
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.nodes.commands import CommandBoard, Settings
 from sst_ros.nodes.counters import Counters
+from sst_ros.nodes.course import Course, NoAnswer
 from sst_ros.nodes.pacing import Pacer
 from sst_ros.nodes.run_parts import Answer, Audience, Phase, Reply
 from sst_ros.scene import Initial, Scene
@@ -34,9 +33,6 @@ class RunLoop:
     Attributes:
         phase: what it does now.
         fault: why it does nothing any more, until a reset.
-        begun: its first sample has been published since the start or the last reset.
-        simulation: the present one; its `state` may be read by any thread.
-        counters: counters.
 
     """
 
@@ -49,23 +45,32 @@ class RunLoop:
         pacer: Pacer,
         audience: Audience,
     ) -> None:
-        self.phase, self.fault, self.begun = Phase.WAITING, "", False
-        self.counters = Counters()
-        self.simulation = self._original = build(scene)
-        self._build, self._settings, self._board = build, settings, board
-        self._pacer, self._audience = pacer, audience
-        self._period_ns = settings.parameters.period_ns
-        self._ticks_per_sample = settings.parameters.ticks_per_sample
-        duration = settings.parameters.duration * settings.parameters.rate
-        self._last_tick = math.ceil(duration - 1e-6) or math.inf
-        self._tick = self._start_ns = self._stamp_ns = 0
+        self.phase, self.fault = Phase.WAITING, ""
+        self._build, self._settings = build, settings
+        self._board, self._audience = board, audience
+        self._original = build(scene)
+        self._course = Course(self._original, settings, board, pacer, audience)
         self._requests: deque[tuple[Callable[[], Reply], Answer]] = deque()
-        self._asked, self._stop = threading.Event(), threading.Event()
+
+    @property
+    def simulation(self) -> Simulation:
+        """The present one; its `state` may be read by any thread."""
+        return self._course.simulation
+
+    @property
+    def counters(self) -> Counters:
+        """What has been done."""
+        return self._course.counters
+
+    @property
+    def begun(self) -> bool:
+        """Whether the first sample has been published since the start or the last reset."""
+        return self._course.begun
 
     def ask(self, request: Callable[[], Reply], timeout: float = _ANSWER_S) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the run's thread; wait for the reply."""
         answer = self.post(request)
-        if self._stop.is_set() or not answer.done.wait(timeout):
+        if self._course.stop.is_set() or not answer.done.wait(timeout):
             return Reply(False, "the run did not answer: the node is shutting down or too slow")
         return answer.reply
 
@@ -73,13 +78,13 @@ class RunLoop:
         """Have a request served; do not wait."""
         answer = Answer()
         self._requests.append((request, answer))
-        self._asked.set()
+        self._course.asked.set()
         return answer
 
     def stop(self) -> None:
         """Have `run` return soon."""
-        self._stop.set()
-        self._asked.set()
+        self._course.stop.set()
+        self._course.asked.set()
 
     def run(self) -> None:
         """Live until `stop` or the end of the run."""
@@ -90,17 +95,17 @@ class RunLoop:
             Phase.PAUSED: self._idle,
             Phase.FAULT: self._idle,
         }
-        while not self._stop.is_set() and self.phase is not Phase.FINISHED:
+        while not self._course.stop.is_set() and self.phase is not Phase.FINISHED:
             try:
                 self._serve()
                 act[self.phase]()
-            except RunStopped as stopped:
+            except (RunStopped, NoAnswer) as stopped:
                 self._fail(str(stopped))
             except Exception as error:
                 at = traceback.extract_tb(error.__traceback__)[-1]
                 where = f"{at.filename.rpartition('/')[2]}:{at.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
-                self._stop.wait(IDLE_PERIOD_S)
+                self._course.stop.wait(IDLE_PERIOD_S)
         self._end_of_run()
 
     def pause(self, paused: bool) -> Reply:
@@ -123,17 +128,19 @@ class RunLoop:
         """Advance a paused run by one sample or more, by the torques of the last command."""
         if self.phase is not Phase.PAUSED:
             return Reply(False, f"refused: only a paused run can be stepped, it is {self._said()}")
-        if not self.begun and not self._begin():
+        if not self.begun and not self._course.begin():
             return Reply(False, "refused: there is no time yet on /clock")
         for _ in range(samples):
             self._board.refresh()
             try:
-                if not self._control_period(paced=False):
-                    return Reply(False, f"not done: {self._said()}")
+                if not self._course.to_the_next_sample(paced=False):
+                    return Reply(False, "not done: the node is shutting down")
+            except NoAnswer as none:
+                return Reply(False, f"not done: {none}")
             except RunStopped as stopped:
                 self._fail(str(stopped))
                 return Reply(False, self._said())
-        return Reply(True, f"at {self.simulation.state.time_ns / 1e9:.9f} s")
+        return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
     def reset(self) -> Reply:
         """Go back to the scene's initial state; stamps go on, the command is forgotten."""
@@ -159,13 +166,13 @@ class RunLoop:
         return Reply(True, f"the state is set, {self.phase.value}")
 
     def _start_anew(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        self._board.clear()
-        self.begun, self._tick = False, 0
+        self._course.start_anew(simulation)
         self._show()
 
     def _serve(self) -> None:
-        self._asked.clear()
+        if not self._course.asked.is_set():
+            return
+        self._course.asked.clear()
         while self._requests:
             request, answer = self._requests.popleft()
             try:
@@ -176,9 +183,9 @@ class RunLoop:
     def _wait_for_start(self) -> None:
         """Show the state until a command begins the run, where one has to."""
         shown = -math.inf
-        while not self._asked.is_set():
+        while not self._course.asked.is_set():
             called = not self._settings.parameters.waits or self._board.look()
-            if called and self._begin():
+            if called and self._course.begin():
                 self._resume()
                 return
             if time.monotonic() - shown > IDLE_PERIOD_S:
@@ -186,96 +193,33 @@ class RunLoop:
                 self._show()
             time.sleep(_POLL_S)
 
-    def _begin(self) -> bool:
-        """Publish the first sample; False as long as the clock has not begun."""
-        self._start_ns = self._audience.begin_ns(
-            self._stamp_ns + self._period_ns * self._ticks_per_sample
-        )
-        if self._start_ns == 0:
-            return False
-        self.begun = True
-        self._publish()
-        return True
-
     def _resume(self) -> None:
         self._to(Phase.RUNNING)
-        self._board.refresh()
-        self.counters.resume()
-        self._pacer.start()
+        self._course.resume()
 
     def _to_the_next_sample(self) -> None:
-        if self._control_period(paced=True) and self._tick >= self._last_tick:
+        if self._course.to_the_next_sample(paced=True) and self._course.is_over:
             self._to(Phase.FINISHED)
-
-    def _control_period(self, *, paced: bool) -> bool:
-        """Tick to the next sample and publish it; False if there was none."""
-        answer: Triple | None = None
-        if self._settings.parameters.sync == "lockstep":
-            answer = self._answered(paced)
-            if answer is None:
-                return False
-        while True:
-            if paced and not self._pacer.wait(self._stop.is_set):
-                return False
-            now = self.simulation.state
-            self._advance(self._board.torque(now) if answer is None else answer)
-            if self._tick % self._ticks_per_sample == 0 or self._tick >= self._last_tick:
-                self._publish()
-                return True
-
-    def _advance(self, torque: Triple) -> None:
-        moment, counters = self._board.moment, self.counters
-        began = time.perf_counter()
-        self.simulation.step(torque, self._period_ns, moment)
-        counters.stepped(time.perf_counter() - began, self._pacer.late_ns)
-        self._audience.tick(torque, moment)
-        self._tick += 1
-
-    def _answered(self, paced: bool) -> Triple | None:
-        """Torques that answer the last sample; None if something else comes first."""
-        timeout = self._settings.parameters.lockstep_timeout or math.inf
-        began = time.monotonic()
-        waited = 0.0
-        while (answer := self._board.answer(self._stamp_ns)) is None:
-            if self._stop.is_set() or (paced and self._asked.is_set()):
-                return None
-            if waited > timeout:
-                said = f"no command answered the sample of {self._stamp_ns} ns within {timeout:g} s"
-                if paced:
-                    self._fail(said)
-                return None
-            time.sleep(min(max(waited / 10, 2e-5), _POLL_S))
-            waited = time.monotonic() - began
-        if waited * 1e9 > self._period_ns:
-            self._pacer.start()  # to wait for an answer is no overrun
-        return answer
-
-    def _publish(self) -> None:
-        self._stamp_ns = self._start_ns + self._tick * self._period_ns
-        self._audience.sample(self.simulation.state, self._stamp_ns)
-        self.counters.published += 1
 
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
-        began = self.phase is not Phase.FAULT
         self.fault = self.fault or reason
-        if began and self.begun and self._tick % self._ticks_per_sample:
-            with contextlib.suppress(Exception):  # publishing may be what failed
-                self._publish()
+        if self.phase is not Phase.FAULT:
+            self._course.publish_rest()
         self._to(Phase.FAULT)
 
     def _idle(self) -> None:
         self._show()
-        self._asked.wait(IDLE_PERIOD_S)
+        self._course.asked.wait(IDLE_PERIOD_S)
 
     def _show(self) -> None:
-        self._audience.idle(self.simulation.state, still=self.phase is Phase.FAULT)
+        self._course.show(still=self.phase is Phase.FAULT)
 
     def _end_of_run(self) -> None:
-        if self.phase is Phase.RUNNING and self._tick % self._ticks_per_sample:
-            self._publish()
+        if self.phase is Phase.RUNNING:
+            self._course.publish_rest()
         self.counters.hold()
-        self._stop.set()
+        self._course.stop.set()
         while self._requests:
             self._requests.popleft()[1].done.set()
 

@@ -33,8 +33,8 @@ class Audience(Protocol):
     def begin_ns(self, earliest_ns: int) -> int:
         """Give the stamp of a new start, not before `earliest_ns`; 0 where there is no time yet."""
 
-    def tick(self, torque: Triple, moment: Triple) -> None:
-        """Note what acts over a tick."""
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        """Note what acted over some ticks."""
 
     def sample(self, state: State, stamp_ns: int) -> None:
         """Publish a sample of the run and the torques that led to it."""

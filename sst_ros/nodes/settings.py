@@ -20,7 +20,6 @@ class SimulatorParameters(Section):
     CHANGEABLE: ClassVar[tuple[str, ...]] = (
         "real_time_factor",
         "command_timeout",
-        "timeout_damping",
         "lockstep_timeout",
     )
 
@@ -57,6 +56,9 @@ class SimulatorParameters(Section):
     publish_clock: bool = flag(
         "publish the simulated time on /clock; refused where there is a clock", default=False
     )
+    publish_description: bool = flag(
+        "publish the scene as URDF on robot_description", default=False
+    )
     sync: str = choice(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
         ("free", "lockstep"),
@@ -76,13 +78,6 @@ class SimulatorParameters(Section):
         least=0.0,
         most=1e6,
     )
-    timeout_damping: float = number(
-        "torque -timeout_damping gamma_dot in place of a command that is too old; 0 for no torque",
-        "N m s/rad",
-        default=0.0,
-        least=0.0,
-        most=1e6,
-    )
     integrator: str = choice("method of integration", INTEGRATORS, default="auto")
     tolerance: float = number(
         "largest local error of a step of the integrator",
@@ -91,7 +86,11 @@ class SimulatorParameters(Section):
         above=0.0,
         most=1.0,
     )
-    compiled: bool = flag("run under numba, which takes seconds to start", default=False)
+    compiled: bool = flag(
+        "run machine code where numba is installed: the first run of a scene is plain Python, to "
+        "the same bits, while a process beside makes the code for the next",
+        default=True,
+    )
     realtime_priority: int = integer(
         "SCHED_FIFO priority of the run's thread where that is permitted; 0 for none",
         "1",
@@ -154,3 +153,18 @@ class RecorderParameters(Section):
         "folder of the bag, which must not exist yet; - for a dated name", default="-"
     )
     topics: tuple[str, ...] = texts("topics to record", default=default_topics())
+
+
+@dataclass(frozen=True)
+class ViewerParameters(Section):
+    """Parameters of sst_viewer."""
+
+    simulator: str = text("name of the simulator's node", default="sst_simulator")
+    host: str = text(
+        "address to serve the page at; another than this opens the actuators to all who reach it",
+        default="127.0.0.1",
+    )
+    port: int = integer(
+        "port of the page; the next free one is taken", "1", default=8080, least=1024, most=65535
+    )
+    open: bool = flag("open the page in a browser, where there is a desktop", default=False)

@@ -14,7 +14,16 @@ from rclpy.node import Node
 
 from sst_ros import scene
 from sst_ros.errors import RunStopped
-from sst_ros.nodes import endpoints, gauges, interfaces, parameters, process, realtime
+from sst_ros.nodes import (
+    description,
+    endpoints,
+    gauges,
+    interfaces,
+    machine_code,
+    parameters,
+    process,
+    realtime,
+)
 from sst_ros.nodes.clocks import HEARD_GRAIN_NS, STEADY, HeardTime, follows_clock
 from sst_ros.nodes.commands import ZERO, CommandBoard
 from sst_ros.nodes.endpoints import Endpoint
@@ -42,10 +51,10 @@ class Simulator:
         self.parameters = parameters.declare(self.node, SimulatorParameters, self._change)
         given = self.parameters
         simulated = scene.load(given.scene)
-        limit = simulated.actuators.torque_limit if simulated.actuators else None
         self._publications = Publications(self.node, simulated, self)
-        self._board = CommandBoard(self, limit, *self._readers(simulated))
+        self._board = CommandBoard(self, simulated.actuators, *self._readers(simulated))
         self._pacer = self._paced()
+        self._compiled = given.compiled and machine_code.use(self.node, simulated, given)
         self._loop = RunLoop(
             simulated, self._build, self, self._board, self._pacer, self._publications
         )
@@ -53,6 +62,7 @@ class Simulator:
         self._diagnostics = endpoints.DIAGNOSTICS.publisher(self.node)
         Services(self.node, self._loop)
         interfaces.offer(self.node, self._loop)
+        description.offer(self.node, simulated, given, lambda: self._loop.simulation.state)
         self.node.create_timer(1.0, self._report, clock=STEADY)
         self._read_gauges()
         realtime.quiet()
@@ -80,7 +90,7 @@ class Simulator:
         """Make a simulation whose first step takes no longer than the others."""
         given = self.parameters
         simulation = Simulation(
-            simulated, given.integrator, tolerance=given.tolerance, compiled=given.compiled
+            simulated, given.integrator, tolerance=given.tolerance, compiled=self._compiled
         )
         with contextlib.suppress(RunStopped):
             simulation.step(ZERO, given.period_ns)

@@ -51,7 +51,7 @@ def test_all_data_files_are_installed(prefix):
                 assert (share / path.relative_to(SOURCE)).read_bytes() == path.read_bytes()
 
 
-@pytest.mark.parametrize("name", ["simulator", "torque_player", "recorder"])
+@pytest.mark.parametrize("name", ["simulator", "torque_player", "inverse_dynamics", "recorder"])
 def test_ros2_run_finds_the_executables(prefix, name):
     executable = prefix / "lib" / "sst_ros" / name
     assert executable.is_file()

@@ -10,6 +10,7 @@ import pytest
 from sst_ros import load_scene
 from sst_ros.nodes.commands import ZERO, CommandBoard, Refused, named
 from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.scene import Actuators
 from sst_ros.simulation import Simulation
 
 
@@ -24,18 +25,18 @@ def stamped(stamp_ns, effort, names=("gamma_1", "gamma_2", "gamma_3")):
 
 
 class Bench:
-    def __init__(self, limit=None, **given):
+    def __init__(self, actuators=None, **given):
         self.parameters = SimulatorParameters(**given)
         self.commands, self.stamped, self.moments = [], [], []
         takes = [
             lambda queue=queue: queue.pop(0) if queue else None
             for queue in (self.commands, self.stamped, self.moments)
         ]
-        self.board = CommandBoard(self, limit, *takes)
-        self.state = Simulation(load_scene("example1")).state
+        self.board = CommandBoard(self, actuators, *takes)
+        self.moving = Simulation(load_scene("example1"))
 
     def torque(self):
-        return self.board.torque(self.state)
+        return self.board.torque(self.moving)
 
 
 def test_the_last_good_command_is_held():
@@ -95,17 +96,19 @@ def test_zero_timeout_holds_for_ever():
 
 
 def test_damping_takes_over_within_the_limit():
-    bench = Bench(limit=0.5, command_timeout=0.5, timeout_damping=2.0)
+    bench = Bench(Actuators(torque_limit=0.5, idle_damping=2.0), command_timeout=0.5)
     bench.commands.append(array(0.1, 0.1, 0.1))
     bench.torque()
+    assert not bench.board.brakes
     bench.board._since -= 1.0
-    rates = bench.state.joints.gamma_dot
+    rates = bench.moving.state.joints.gamma_dot
     expected = tuple(min(max(-2.0 * rate, -0.5), 0.5) for rate in rates)
     assert any(rates) and bench.torque() == expected
+    assert bench.board.brakes  # by the rates of this tick, so for no more than this tick
 
 
 def test_limits_clamp_and_count():
-    bench = Bench(limit=2.0)
+    bench = Bench(Actuators(torque_limit=2.0))
     bench.commands.append(array(1.0, -5.0, 2.5))
     assert bench.torque() == (1.0, -2.0, 2.0)
     assert bench.board.clamped == 1

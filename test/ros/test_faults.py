@@ -76,8 +76,8 @@ def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
 
 
 def test_beyond_the_limit_is_clamped_and_a_stale_command_damped(nodes, observer, variant):
-    path = variant(actuators="actuators: {torque_limit: 0.5}\n")
-    nodes.run("simulator", scene=path, timeout_damping=2.0, command_timeout=0.2)
+    path = variant(actuators="actuators: {torque_limit: 0.5, idle_damping: 2.0}\n")
+    nodes.run("simulator", scene=path, command_timeout=0.2)
     states = observer.listen(JointState, "/joint_states")
     commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
     commands.publish(Float64MultiArray(data=[7.0, -7.0, 0.1]))

@@ -4,6 +4,7 @@
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -36,12 +37,13 @@ class Controller:
         self.publisher.publish(answer)
 
 
-def closed_loop(nodes, observer, bag):
+def closed_loop(nodes, observer, bag, disturb=lambda: None):
     recorder = nodes.run("recorder", output=bag)
     simulator = nodes.run(
         "simulator", sync="lockstep", duration=0.3, real_time_factor=0.0, publish_rate=500
     )
     assert nodes.line(recorder).startswith("ready")
+    disturb()
     controller = Controller(observer)
     observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=60.0)
     controller.close()
@@ -62,8 +64,8 @@ def load():
 
 def test_a_closed_loop_is_the_same_on_a_loaded_machine(nodes, observer, tmp_path, request):
     idle = closed_loop(nodes, observer, tmp_path / "idle")
-    request.getfixturevalue("load")
-    loaded = closed_loop(nodes, observer, tmp_path / "loaded")
+    disturb = partial(request.getfixturevalue, "load")
+    loaded = closed_loop(nodes, observer, tmp_path / "loaded", disturb)
     assert len(idle.time_ns) == 151 and idle.ticks.gaps == 0
     assert np.ptp(idle.gamma, axis=0).min() > 1e-3  # it moves
     for name in (

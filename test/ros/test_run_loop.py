@@ -25,14 +25,14 @@ class Audience:
     """Keeps what it is told; gives time from 1 s on."""
 
     def __init__(self):
-        self.samples, self.ticks, self.idles, self.phases = [], [], [], []
+        self.samples, self.acted, self.idles, self.phases = [], [], [], []
         self.now_ns = 1_000_000_000
 
     def begin_ns(self, earliest_ns):
         return max(self.now_ns, earliest_ns) if self.now_ns else 0
 
-    def tick(self, torque, moment):
-        self.ticks.append(torque)
+    def ticks(self, torque, moment, count):
+        self.acted.extend([torque] * count)
 
     def sample(self, state, stamp_ns):
         self.samples.append((stamp_ns, state))
@@ -87,7 +87,7 @@ def test_a_run_ends_after_its_duration_with_every_sample():
     assert bench.loop.phase is Phase.FINISHED
     first = stamps(bench)[0]
     assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
-    assert len(bench.audience.ticks) == bench.loop.counters.ticks == 11
+    assert len(bench.audience.acted) == bench.loop.counters.ticks == 11
     assert bench.audience.phases == ["waiting", "running", "finished"]
 
 
@@ -162,7 +162,20 @@ def test_a_fault_is_latched_until_a_reset():
         assert loop.ask(loop.reset).success
         bench.until(lambda: loop.phase is Phase.RUNNING)
         assert loop.fault == ""
-        bench.until(lambda: bench.audience.ticks[-1] == ZERO)  # the command is forgotten
+        bench.until(lambda: bench.audience.acted[-1] == ZERO)  # the command is forgotten
+
+
+def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick():
+    bench = Bench(scene="example2", publish_rate=10, wait_for_command=True)
+    bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
+    with bench.running() as loop:
+        bench.until(lambda: loop.phase is Phase.FAULT)
+        ticks, last = loop.simulation.time_ns // 1_000_000, loop.simulation.state
+    assert ticks % 100 and "gamma_1 > 1.570796 rad" in loop.fault
+    assert bench.audience.acted == [(50.0, 0.0, 0.0)] * ticks
+    assert loop.counters.ticks == ticks
+    assert stamps(bench)[-1] == stamps(bench)[0] + ticks * 1_000_000
+    assert bench.audience.samples[-1][1] == last
 
 
 def test_set_state_is_checked():
@@ -183,10 +196,10 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
     class Broken(Simulation):
         broken = False
 
-        def step(self, *args):
+        def steps(self, *args):
             if self.broken:
                 raise error
-            return super().step(*args)
+            super().steps(*args)
 
     bench = Bench(build=Broken)
     with bench.running() as loop:
@@ -207,7 +220,7 @@ def test_lockstep_times_out_into_a_fault():
         bench.stamped.append(answer(stamps(bench)[0]))
         bench.until(lambda: loop.phase is Phase.FAULT)
         assert "no command answered the sample of 1002000000 ns within 0.05 s" in loop.fault
-        assert len(bench.audience.ticks) == 2
+        assert len(bench.audience.acted) == 2
 
 
 def test_requests_after_the_end_are_refused():
@@ -236,6 +249,7 @@ def test_simulation_interfaces_are_the_same_machine():
         assert answers.reset(Box(scope=1), response()).result.result == 0
         assert answers.reset(Box(scope=255), response()).result.result == 1
         assert answers.get_state(None, response()).state.state == 0
+        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 103
         assert answers.set_state(Box(state=Box(state=1)), response()).result.result == 1
         assert answers.set_state(Box(state=Box(state=0)), response()).result.result == 1
         assert answers.get_state(None, response()).state.state == 0

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages as bytes, against what rclpy and rosbags read from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from sst_ros import load_scene
+from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.nodes.messages import JOINTS, NotFinite, StateMessages, TorqueLog, zyz_of
+from sst_ros.nodes.template import Template
+from sst_ros.simulation import Simulation
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+@pytest.fixture(scope="module")
+def state():
+    simulation = Simulation(load_scene("example2"))
+    return simulation.step((1.0, 2.0, 3.0), 50_000_000)
+
+
+def strictly(data, name):
+    """rosbags refuses bytes that are left over."""
+    return STORE.deserialize_cdr(data, name)
+
+
+def test_a_state_is_read_as_it_is(state):
+    messages = StateMessages()
+    messages.fill(state)
+    joints, orientation, euler = messages.stamped(STAMP_NS)
+    read = deserialize_message(joints, JointState)
+    at = state.joints
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
+    assert list(read.name) == JOINTS
+    assert tuple(read.position) == at.gamma + at.mu + at.beta
+    assert tuple(read.velocity) == at.gamma_dot + at.mu_dot + at.beta_dot
+    assert tuple(read.effort) == state.torque + (0.0,) * 6
+    read = deserialize_message(orientation, QuaternionStamped)
+    assert (read.quaternion.x, read.quaternion.y, read.quaternion.z) == state.quaternion[:3]
+    assert (read.quaternion.w, read.header.frame_id) == (state.quaternion[3], "base")
+    read = deserialize_message(euler, Vector3Stamped).vector
+    expected = zyz_angles(rotation_matrix(state.quaternion))
+    np.testing.assert_allclose((read.x, read.y, read.z), expected, atol=1e-14)
+    messages.still()
+    read = strictly(messages.stamped(0)[0], "sensor_msgs/msg/JointState")
+    assert not read.velocity.any() and not read.effort.any() and read.position.all()
+    strictly(orientation, "geometry_msgs/msg/QuaternionStamped")
+    strictly(euler, "geometry_msgs/msg/Vector3Stamped")
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_what_is_not_finite_is_not_taken_over(state, bad):
+    messages = StateMessages()
+    messages.fill(state)
+    before = messages.stamped(5)
+    joints = state.joints._replace(mu_dot=(0.0, bad, 0.0))
+    for broken in (
+        replace(state, joints=joints),
+        replace(state, torque=(bad, 0.0, 0.0)),
+        replace(state, quaternion=(bad, *state.quaternion[1:])),
+    ):
+        with pytest.raises(NotFinite, match="not finite"):
+            messages.fill(broken)
+    assert messages.stamped(5) == before
+
+
+@pytest.mark.parametrize("moments", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 40])
+def test_torques_of_every_tick_are_read_as_they_were(count, moments):
+    log = TorqueLog(2, 1_500_000_000, moments=moments)
+    for run in range(2):  # the second fills the same bytes anew
+        rows = [(float(i), -1.0, run + 0.5) for i in range(count)]
+        for row in rows:
+            log.append(row, (7.0, 8.0, 9.0))
+        assert len(log) == count
+        data = log.take(STAMP_NS)
+        assert len(log) == 0
+        more = (7.0, 8.0, 9.0) if moments else ()
+        read = deserialize_message(data, JointTrajectory)
+        assert [tuple(point.effort) for point in read.points] == [(*row, *more) for row in rows]
+        assert [p.time_from_start.sec * 10**9 + p.time_from_start.nanosec for p in read.points] == [
+            (i + 1) * 1_500_000_000 for i in range(count)
+        ]
+        assert len(read.joint_names) == 3 + len(more)
+        strictly(data, "trajectory_msgs/msg/JointTrajectory")
+
+
+def test_ticks_noted_at_once_are_those_noted_one_by_one():
+    one, other = TorqueLog(5, 1_000_000), TorqueLog(5, 1_000_000)
+    one.append((1.0, 2.0, 3.0), (), 5)
+    for _ in range(5):
+        other.append((1.0, 2.0, 3.0), ())
+    read = [deserialize_message(log.take(9), JointTrajectory) for log in (one, other)]
+    assert read[0] == read[1]
+
+
+def test_a_mark_that_stands_twice_is_refused():
+    template = Template(JointState(position=[1.5], velocity=[1.5]))
+    with pytest.raises(ValueError, match="once"):
+        template.place([1.5])
+
+
+angle = st.floats(-np.pi, np.pi)
+
+
+@given(theta=angle, phi=st.floats(1e-6, np.pi - 1e-6), psi=angle, length=st.sampled_from([1, -1]))
+def test_zyz_angles_are_those_of_the_rotation(theta, phi, psi, length):
+    """Where the sine of phi is small both forms lose digits of theta and psi: compare rotations."""
+    half = phi / 2.0, (theta + psi) / 2.0, (theta - psi) / 2.0
+    x, y = -np.sin(half[0]) * np.sin(half[2]), np.sin(half[0]) * np.cos(half[2])
+    z, w = np.cos(half[0]) * np.sin(half[1]), np.cos(half[0]) * np.cos(half[1])
+    found = np.array(zyz_of([float(length * part) for part in (x, y, z, w)]))
+    assert np.all(np.abs(found) <= np.pi)
+    apart = found - (theta, phi, psi)
+    np.testing.assert_allclose(np.exp(1j * apart), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.6, 0.8), (0.6, 0.8, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)])
+def test_at_a_pole_psi_carries_it_all(q):
+    np.testing.assert_allclose(zyz_of(q), zyz_angles(rotation_matrix(q)), atol=1e-15)
