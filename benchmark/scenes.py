@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Operations and time of one evaluation of the right-hand side, by scene.
 
-    python benchmark/scenes.py [--markdown]
+    python -m benchmark.scenes [--markdown]
 
 `bare` is a kernel that was written without any optional term (test/mechanism/bare_kernel.py) on
 the bodies of example2. Every round times every program once, in an order that changes, and ratios

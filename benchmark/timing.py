@@ -17,20 +17,23 @@ def interleaved(
     rounds: int = 9,
     shortest: float = 2e-3,
     told: Callable[[int, int], None] = lambda done, of: None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Key, list[float]]:
     """Seconds of each call, one number a round.
 
     Every round times every call, so that what slows the machine for a while slows all of them.
-    A call that is shorter than `shortest` is repeated until it is not, and divided.
+    A call that is shorter than `shortest` is repeated until it is not, and divided. A `clock` of
+    processor time leaves out what others do on the machine meanwhile, which long calls would
+    otherwise have more of than short ones; it is for work of one thread.
     """
-    repeats = {key: _repeats(call, shortest) for key, call in calls.items()}
+    repeats = {key: _repeats(call, shortest, clock) for key, call in calls.items()}
     seconds: dict[Key, list[float]] = {key: [] for key in calls}
     collecting = gc.isenabled()
     gc.disable()
     try:
         for done in range(rounds):
             for key, call in calls.items():
-                seconds[key].append(_timed(call, repeats[key]))
+                seconds[key].append(_timed(call, repeats[key], clock))
             gc.collect()
             told(done + 1, rounds)
     finally:
@@ -44,14 +47,14 @@ def ratio(seconds: dict[Key, list[float]], first: Key, second: Key) -> float:
     return median(a / b for a, b in zip(seconds[first], seconds[second], strict=True))
 
 
-def _repeats(call: Callable[[], Any], shortest: float) -> int:
+def _repeats(call: Callable[[], Any], shortest: float, clock: Callable[[], float]) -> int:
     call()
-    once = _timed(call, 1)
+    once = _timed(call, 1, clock)
     return max(1, round(shortest / once)) if once < shortest else 1
 
 
-def _timed(call: Callable[[], Any], repeats: int) -> float:
-    begin = time.perf_counter()
+def _timed(call: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> float:
+    begin = clock()
     for _ in range(repeats):
         call()
-    return (time.perf_counter() - begin) / repeats
+    return (clock() - begin) / repeats

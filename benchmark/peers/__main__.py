@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error against wall time on one second of Example 2, for sst_ros and its peers.
+"""Error against processor time on one second of Example 2, for sst_ros and its peers.
 
 python -m benchmark.peers [--quick] [--rounds N] [--only ENGINE ...] [--out FOLDER] [--no-page]
 """
@@ -13,9 +13,9 @@ import sys
 import time
 from pathlib import Path
 
-from benchmark.peers import page, picture, reference, results
+from benchmark.peers import floor, page, picture, reference, results
 from benchmark.peers.series import Series
-from benchmark.peers.study import studied
+from benchmark.peers.study import TARGETS, studied
 from benchmark.peers.task import Task
 from sst_ros.integration.backend import numba_version
 
@@ -49,8 +49,9 @@ def main(arguments: list[str] | None = None) -> int:
     truth = reference.solved(task, lambda done, of: told("reference", done, of))
     rounds = options.rounds or (3 if options.quick else 9)
     curves = studied(task, truth, series, rounds, told)
+    least = floor.found(task, TARGETS)
     seconds = time.monotonic() - begin
-    result = results.Results(curves, missing, truth.error, rounds, options.quick, seconds)
+    result = results.Results(curves, missing, truth.error, rounds, options.quick, seconds, least)
     told("", 0, 0)
     print(results.table(result))
     if not options.no_page:

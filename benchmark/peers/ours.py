@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sst_ros: fixed steps of the explicit methods, compiled and as plain Python."""
+"""sst_ros: fixed steps of the explicit methods and of collocation, compiled and plain Python."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 
 from benchmark.peers.series import Run, Series, Setting, ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
+from sst_ros.integration.collocation import Collocation
 from sst_ros.integration.machine import Machine
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4, Tableau
 
@@ -26,8 +27,31 @@ def series(task: Task, quick: bool) -> list[Series]:
     found = []
     for name, (tableau, first, last) in METHODS.items():
         found.append(_series(task, f"{name}, numba", tableau, True, ladder(first, last, factor)))
+    found.append(_collocation(task))
     plain = ladder(5, 80, 2.0 if quick else 1.3)
     return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
+
+
+def _collocation(task: Task) -> Series:
+    """Few long steps; how often each is iterated is part of the setting."""
+    method = Collocation(task.system)
+    start = np.array(task.start)
+
+    def acceleration(at: Moving) -> np.ndarray:
+        return task.kernel_answer(at.y, at.torque)
+
+    def setting(steps: int, iterations: int) -> Setting:
+        def whole() -> list[float]:
+            return method.march(0.0, DURATION / steps, steps, start, iterations=iterations).y
+
+        return Setting(
+            f"{steps} steps of {iterations} iterations", steps * iterations,
+            lambda: Run(whole, lambda pieces: [task.pose_of(whole())]), samples=False,
+        )  # fmt: skip
+
+    settings = [setting(n, m) for n in range(4, 13) for m in range(1, 8)]
+    name = "Gauss collocation, order 16, numba"
+    return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)
 
 
 def _series(task: Task, name: str, tableau: Tableau, compiled: bool, counts: list[int]) -> Series:

@@ -16,13 +16,13 @@ TEXT = """\
 
 {date}. One second of Example 2 of the paper (scene `example2`: three sine torques, from rest) on
 every engine, with the same seven links. The error is the angle between the star's orientation at
-t = 1 s and the reference; the time is that of the whole second.
+t = 1 s and the reference; the time is that of the whole second, in seconds of the processor.
 
-![Error against wall time](peers.png)
+![Error against processor time](peers.png)
 
 ## How soon an error is reached
 
-Wall time in ms, and how many times ours that is. The time is that of the fastest setting tried
+Time in ms, and how many times ours that is. The time is that of the fastest setting tried
 whose error is as small or smaller, not interpolated. "-" means that no setting tried gets there:
 the steps end at 16000 a second for MuJoCo (3200 with Python torques, 6400 for rollout), at 20000
 for Drake and at 8000 for Exudyn.
@@ -30,6 +30,18 @@ for Drake and at 8000 for Exudyn.
 {best}
 
 {verdicts}
+
+## What can exist at all
+
+A method that is told values of the acceleration, and not its derivatives, cannot do with fewer than
+a polynomial through them needs to tell the orientation at the end to the error, at the true motion
+and at Gauss's nodes. In C, one after the other on one core, these take so long; and so many times
+longer take the engines:
+
+{floor}
+
+A ratio beyond a peer's in this table cannot be had by evaluations one at a time. The collocation
+of sst_ros evaluates eight at once, by SIMD, and iterates.
 
 ## By method
 
@@ -53,7 +65,9 @@ is not timed.
   would save, but that is a program to write. SciPy and NumPy are Python all through. "DOP853,
   plain Python" is sst_ros without any compiler.
 - **The method counts.** A method of order 8 needs far fewer evaluations at 1e-9 rad than RK4 does,
-  on any engine. Where an engine leaves the integrator to its user (Pinocchio) it gets DOP853 too;
+  on any engine. Where an engine leaves the integrator to its user (Pinocchio) it gets our DOP853
+  too, in Python; RK4 is what its users write, so both are told. sst_ros has collocation besides,
+  whose SIMD needs a right-hand side that is one straight line of operations;
   MuJoCo, Drake and Exudyn have no method of order above 4 for mechanisms with loops. Compare equal
   methods by the rows above.
 - **MuJoCo's best setting takes work.** The torques are evaluated by a compiled callback at the
@@ -72,8 +86,9 @@ is not timed.
   says; with (q, γ̇) it need not.
 - **Not in the times:** compiling (numba, first call: some seconds, then from a cache), building
   models, and turning the end state into an orientation.
-- **The machine** was not idle, and one core is used. Times are medians of {rounds} rounds in which
-  every setting takes its turn; ratios are medians of the quotients of each round. Trust ratios.
+- **The machine** was not idle, so times are of the processor (of all threads of the process), not
+  of the wall. They are medians of {rounds} rounds in which every setting takes its turn; ratios are
+  medians of the quotients of each round. Trust ratios.
 - **The reference** is an extrapolation method in 32-digit arithmetic (mpmath); two step sizes are
   {reference} rad apart. It is kept as doubles, 2e-16. It integrates the traced program of sst_ros,
   which the gates hold against the paper's equations and against the other engines.
@@ -93,6 +108,7 @@ def write(results: Results, path: Path) -> None:
         best=_markdown(told.best_rows(results)),
         verdicts="\n".join(f"- {line}." for line in told.verdicts(results)),
         series=_markdown(told.rows(results)),
+        floor=_markdown(told.floor_rows(results)),
         missing=missing,
         settings=_settings(results),
         rounds=results.rounds,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error against wall time, both logarithmic; colours of Okabe and Ito, a marker for each curve."""
+"""Error against processor time, both logarithmic; colours of Okabe and Ito, a marker a curve."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def draw(results: Results, path: Path) -> None:
         for target in TARGETS[1:]:
             axes.axhline(target, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
         axes.set(xscale="log", yscale="log", ylim=(0.5 * SMALLEST, LARGEST))
-        axes.set_xlabel("wall time of one simulated second [ms], median")
+        axes.set_xlabel("processor time of one simulated second [ms], median")
         axes.set_ylabel("error of the star's orientation at t = 1 s [rad]")
         axes.set_title("Example 2 of the paper, the same second on each engine", loc="left")
         figure.legend(loc="outside right upper", fontsize=8.5, handlelength=3.6, frameon=False)

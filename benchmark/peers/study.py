@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -29,7 +30,7 @@ class Point:
         error: of the orientation at the end [rad].
         largest: of the orientation at all samples that steps and reference share [rad].
         gamma: largest error of an actuator angle at the end [rad].
-        seconds: wall time of the whole second, one a round; empty for what was not timed.
+        seconds: processor time of the whole second, one a round; empty for what was not timed.
 
     """
 
@@ -42,7 +43,7 @@ class Point:
 
     @property
     def time(self) -> float:
-        """Median wall time [s]."""
+        """Median processor time [s]."""
         return median(self.seconds) if self.seconds else math.nan
 
 
@@ -84,7 +85,9 @@ def studied(
         _drop(curve, runs)
     points = {id(p): p for curve in curves for p in curve.points if id(p.setting) in runs}
     calls = {key: runs[id(point.setting)].whole for key, point in points.items()}
-    seconds = interleaved(calls, rounds, told=lambda a, b: told("rounds of times", a, b))
+    seconds = interleaved(
+        calls, rounds, told=lambda a, b: told("rounds of times", a, b), clock=time.process_time
+    )
     for key, point in points.items():
         point.seconds = seconds[key]
     return curves

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step of many scenarios costs: numba, the same text in C with SIMD, and NumPy columns.
+
+python -m benchmark.batch [--scene example2] [--scenarios 10000] [--rounds 9] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from benchmark import c_batch, c_floor, machine
+from benchmark.timing import interleaved, ratio
+from sst_ros import scene as scenes
+from sst_ros.integration.batch import Batch
+from sst_ros.integration.blocks import LANES
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853, RK4, Tableau
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.scene import Scene
+
+METHODS = {"rk4": RK4, "dop853": DOP853}
+SIMD = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+"""The last two change no bit; without them gcc leaves square roots and choices scalar."""
+
+FLAGS = {
+    "C SIMD": SIMD,
+    "C SIMD, no fma": (*SIMD, "-ffp-contract=off"),
+    "C SIMD, -ffast-math": (*SIMD, "-ffast-math"),
+}
+ONE, ALL, FLOOR, PLAIN = "numba, 1 thread", "numba, all cores", "C SIMD", "C SIMD, no fma"
+COLUMNS, TRACED = "NumPy columns", "NumPy columns, traced program"
+AT_MOST_C, AT_LEAST_COLUMNS = 1.5, 20
+STEP, STEPS = 1e-3, 20
+SPREAD = 0.05
+
+State = tuple[Any, ...]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.batch", description=__doc__)
+    parser.add_argument("--scene", default="example2")
+    parser.add_argument("--scenarios", type=int, default=10_000)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    scene = scenes.load(options.scene)
+    with_c = c_floor.compiler() is not None
+    if not with_c:
+        print("gcc is missing: NO C FLOOR. Only numba and NumPy are timed.", file=sys.stderr)
+    with tempfile.TemporaryDirectory() as folder:
+        work = _Work(scene, options.scenarios, Path(folder) if with_c else None)
+        seconds = interleaved(work.calls, options.rounds, shortest=5e-3)
+    told = machine.described("numpy", "numba", "llvmlite")
+    if with_c:
+        told["gcc"] = c_floor.version()
+    rows = _rows(seconds, options.scenarios)
+    print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {LANES} lanes.")
+    print("Time per evaluation and scenario: a step with limits and error, over its stages.")
+    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
+    print("\n".join(work.said), "\n")
+    _print(rows, seconds)
+    print("\n" + machine.line(told))
+    if options.json:
+        document = {"machine": told, "scene": options.scene, "rows": rows, "said": work.said}
+        options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+class _Work:
+    """What is timed, by (method, who): STEPS steps of all scenarios; NumPy does one."""
+
+    def __init__(self, scene: Scene, number: int, folder: Path | None) -> None:
+        self.calls: dict[tuple[str, str], Callable[[], Any]] = {}
+        self.said: list[str] = []
+        self._scene, self._number = scene, number
+        centre = np.array(scene.initial.gamma)
+        self._gamma = centre + np.random.default_rng(1).uniform(-SPREAD, SPREAD, (number, 3))
+        for name, method in METHODS.items():
+            self._add(name, method, folder)
+
+    def _add(self, name: str, method: Tableau, folder: Path | None) -> None:
+        profile = self._scene.torque is not None
+        batch = Batch(self._scene, method, profile=profile)
+
+        def run(threads: int) -> Any:
+            return batch.advance(0, STEPS, STEP, *start(), threads=threads)
+
+        y, code = batch.start(self._gamma, (0.0, 0.0, 0.0))
+        given = batch.drives((0.0, 0.0, 0.0), self._number)
+
+        def start() -> tuple[np.ndarray, ...]:
+            number = self._number
+            return y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)
+
+        self.calls[name, ONE] = lambda: run(1)
+        self.calls[name, ALL] = lambda: run(len(os.sched_getaffinity(0)))
+        if folder is not None:
+            self._add_c(name, method, batch, start, folder)
+        columns = tuple(y.copy())
+        dynamics = Dynamics(self._scene)
+        system = System(dynamics, self._scene.torque)
+        slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
+        for who, slope in slopes.items():
+            self.calls[name, who] = lambda slope=slope: _step(method, slope, 0.0, columns)
+
+    def _add_c(
+        self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any], folder: Path
+    ) -> None:
+        text, loops = c_batch.source(batch.program, batch.margins, method, len(batch.state))
+        blocks = -(-self._number // LANES)
+        expected = start()
+        batch.advance(0, STEPS, STEP, *expected, threads=1)
+        for index, (who, flags) in enumerate(FLAGS.items()):
+            library, done = c_batch.built(text, folder, f"{name}_{index}", *flags)
+
+            def run(library: Any = library) -> Any:
+                arrays = start()
+                pointers = (array.ctypes.data for array in arrays)
+                library.batch(STEP, 0, STEPS, 0, blocks, self._number, *pointers)
+                return arrays
+
+            apart = float(np.abs(run()[0] - expected[0]).max())
+            if not apart < 1e-12:
+                raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
+            same = "the bits of numba" if apart == 0.0 else f"{apart:.0e} from numba"
+            self.said.append(
+                f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc vectorised {done} of {loops}"
+                f" loops over lanes; {same}."
+            )
+            self.calls[name, who] = run
+
+
+def _columns(dynamics: Dynamics, scene: Scene) -> Callable[..., State]:
+    """The kernel as it is written, on one column a number."""
+    torque = scene.torque
+
+    def slope(t: float, *y: Any) -> State:
+        tau = (0.0, 0.0, 0.0)
+        if torque is not None:
+            rows = zip(torque.amplitude, torque.frequency, torque.phase, strict=True)
+            tau = tuple(a * np.sin(f * t + p) for a, f, p in rows)
+        return kernel.derivative(dynamics.model, y, tau)
+
+    return slope
+
+
+def _traced(system: System) -> Callable[..., State]:
+    names: dict[str, Any] = {}
+    head = "from numpy import arctan2 as atan2, cos, exp, sin, sqrt, tanh\n"
+    exec(head + system.program.source("rhs"), names)
+    drive = (0.0,) * len(system.drive)
+    return lambda t, *y: names["rhs"](t, *y, *drive)
+
+
+def _step(method: Tableau, slope: Callable[..., State], t: float, y: State) -> State:
+    """One step of all columns, without limits and error estimates."""
+    stages: list[State] = []
+
+    def combined(weights: Sequence[float], j: int) -> Any:
+        return sum(w * k[j] for w, k in zip(weights, stages, strict=False) if w)
+
+    for row, node in zip(method.a, method.c, strict=True):
+        at = tuple(x + STEP * combined(row, j) for j, x in enumerate(y)) if stages else y
+        stages.append(slope(t + node * STEP, *at))
+    new = [x + STEP * combined(method.b, j) for j, x in enumerate(y)]
+    length = np.sqrt(sum(x * x for x in new[:4]))
+    return tuple(x / length for x in new[:4]) + tuple(new[4:])
+
+
+def _rows(seconds: dict[tuple[str, str], list[float]], number: int) -> list[dict[str, Any]]:
+    rows = []
+    for name, who in seconds:
+        steps = 1 if who in (COLUMNS, TRACED) else STEPS
+        count = steps * number * len(METHODS[name].b)
+        row = {"method": name, "who": who, "ns": 1e9 * median(seconds[name, who]) / count}
+        if (name, FLOOR) in seconds:
+            share = ratio(seconds, (name, who), (name, FLOOR))
+            row["over_c"] = share * STEPS / steps
+        rows.append(row)
+    return rows
+
+
+def _print(rows: list[dict[str, Any]], seconds: dict[tuple[str, str], list[float]]) -> None:
+    print(f"{'method':10}{'who':32}{'ns':>10}{'over C SIMD':>14}")
+    for row in rows:
+        over = f"{row['over_c']:.2f}" if "over_c" in row else ""
+        print(f"{row['method']:10}{row['who']:32}{row['ns']:10.1f}{over:>14}")
+    print()
+    for name in METHODS:
+        for floor in (FLOOR, PLAIN):
+            if (name, floor) in seconds:
+                over = ratio(seconds, (name, ONE), (name, floor))
+                met = "met" if over <= AT_MOST_C else "MISSED"
+                print(f"{name}: numba over {floor}, 1 thread each {over:.2f}, "
+                      f"target {AT_MOST_C}: {met}")  # fmt: skip
+        for ours in (ALL, ONE):
+            for who in (COLUMNS, TRACED):
+                times = STEPS * ratio(seconds, (name, who), (name, ours))
+                met = "met" if times >= AT_LEAST_COLUMNS else "MISSED"
+                print(f"{name}: {who} over {ours} {times:.0f}, target {AT_LEAST_COLUMNS}: {met}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

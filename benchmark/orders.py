@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured orders of convergence, energy over a long run with springs, and states between steps.
+
+python -m benchmark.orders [--seconds 1000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from dataclasses import replace
+from statistics import median
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from benchmark import machine
+from sst_ros import scene as scenes
+from sst_ros.control.torque import sine
+from sst_ros.integration.collocation import Collocation
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4, RODAS4
+from sst_ros.mechanism import kernel
+from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.simulation import Simulation
+
+SPAN = 0.4
+PUSH = (0.02, 0.03, -0.02)
+STEPS = {"rk4": 128, "dopri5": 128, "dop853": 16, "rodas4": 128}
+WITHIN, MOST_DRIFT = 0.1, 1e-12
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.orders", description=__doc__)
+    parser.add_argument("--seconds", type=int, default=1000, help="of the run with springs")
+    options = parser.parse_args(arguments)
+    _orders()
+    _energy(options.seconds)
+    _between()
+    print("\n" + machine.line(machine.described("numpy", "scipy", "numba")))
+    return 0
+
+
+def _orders() -> None:
+    """Truth: SciPy's DOP853 at its tightest, in short steps, on the kernel before tracing."""
+    scene = scenes.load("example2")
+    assert scene.torque is not None
+    model, torque = kernel.model_of(scene), sine(scene.torque)
+    state = Simulation(scene).state
+    start = [*state.quaternion, *state.body_rate]
+    truth = solve_ivp(
+        lambda t, y: kernel.derivative(model, tuple(y), torque(t)),
+        (0.0, SPAN), start, method="DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.002,
+    ).y[:, -1]  # fmt: skip
+    system = System(Dynamics(scene), scene.torque)
+    print(f"Orders on example2, {SPAN} s: error with n steps and with 2 n")
+
+    def told(name: str, order: int, n: int, errors: list[float]) -> None:
+        found = math.log(errors[0] / errors[1]) / math.log(2.0)
+        met = "met" if abs(found - order) <= WITHIN else "MISSED"
+        print(f"{name:8}{n:6} steps {errors[0]:9.1e} {errors[1]:9.1e}  order {found:.3f} of {order}"
+              f", target +-{WITHIN}: {met}")  # fmt: skip
+
+    for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4):
+        runner, n = Machine(system, method, compiled=False), STEPS[method.name]
+        ends = [runner.march(0.0, SPAN / k, k, start, []) for k in (n, 2 * n)]
+        told(method.name, method.order, n, [math.dist(end, truth) for end in ends])
+    for nodes, n in ((2, 64), (4, 12)):
+        gauss = Collocation(system, nodes, compiled=False)
+        ends = [gauss.march(0.0, SPAN / k, k, start, iterations=20).y for k in (n, 2 * n)]
+        told(f"gauss {nodes}", 2 * nodes, n, [math.dist(end, truth) for end in ends])
+
+
+def _energy(seconds: int) -> None:
+    scene = replace(scenes.load("gravity_payload"), friction=None)
+    simulation = Simulation(scene, "dop853", tolerance=1e-14, compiled=True)
+    scale, worst = max(abs(simulation._stored()), 1.0), 0.0
+    for _ in range(seconds * 100):
+        simulation.step((0.0, 0.0, 0.0), 10_000_000)
+        worst = max(worst, abs(simulation.energy_residual))
+    met = "met" if worst / scale <= MOST_DRIFT else "MISSED"
+    print(f"\nEnergy with springs, dop853, {seconds} s: off by {worst / scale:.1e}"
+          f" of {scale:.2g} J, target {MOST_DRIFT:.0e}: {met}")  # fmt: skip
+
+
+def _between() -> None:
+    """What `within` costs and is worth, beside a polynomial through a step (SciPy's, order 7)."""
+    scene = scenes.load("example2")
+    assert scene.torque is not None
+    print("\nStates inside a step of 10 ms")
+    for compiled in (False, True):
+        simulation = Simulation(scene, "dop853", tolerance=1e-10, compiled=compiled)
+        simulation.step(PUSH, 10_000_000)
+        times: dict[str, list[float]] = {"step": [], "within": []}
+        for _ in range(200):
+            begin = time.process_time()
+            simulation.step(PUSH, 10_000_000)
+            between = time.process_time()
+            inside = simulation.within(simulation.state.time_ns - 4_000_000)
+            times["step"].append(between - begin)
+            times["within"].append(time.process_time() - between)
+        micro = {name: 1e6 * median(taken) for name, taken in times.items()}
+        print(f"{'numba' if compiled else 'plain':8}a step {micro['step']:.0f} us, a state inside "
+              f"it {micro['within']:.0f} us (medians of 200)")  # fmt: skip
+    model = kernel.model_of(scene)
+    start = [*Simulation(scene).state.quaternion, 1.0, -2.0, 1.5]
+
+    def slope(t: float, y: np.ndarray) -> tuple[float, ...]:
+        return kernel.derivative(model, tuple(y), PUSH)
+
+    whole = solve_ivp(slope, (0.0, 0.05), start, method="DOP853", rtol=1.0, atol=1.0,
+                      first_step=0.05, dense_output=True)  # fmt: skip
+    inside = solve_ivp(slope, (0.0, 0.02), start, method="DOP853", rtol=2.3e-14, atol=1e-15)
+    system = System(Dynamics(scene))
+    runner = Machine(system, DOP853, compiled=False)
+    again = runner.march(0.0, 0.02, 1, start, list(PUSH))
+    truth = inside.y[:, -1]
+    off = math.dist(whole.sol(0.02), truth), math.dist(again, truth)
+    print("In a step of 50 ms, 20 ms after its begin: "
+          f"polynomial {off[0]:.0e} off, a step to there {off[1]:.0e} off")  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

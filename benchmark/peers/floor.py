@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How soon any program could be there at all that evaluates these accelerations one at a time.
+
+A method that is told values of W_dot, and not its derivatives, needs as many as a polynomial
+through them over the whole second to tell the orientation at its end to an error. The nodes here
+are Gauss's, at the true motion, which no method knows beforehand.
+Times the cost of an evaluation in C, that is a floor for one core without SIMD over evaluations.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from benchmark import c_floor
+from benchmark.peers.task import DURATION, Task
+from benchmark.timing import interleaved
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.tableaux import DOP853, RK4
+from sst_ros.mechanism.frames import rotation_matrix
+
+_STEPS = 400
+_MOST = 80
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Evaluations that are needed at least, by error, and seconds of one in C; None without gcc."""
+
+    evaluations: dict[float, int]
+    seconds: float | None
+
+
+def found(task: Task, targets: tuple[float, ...]) -> Floor:
+    """Count and measure."""
+    return Floor({target: _needed(task, target) for target in targets}, _seconds(task))
+
+
+def _needed(task: Task, target: float) -> int:
+    """Fewest nodes whose polynomial of W_dot turns the star to within the error."""
+    machine = Machine(task.system, DOP853, compiled=True)
+    names: dict[str, Any] = {}
+    exec("from math import cos, sin, sqrt, tanh\n" + task.system.program.source("rhs"), names)
+    x, weights = legendre.leggauss(_MOST)
+    fine, w = DURATION * (x + 1.0) / 2.0, DURATION * weights / 2.0
+    truth = _states(machine, task.start, fine)
+    turned = np.array([rotation_matrix(y[:4]) for y in truth])
+    for count in range(2, _MOST):
+        nodes = legendre.leggauss(count)[0]
+        times = DURATION * (nodes + 1.0) / 2.0
+        states = _states(machine, task.start, times)
+        slopes = [names["rhs"](t, *y)[4:7] for t, y in zip(times, states, strict=True)]
+        fit = np.linalg.solve(legendre.legvander(nodes, count - 1), np.array(slopes))
+        rate = np.array([np.zeros(3)] * _MOST)
+        for k in range(3):
+            rate[:, k] = DURATION / 2.0 * legendre.Legendre(fit[:, k]).integ(lbnd=-1)(x)
+        # The error of the orientation, to first order: what the error of W adds up to in {B}.
+        off = np.einsum("i,ijk,ik->j", w, turned, rate + task.start[4:7] - truth[:, 4:7])
+        if float(np.linalg.norm(off)) <= target:
+            return count
+    return _MOST
+
+
+def _states(machine: Machine, start: list[float], times: np.ndarray) -> np.ndarray:
+    found, t, y = [], 0.0, start
+    for time_ in times:
+        steps = max(1, math.ceil((time_ - t) * _STEPS))
+        y = machine.march(t, (time_ - t) / steps, steps, y, [])
+        t = time_
+        found.append(y)
+    return np.array(found)
+
+
+def _seconds(task: Task) -> float | None:
+    if c_floor.compiler() is None:
+        return None
+    import ctypes
+
+    count = 1000
+    array = ctypes.c_double * len(task.start)
+    with tempfile.TemporaryDirectory() as folder:
+        text = c_floor.source(task.system.program, RK4)
+        library = c_floor.built(text, Path(folder), "floor", "-O3", "-march=native")
+        calls = {"": lambda: library.slopes(count, array(*task.start))}
+        return median(interleaved(calls, 15, clock=time.process_time)[""]) / count

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The floors that benchmarks measure against: C must be the same program, counts be counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmark import c_batch, c_floor
+from benchmark.batch import FLAGS, METHODS
+from sst_ros.integration.batch import Batch
+from sst_ros.integration.blocks import LANES
+from sst_ros.scene import load
+
+needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
+
+
+@needs_gcc
+def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    number = LANES + 3
+    scene, method = load("example2"), METHODS["rk4"]
+    batch = Batch(scene, method, profile=True)
+    gamma = np.array(scene.initial.gamma) + np.linspace(-0.05, 0.05, number)[:, None]
+    y, code = batch.start(gamma, (0.0, 0.0, 0.0))
+    given = batch.drives((0.0, 0.0, 0.0), number)
+    text, _ = c_batch.source(batch.program, batch.margins, method, len(batch.state))
+    library, vectorised = c_batch.built(text, tmp_path, "batch", *FLAGS["C SIMD, no fma"])
+    assert vectorised > 0
+    sets = [
+        [y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)] for _ in range(2)
+    ]
+    batch.advance(0, 50, 2e-3, *sets[0])
+    library.batch(2e-3, 0, 50, 0, 2, number, *(array.ctypes.data for array in sets[1]))
+    for one, other in zip(*sets, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(sets[0][0], y)
