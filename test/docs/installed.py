@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that need what a plain machine has not: checked against what exists in the tree."""
+
+import re
+import shlex
+from functools import cache
+
+import yaml
+from docs.blocks import ROOT
+
+from sst_ros.nodes.documentation import NODES
+from sst_ros.nodes.endpoints import PUBLISHES, SERVES, SUBSCRIBES
+from sst_ros.schema import specs
+
+STANDARD = {"use_sim_time"}
+SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")
+
+
+@cache
+def names(*uses):
+    """Every topic or service of ours in the root namespace, with its type."""
+    found = {}
+    for node in NODES:
+        for endpoint in node.endpoints:
+            if endpoint.use in uses:
+                name = endpoint.name.replace("~", f"/{node.name}")
+                name = name.format(simulator="/sst_simulator")
+                found[name if name.startswith("/") else f"/{name}"] = endpoint
+    return found
+
+
+def topics():
+    return names(PUBLISHES, SUBSCRIBES)
+
+
+def parameters(command):
+    (node,) = (node for node in NODES if node.command == command)
+    return specs(node.parameters)
+
+
+def check(line):
+    """Raise an AssertionError that says what a command names that is not there."""
+    words = shlex.split(re.sub(r"\$\((?:[^()]|\([^()]*\))*\)", "SUBSTITUTED", line))
+    for inner in re.findall(r"\$\(((?:[^()]|\([^()]*\))*)\)", line):
+        for path in re.findall(r"\)/(\S+)", inner):
+            assert (ROOT / path.removeprefix("share/sst_ros/")).exists(), path
+    KINDS[words[0]](words[1:])
+
+
+def _ros2(words):
+    if words[0] in ("run", "launch"):
+        assert words[1] == "sst_ros", words
+        (run if words[0] == "run" else _launch)(words[2:])
+    elif words[0] == "topic":
+        _topic(words[1], [word for word in words[2:] if word[0] in "/{" or "/msg/" in word])
+    elif words[0] == "service":
+        assert words[1] == "call", words
+        _service(*words[2:])
+    elif words[0] == "param":
+        assert words[1] in ("get", "set"), words
+        (node,) = (node for node in NODES if f"/{node.name}" == words[2])
+        spec = specs(node.parameters)[words[3]]
+        if words[1] == "set":
+            assert words[3] in node.parameters.CHANGEABLE, f"{words[3]} is read-only"
+            _value(spec, words[4])
+    elif words[0] == "bag":
+        for word in words:
+            assert not word.startswith("/") or word in topics(), word
+    else:
+        assert words[0] in ("pkg", "security"), f"ros2 {words[0]} is not known to this test"
+
+
+def run(words):
+    """Check an executable, its parameters, and files that they name."""
+    command, *rest = words
+    assert command in {node.command for node in NODES} or command == "viewer", command
+    assert f'"{command}"' in SETUP.partition("NODES =")[2].partition(")")[0], command
+    for given in (rest[i + 1] for i, word in enumerate(rest) if word == "-p"):
+        name, _, text = given.partition(":=")
+        if name not in STANDARD:
+            assert name in parameters(command), f"{command} has no parameter {name}"
+            _value(parameters(command)[name], text)
+
+
+def _value(spec, text):
+    """Check that ROS would read text as what the parameter takes."""
+    kinds = {"flag": bool, "integer": int, "number": float, "texts": list, "text": str}
+    kind = kinds.get(spec.kind)
+    value = yaml.safe_load(text)
+    assert kind is None or type(value) is kind, f"{text} is no {kind.__name__}"
+
+
+def _launch(words):
+    name, *given = words
+    text = (ROOT / "launch" / name).read_text(encoding="utf-8")
+    for argument in (word.partition(":=")[0] for word in given if ":=" in word):
+        assert f'"{argument}"' in text, f"{name} has no argument {argument}"
+
+
+def _topic(verb, words):
+    assert verb in ("echo", "hz", "pub", "info", "bw", "delay"), verb
+    name, *rest = words
+    assert name in topics(), name
+    if rest:
+        assert rest[0] == topics()[name].type_name, rest[0]
+        _message(topics()[name].kind, rest[1])
+
+
+def _service(name, kind, content="{}"):
+    offered = names(SERVES)
+    assert name in offered, name
+    assert kind == offered[name].type_name, kind
+    _message(offered[name].kind.Request, content)
+
+
+def _message(kind, text):
+    """Check that a message can be made of the YAML."""
+    kind(check_fields=True, **yaml.safe_load(text))
+
+
+def _make(words):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in (word for word in words if "=" not in word):
+        assert re.search(rf"^{target}:", makefile, re.M), f"make {target} is not in the Makefile"
+
+
+def _pip(words):
+    for extra in re.findall(r"\[([\w,]+)\]", " ".join(words)):
+        for name in extra.split(","):
+            assert f'"{name}": ' in SETUP, f"there is no extra {name}"
+
+
+def _rviz(words):
+    for word in words:
+        assert not word.endswith(".rviz") or (ROOT / word).exists(), word
+
+
+def _known(_):
+    """Pass over commands of others that name nothing of ours."""
+
+
+KINDS = {
+    "ros2": _ros2, "make": _make, "pip": _pip, "rviz2": _rviz, "colcon": _known, "git": _known,
+    "cd": _known, "source": _known, "sudo": _known, "rosdep": _known, "ulimit": _known,
+    "export": _known, "for": _known, "done": _known, "do": _known,
+}  # fmt: skip

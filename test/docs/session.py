@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A reader who types what a page says: a folder, and a terminal for each node."""
+
+import ast
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from docs.blocks import ROOT, commands
+
+from docs import installed
+from sst_ros.__main__ import NODES
+
+PYTHONS = (".venv/bin/python", "python", "python3")
+LIMIT_S = 60.0
+RECORDED_BYTES = 20_000
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
+
+
+class Session:
+    """Runs blocks in order; what a node was told to write is there for the next command."""
+
+    def __init__(self, folder: Path, domain: int | None):
+        self.folder = folder
+        (folder / ".venv").symlink_to(sys.prefix)
+        shutil.copytree(ROOT / "examples", folder / "examples")
+        shutil.copy(ROOT / "config" / "scenes" / "general.yaml", folder / "my_scene.yaml")
+        self.environment = {
+            **os.environ,
+            "PATH": os.pathsep.join([str(Path(sys.prefix) / "bin"), os.environ["PATH"]]),
+            "MPLBACKEND": "agg",
+        }
+        self._domain = domain
+        self._terminals = []
+
+    def run(self, block):
+        """Run a block, or check it where it needs more than a plain machine."""
+        first = block.text.lstrip().partition("\n")[0]
+        if block.language in ("python", "yaml") and first.startswith("# ") and "." in first:
+            self._file(first.removeprefix("# ").strip(), block)
+        elif block.language == "python":
+            self.settle()
+            self._done([sys.executable, "-c", block.text], block)
+        elif block.language in ("bash", "sh", "console") or _is_shell(block):
+            for line in commands(block.text):
+                self._line(line, block)
+        else:
+            assert block.language in ("", "text", "yaml") or block.language.startswith("{"), (
+                f"{block}: nobody knows what to do with {block.language}"
+            )
+
+    def settle(self):
+        """Wait for what ends by itself, for recorders to have something, and press Ctrl-C."""
+        for words, process, log in self._terminals:
+            self._wait_ready(words, process, log)
+        for words, process, log in self._terminals:
+            if _ends_by_itself(words):
+                self._ended(words, process, log)
+        for words, process, log in self._terminals:
+            self._wait_recorded(words, process, log)
+        for words, process, log in self._terminals:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                self._ended(words, process, log)
+        self._terminals = []
+
+    def close(self):
+        """Leave no process behind."""
+        for _, process, _ in self._terminals:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+    def _file(self, name, block):
+        shown = ROOT / name
+        if shown.exists() and name.endswith(".py"):
+            theirs = _program(shown.read_text(encoding="utf-8"))
+            assert _program(block.text) == theirs, f"{block} is not {name}"
+            return
+        path = self.folder / name
+        path.write_text(block.text, encoding="utf-8")
+
+    def _line(self, line, block):
+        words = shlex.split(line)
+        if words[0] in installed.KINDS:
+            try:
+                installed.check(line)
+            except (AssertionError, KeyError, ValueError, OSError) as error:
+                raise AssertionError(f"{block}: {line}: {error!r}") from error
+        elif words[0] in PYTHONS and _stays(words):
+            self._start(line, words)
+        else:
+            self.settle()
+            self._done(["bash", "-euo", "pipefail", "-c", line], block)
+
+    def _done(self, argv, block):
+        done = subprocess.run(
+            argv, capture_output=True, text=True, cwd=self.folder, env=self.environment,
+            timeout=LIMIT_S,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block}: {argv[-1]}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+    def _start(self, line, words):
+        assert self._domain is not None, "nodes need a ROS domain"
+        if words[1] == "-m" and words[3] != "view":
+            installed.run(words[3:])
+        log = self.folder / f"terminal_{len(list(self.folder.glob('terminal_*')))}"
+        with log.open("w") as file:
+            process = subprocess.Popen(
+                ["bash", "-c", f"exec {line}"], cwd=self.folder, env=self.environment, stdout=file,
+                stderr=subprocess.STDOUT,
+            )  # fmt: skip
+        self._terminals.append((words, process, log))
+
+    def _wait_ready(self, words, process, log):
+        """Wait until a node listens to Ctrl-C, and a recorder to its simulator."""
+        if words[1] == "-m":
+            _until(lambda: log.read_text() or process.poll() is not None, words, log)
+        if "recorder" in words and any("simulator" in other for other, *_ in self._terminals):
+            _until(lambda: "ready" in log.read_text() or process.poll() is not None, words, log)
+
+    def _wait_recorded(self, words, process, log):
+        if "recorder" in words:
+            (name,) = (w.partition(":=")[2] for w in words if w.startswith("output:="))
+
+            def size():
+                return sum(path.stat().st_size for path in (self.folder / name).glob("*.mcap"))
+
+            _until(lambda: size() > RECORDED_BYTES or process.poll() is not None, words, log)
+
+    def _ended(self, words, process, log):
+        try:
+            status = process.wait(LIMIT_S)
+        except subprocess.TimeoutExpired:
+            status = "no end"
+        assert status == 0, f"{shlex.join(words)}: {status}\n{log.read_text()}"
+
+
+def _until(condition, words, log):
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline, f"{shlex.join(words)}\n{log.read_text()}"
+        time.sleep(0.05)
+
+
+def _stays(words):
+    """Tell whether a command runs until it is stopped, as nodes do."""
+    if words[1] == "-m":
+        return words[2] == "sst_ros" and words[3] in (*NODES, "view")
+    return "rclpy.spin" in (ROOT / words[1]).read_text(encoding="utf-8")
+
+
+def _ends_by_itself(words):
+    return "torque_player" in words or any(word.startswith("duration:=") for word in words)
+
+
+def _is_shell(block):
+    """Tell whether a block without a language is one of commands."""
+    if block.language or not block.text.strip():
+        return False
+    first = {line.split()[0] for line in commands(block.text)}
+    return first <= {*installed.KINDS, *PYTHONS}
+
+
+def _program(text):
+    """Syntax tree of a program without its docstrings."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, False) is not None:
+            del node.body[0]
+    return ast.dump(tree)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every block of every page runs, or is checked where it needs a ROS installation."""
+
+import contextlib
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from docs.blocks import ROOT, blocks, links, pages, prose
+
+from sst_ros.__main__ import NODES, parser
+
+PAGES = pages()
+LONG = ("batch", "fast", "follow", "judge", "lockstep", "look", "many", "plot", "record")
+"""How-to pages whose commands are those of the tutorial in another order, or that compile."""
+WITH_BLOCKS = [
+    pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG else page
+    for page in PAGES
+    if blocks(page)
+]
+
+
+@contextlib.contextmanager
+def own_domain():
+    """A ROS domain of ours, as the tests of nodes take one."""
+    path = Path(__file__).parents[1] / "ros" / "conftest.py"
+    spec = importlib.util.spec_from_file_location("sst_ros_test_nodes", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    with module.own_domain() as number:
+        yield number
+
+
+@pytest.mark.ros
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("page", WITH_BLOCKS)
+def test_every_block_of_a_page_runs(page, tmp_path):
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+    from docs.session import Session
+
+    with own_domain() as domain, contextlib.closing(Session(tmp_path, domain)) as session:
+        for block in blocks(page):
+            session.run(block)
+        session.settle()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_pictures_exist(page):
+    folder, missing = (ROOT / page).parent, []
+    for target in links(page):
+        path, _, anchor = target.partition("#")
+        place = folder / path if path else ROOT / page
+        if not place.exists() or (anchor and anchor not in anchors(place)):
+            missing.append(target)
+    assert missing == []
+
+
+def anchors(path):
+    heads = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_in_the_text_are_commands(page):
+    """`python -m sst_ros ...` in running text names commands, options and nodes that exist."""
+    for text in re.findall(r"`[^`\n]*python -m sst_ros ([^`\n]+)`", prose(page)):
+        words = shlex.split(text.replace("...", ""))
+        if words[0] in NODES or words[0].isupper():
+            continue
+        of = parser()
+        while (choices := _choices(of)) and words and not words[0].isupper():
+            assert words[0] in choices, text
+            of = choices[words.pop(0)]
+        options = {option for action in of._actions for option in action.option_strings}
+        assert {word for word in words if word.startswith("--")} <= options, text
+
+
+def _choices(of):
+    return next((a.choices for a in of._actions if hasattr(a, "_choices_actions")), None)
+
+
+def test_every_page_is_in_the_site():
+    """All but the README are listed in the index, so that nobody has to guess an address."""
+    (toc,) = ["\n".join(block.text for block in blocks("docs/index.md"))]
+    listed = {f"docs/{line}.md" for line in toc.splitlines() if re.fullmatch(r"[\w/]+", line)}
+    there = {str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")}
+    assert there - {"docs/index.md"} == listed
+
+
+def test_the_generated_pages_are_those_of_the_declarations():
+    from sst_ros.commands.documentation import PAGES as generated
+
+    for name, write in generated.items():
+        page = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        assert write() == page, "run python -m sst_ros.commands.documentation"
+
+
+def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path):
+    """By the command of `make docs`."""
+    pytest.importorskip("furo", reason="needs Sphinx, MyST and Furo: pip install .[docs]")
+    recipe = (ROOT / "Makefile").read_text(encoding="utf-8").partition("\ndocs:")[2]
+    words = recipe.partition("$(RUN) ")[2].partition("\n")[0].split()
+    assert words[-2:] == ["docs", "site"] and "--fail-on-warning" in words
+    built = subprocess.run(
+        [sys.executable, *words[:-1], tmp_path], cwd=ROOT, capture_output=True, text=True
+    )
+    assert built.returncode == 0, built.stderr
+    for page in tmp_path.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        fetched = re.findall(r"<(?:script|img|link)\b[^>]*(?:src|href)=\"(https?:[^\"]*)\"", text)
+        assert fetched == [], page.name
+    assert "<math" in (tmp_path / "theory.html").read_text(encoding="utf-8")
