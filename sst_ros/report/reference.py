@@ -34,7 +34,7 @@ larger than what an integrator gets wrong, and can be told with longer steps."""
 PLAIN_TICKS = 60_000
 """So many ticks are compared in plain Python, a minute's work."""
 
-CHUNK = 100_000
+CHUNK = 25_000
 """So many ticks at a time, which bounds the memory."""
 
 
