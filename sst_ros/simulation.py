@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,12 +16,11 @@ from sst_ros.integration.backend import numba_version
 from sst_ros.integration.journey import Journey, Point
 from sst_ros.integration.tableaux import METHODS
 from sst_ros.integration.walk import CannotStep, Change
-from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.kernel import Joints
 from sst_ros.mechanism.start import initial_state
+from sst_ros.mechanism.triples import axpy, cross, dot, rotation_rows, turned_back
 from sst_ros.scene import Scene
 
 NANOSECONDS = 1_000_000_000
@@ -163,14 +162,13 @@ class Simulation:
     @property
     def closure_residual(self) -> float:
         """Largest abs(r_k . t_k): how far the loops are from closed."""
-        r, t = self._directions(self.state.joints.gamma, self.state.quaternion)
-        return float(np.abs(np.sum(r * t, axis=1)).max())
+        return float(max(abs(dot(t, r)) for t, r in self._directions()))
 
     @property
     def conditioning(self) -> dict[str, float]:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
-        r, t = self._directions(self.state.joints.gamma, self.state.quaternion)
-        determinant = float(np.linalg.det(np.cross(t, r)))
+        first, second, third = (cross(t, r) for t, r in self._directions())
+        determinant = dot(first, cross(second, third))
         return {"sin_mu": min(map(math.sin, self.state.joints.mu)), "det_j2": determinant}
 
     def step(self, torque: Torque, dt_ns: int, moment: Triple = (0.0, 0.0, 0.0)) -> State:
@@ -275,9 +273,12 @@ class Simulation:
             raise InputError(self.scene.name, [Problem("initial.gamma", initial.gamma, allowed)])
         return self._journey.begin(list(initial_state(self.scene, self.geometry)))
 
-    def _directions(self, gamma: Sequence[float], quaternion: Sequence[float]) -> tuple[Any, Any]:
-        r = kinematics.carriage_directions(self.geometry, np.array(gamma))
-        return r, self.geometry.e @ rotation_matrix(quaternion).T
+    def _directions(self) -> Iterator[tuple[Triple, Triple]]:
+        """Directions t_k and r_k in {E}, r_k from gamma_k alone."""
+        rows = rotation_rows(self.state.quaternion)
+        for gamma, leg in zip(self.state.joints.gamma, self.dynamics.model.legs, strict=True):
+            r = axpy(math.cos(gamma), leg.v, math.sin(gamma), leg.across)
+            yield (leg.e0, leg.e1, 0.0), turned_back(rows, r)
 
 
 def _refuse_bad_input(torque: Torque, dt_ns: int, moment: Sequence[float]) -> None:
