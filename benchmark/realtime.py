@@ -4,8 +4,9 @@
 python -m benchmark.realtime --minutes 10 --write   # the official figures, on an idle machine
 python -m benchmark.realtime --fleet 10 --rate 200  # namespaced simulators side by side
 
-Runs simulator and recorder for so long, with SCHED_FIFO and without, then the simulator alone as
-fast as possible, then a fleet. Commands of zero torque come at 100 Hz.
+First a loop that only sleeps tells what the machine itself misses. Then simulator and recorder run
+for so long with SCHED_FIFO, half as long without, then the simulator alone as fast as possible,
+then a fleet. Commands of zero torque come at 100 Hz.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
 from benchmark import machine
+from sst_ros.nodes import realtime
+from sst_ros.nodes.pacing import Pacer, SteadyTime
 
 PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
 TICK = os.sysconf("SC_CLK_TCK")
@@ -119,6 +122,29 @@ def commanded(watch: Watch, topic: str, readers: int) -> Iterator[None]:
         stop.set()
         thread.join()
         watch.node.destroy_publisher(commands)
+
+
+def asleep(seconds: float, priority: int) -> Figures:
+    """A loop that only sleeps, in a thread of its own: nobody here can miss fewer ticks."""
+    said: Figures = {}
+
+    def loop() -> None:
+        pacer, latest, ticks = Pacer(1_000_000, 1.0, SteadyTime()), 0, 0
+        said["scheduling"] = realtime.schedule(priority)
+        pacer.start()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            pacer.wait(lambda: False)
+            latest, ticks = max(latest, pacer.late_ns), ticks + 1
+        share = 100.0 * pacer.missed / (ticks + pacer.missed)
+        said["length [min]"] = f"{seconds / 60.0:.1f}"
+        said["missed ticks [%]"] = f"{share:.4f}"
+        said["lateness, largest [us]"] = f"{latest / 1000.0:.0f}"
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    thread.join()
+    return said
 
 
 def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
@@ -285,11 +311,14 @@ def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
 
     if not options.fleet:
         if options.minutes:
+            seconds = min(60.0 * options.minutes, 60.0)
+            alone = [{"": "asleep at 1 kHz", **asleep(seconds, options.priority)}]
+            yield told("The machine itself", alone)
             both = [
-                {"": name, **keep_time(watch, options.minutes, {**given, **how})}
-                for name, how in (
-                    ("SCHED_FIFO asked for", {"realtime_priority": options.priority}),
-                    ("not", {"realtime_priority": 0}),
+                {"": name, **keep_time(watch, minutes, {**given, "realtime_priority": priority})}
+                for name, minutes, priority in (
+                    ("SCHED_FIFO asked for", options.minutes, options.priority),
+                    ("not", options.minutes / 2.0, 0),
                 )
             ]
             yield told("1 kHz, 500 samples a second, recorder attached", both)

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from sst_ros.mechanism import energy, kernel
-from sst_ros.mechanism.trace import Program, trace, with_jacobian
+from sst_ros.mechanism.trace import Program, trace
 from sst_ros.mechanism.triples import rotation_rows
 from sst_ros.scene import Scene
 
@@ -50,12 +50,6 @@ class Dynamics:
     def derivative(self) -> Function:
         """The program as a function of plain floats."""
         return compiled(self.program)
-
-    @cached_property
-    def linearised(self) -> Function:
-        """The derivative, and then its derivatives by each number of the state in turn."""
-        inputs = (*self.state, *self.drive)
-        return compiled(with_jacobian(self._derivative, inputs, self.state))
 
     @cached_property
     def joints(self) -> Function:

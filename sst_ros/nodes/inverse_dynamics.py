@@ -196,8 +196,9 @@ class InverseDynamics:
     def _report(self) -> None:
         """Publish the diagnostics."""
         pursuit = self._pursuit
+        stage = "waiting for joint_states" if self._seen is None else pursuit.stage.value
         values: dict[str, object] = {
-            "stage": pursuit.stage.value,
+            "stage": stage,
             "mode": self._parameters.mode,
             "samples": pursuit.samples,
             "samples_irregular": pursuit.irregular,
@@ -219,7 +220,7 @@ class InverseDynamics:
         level = DiagnosticStatus.WARN if doubts else DiagnosticStatus.OK
         name = f"{self.node.get_fully_qualified_name()}: control"
         stamp_ns = self.node.get_clock().now().nanoseconds
-        said = "; ".join([pursuit.stage.value, *doubts])
+        said = "; ".join([stage, *doubts])
         self._diagnostics.publish(diagnostics(name, stamp_ns, level, said, values))
 
     def _tell(self) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-GENERATED = ("accuracy.md", "feedforward.md", "peers.md")
+GENERATED = ("accuracy.md", "feedforward.md", "peers.md", "realtime.md")
 """Reports, whose words are not instructions."""
 
 

@@ -12,10 +12,10 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
+from integration.explicit_method import ExplicitMethod
 from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque import sine
-from sst_ros.integration.explicit import ExplicitMethod
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
 from sst_ros.mechanism import kernel
 from sst_ros.scene import load

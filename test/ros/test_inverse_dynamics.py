@@ -154,7 +154,8 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     given = {"mode": "computed_torque", "feedforward_at": "middle"}
     companion = nodes.run("inverse_dynamics", scene=path, motion="topic", stamped="true", **given)
     publisher = observer.publisher(JointTrajectory, "/sst_inverse_dynamics/joint_trajectory")
-    observer.until(lambda: companion_told(observer, "stage"), "the companion")
+    stage = "waiting for a trajectory"  # joint_states have come: they say where one may begin
+    observer.until(lambda: stage in companion_told(observer, "stage"), stage)
     first, second = trajectory((0.3, AWAY[::-1])), trajectory((0.2, HOME))
     first.joint_names = NAMES[::-1]
     publisher.publish(first)
