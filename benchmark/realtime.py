@@ -344,9 +344,10 @@ def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
 _HEAD = """\
 # Keeping time
 
-Measured by `python -m benchmark.realtime --minutes 10 --write`; shorter runs say so in their tables.
-Python without a real-time kernel is soft real time. A tick is missed when the one before it, or the machine, makes it late by a
-whole period; simulated time then drops it and the diagnostics count it."""
+Measured by `python -m benchmark.realtime --minutes 10 --write`; shorter runs say so in their
+tables. Python without a real-time kernel is soft real time. A tick is missed when the one before
+it, or the machine, makes it late by a whole period; simulated time then drops it and the
+diagnostics count it."""
 
 
 if __name__ == "__main__":
