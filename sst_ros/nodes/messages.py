@@ -28,7 +28,12 @@ class NotFinite(SstError):
 
 
 class StateMessages:
-    """joint_states, orientation and euler_zyz of one instant, as bytes."""
+    """joint_states, orientation and euler_zyz of one instant.
+
+    Attributes:
+        templates: of these three messages, in this order.
+
+    """
 
     def __init__(self) -> None:
         count = len(JOINTS)
@@ -40,13 +45,11 @@ class StateMessages:
         q, vector = orientation.quaternion, euler.vector
         q.x, q.y, q.z, q.w = quaternion
         vector.x, vector.y, vector.z = angles
-        self._joints, self._orientation, self._euler = map(Template, (joints, orientation, euler))
-        places = (self._joints.place(values) for values in (position, velocity, effort))
+        self.templates = Template(joints), Template(orientation), Template(euler)
+        first, second, third = self.templates
+        places = (first.place(values) for values in (position, velocity, effort))
         self._position, self._velocity, self._effort = places
-        self._quaternion, self._angles = (
-            self._orientation.place(quaternion),
-            self._euler.place(angles),
-        )
+        self._quaternion, self._angles = second.place(quaternion), third.place(angles)
         for write in (self._position, self._velocity, self._effort):
             write(*_NO_JOINTS)
 
@@ -73,14 +76,6 @@ class StateMessages:
         """Set all rates and efforts to zero: a state that is held."""
         self._velocity(*_NO_JOINTS)
         self._effort(*_NO_JOINTS)
-
-    def stamped(self, stamp_ns: int) -> tuple[bytes, bytes, bytes]:
-        """Give joint_states, orientation and euler_zyz."""
-        return (
-            self._joints.stamped(stamp_ns),
-            self._orientation.stamped(stamp_ns),
-            self._euler.stamped(stamp_ns),
-        )
 
 
 def zyz_of(quaternion: Sequence[float]) -> tuple[float, float, float]:

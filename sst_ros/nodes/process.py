@@ -16,8 +16,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from sst_ros.errors import SstError
+from sst_ros.nodes import middleware
 
-_SPIN_PERIOD_S = 0.05
+_SPIN_PERIOD_S = 0.2
+"""So late may a signal be heard; to spin once takes half a millisecond, asked for or not."""
 
 
 class Worker(Protocol):
@@ -38,6 +40,7 @@ def run(name: str, build: Callable[[], Worker], args: list[str] | None = None) -
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    middleware.configure()
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:  # what rcl makes of bad --ros-args

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the simulator publishes: the run loop's audience.
 
-Publishing happens in the run's thread, after the step, in the slack before the next deadline.
+Publishing happens in the run's thread, after the step, in the slack before the next deadline; a
+topic that nobody reads is left out.
 rclpy holds the interpreter's lock while it publishes (measured: 200 publications beside a busy
 thread are never interrupted), so a thread of its own could not work beside the next step; it would
 only add switches between threads.
@@ -21,7 +22,7 @@ from sst_ros.nodes import endpoints
 from sst_ros.nodes.clocks import OwnClock
 from sst_ros.nodes.commands import Settings
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
-from sst_ros.nodes.template import sender
+from sst_ros.nodes.template import listeners, sender
 from sst_ros.scene import Scene
 from sst_ros.simulation import State, Triple
 
@@ -41,12 +42,17 @@ class Publications:
         samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
         topics = (endpoints.JOINT_STATES, endpoints.ORIENTATION, endpoints.EULER_ZYZ)
-        self._send_state = [sender(topic.publisher(node, depth)) for topic in topics]
-        self._send_torques = sender(endpoints.APPLIED_TORQUES.publisher(node, depth))
+        state = [topic.publisher(node, depth) for topic in topics]
+        torques = endpoints.APPLIED_TORQUES.publisher(node, depth)
+        self._send_torques, self._torque_listeners = sender(torques), listeners(torques)
         self._phase = endpoints.PHASE.publisher(node)
         self._scene = endpoints.SCENE.publisher(node)
         self._scene.publish(String(data=dump(scene)))
         self._messages = StateMessages()
+        self._state = [
+            (listeners(publisher), sender(publisher), template)
+            for publisher, template in zip(state, self._messages.templates, strict=True)
+        ]
         moments = scene.moment is not None and scene.moment.topic
         self._log = TorqueLog(given.ticks_per_sample, given.period_ns, moments=moments)
         self._period_ns = given.period_ns
@@ -73,8 +79,9 @@ class Publications:
         self._messages.fill(state)
         if self._clock is not None:
             self._clock.tell(stamp_ns)
-        if self._log:
+        if self._log and self._torque_listeners():
             self._send_torques(self._log.take(stamp_ns - len(self._log) * self._period_ns))
+        self._log.clear()
         self._publish_state(stamp_ns)
 
     def idle(self, state: State, *, still: bool) -> None:
@@ -105,8 +112,7 @@ class Publications:
     def finish(self) -> None:
         """Wait until readers have it all.
 
-        Fast DDS asks them every 3 s only, unless there is much to send: so this may take all of
-        its time where nothing is missing.
+        Fast DDS asks them now and then only, see `middleware`.
         """
         deadline = time.monotonic() + _ACKNOWLEDGE_S
         for publisher in self._node.publishers:
@@ -114,5 +120,6 @@ class Publications:
             publisher.wait_for_all_acked(Duration(seconds=left))
 
     def _publish_state(self, stamp_ns: int) -> None:
-        for send, message in zip(self._send_state, self._messages.stamped(stamp_ns), strict=True):
-            send(message)
+        for listened, send, template in self._state:
+            if listened():
+                send(template.stamped(stamp_ns))

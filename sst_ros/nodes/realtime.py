@@ -3,26 +3,43 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
+import threading
+from pathlib import Path
 
 _SWITCH_INTERVAL_S = 1e-4
 
 
 def schedule(priority: int) -> str:
-    """Ask for SCHED_FIFO for the calling thread (0: for the usual scheduling); say what it got."""
+    """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); say what was had.
+
+    The calling thread gets the priority, the others half of it: they hold locks that it waits for,
+    the interpreter's and those of DDS, and must not be put aside meanwhile for the work of others.
+    What these threads start is scheduled as usual.
+    """
     if not hasattr(os, "sched_setscheduler"):
         return "usual: this system has no SCHED_FIFO"
     if priority == 0:
         if os.sched_getscheduler(0) != os.SCHED_OTHER:
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            _schedule_all(os.SCHED_OTHER, 0, 0)
         return "usual"
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        _schedule_all(os.SCHED_FIFO, priority, (priority + 1) // 2)
     except (OSError, ValueError) as error:
         return f"usual: SCHED_FIFO {priority} is not permitted ({error})"
     return f"SCHED_FIFO {priority}"
+
+
+def _schedule_all(policy: int, own: int, others: int) -> None:
+    policy |= os.SCHED_RESET_ON_FORK
+    os.sched_setscheduler(0, policy, os.sched_param(own))
+    for thread in Path("/proc/self/task").iterdir():
+        if int(thread.name) != threading.get_native_id():
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                os.sched_setscheduler(int(thread.name), policy, os.sched_param(others))
 
 
 def quiet() -> None:

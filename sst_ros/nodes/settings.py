@@ -92,7 +92,8 @@ class SimulatorParameters(Section):
         default=True,
     )
     realtime_priority: int = integer(
-        "SCHED_FIFO priority of the run's thread where that is permitted; 0 for none",
+        "SCHED_FIFO priority of the run's thread where that is permitted, the other threads of the "
+        "node get half of it; 0 for none",
         "1",
         default=20,
         least=0,

@@ -82,3 +82,12 @@ def sender(publisher: Publisher) -> Send:
     handle.__enter__()  # in use until the process ends
     send: Send = handle.publish_raw
     return send
+
+
+def listeners(publisher: Publisher) -> Callable[[], int]:
+    """Give what tells how many read a topic now.
+
+    What nobody reads need not be made: unless it is latched nobody gets it later.
+    """
+    count: Callable[[], int] = publisher.handle.get_subscription_count
+    return count

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes ask of Fast DDS, and that it does it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sst_ros.nodes import middleware
+
+NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+
+LISTEN = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(String, "said", lambda message: None, 1000)
+print("listening", flush=True)
+rclpy.spin(node)
+"""
+
+SPEAK = """
+import time
+import rclpy
+from rclpy.duration import Duration
+from std_msgs.msg import String
+from sst_ros.nodes import middleware
+middleware.configure()
+rclpy.init()
+node = rclpy.create_node("speaker")
+publisher = node.create_publisher(String, "said", 1000)
+end = time.monotonic() + 30.0
+while publisher.get_subscription_count() == 0 and time.monotonic() < end:
+    time.sleep(0.01)
+for _ in range(4):
+    publisher.publish(String(data="a word"))
+    print(publisher.wait_for_all_acked(Duration(seconds=1.0)), flush=True)
+"""
+
+
+@pytest.fixture
+def no_profile(monkeypatch):
+    for name in NAMES:
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
+    """By default they are asked every 3 s: the second of waiting would pass in vain."""
+    command = [sys.executable, "-c"]
+    with subprocess.Popen([*command, LISTEN], stdout=subprocess.PIPE, text=True) as listener:
+        try:
+            assert listener.stdout.readline() == "listening\n"
+            spoken = subprocess.run(
+                [*command, SPEAK], capture_output=True, text=True, timeout=60, check=True
+            )
+        finally:
+            listener.kill()
+    assert spoken.stdout.split() == ["True"] * 4
+    assert spoken.stderr == ""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_profile_of_the_user_is_left_alone(name, no_profile, monkeypatch):
+    monkeypatch.setenv(name, "mine.xml")
+    before = dict(os.environ)
+    middleware.configure()
+    assert dict(os.environ) == before
+
+
+@pytest.mark.parametrize(("rclpy", "name"), [("7.1.5", NAMES[0]), ("9.1.2", NAMES[1])])
+def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch):
+    monkeypatch.setattr(middleware, "version", lambda package: {"rclpy": rclpy}[package])
+    middleware.configure()
+    (given,) = {each: os.environ.pop(each) for each in NAMES if each in os.environ}.items()
+    assert given[0] == name
+    assert Path(given[1]).is_file()
