@@ -11,6 +11,7 @@ import json
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
@@ -18,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark import c_batch, c_floor, machine
+from benchmark import c_batch, c_floor, machine, variants
 from benchmark.timing import interleaved, ratio
 from sst_ros import scene as scenes
 from sst_ros.integration.batch import Batch
@@ -106,6 +107,8 @@ class _Work:
 
         self.calls[name, ONE] = lambda: run(1)
         self.calls[name, ALL] = lambda: run(len(os.sched_getaffinity(0)))
+        for who, parameters in variants.parameters(self._scene).items():
+            self._add_varied(name, who, method, parameters, start)
         if folder is not None:
             self._add_c(name, method, batch, start, folder)
         columns = tuple(y.copy())
@@ -114,6 +117,31 @@ class _Work:
         slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
         for who, slope in slopes.items():
             self.calls[name, who] = lambda slope=slope: _step(method, slope, 0.0, columns)
+
+    def _add_varied(
+        self,
+        name: str,
+        who: str,
+        method: Tableau,
+        parameters: dict[str, np.ndarray],
+        start: Callable[[], tuple[np.ndarray, ...]],
+    ) -> None:
+        """The same states, with the parameters of a hundred scenarios again and again."""
+        began = time.perf_counter()
+        profile = self._scene.torque is not None
+        batch = Batch(self._scene, method, profile=profile, parameters=parameters)
+        each = (time.perf_counter() - began) / variants.COUNT
+        given = batch.drives((0.0, 0.0, 0.0), variants.COUNT)
+        given = given[:, np.arange(self._number) % variants.COUNT].copy()
+        self.said.append(
+            f"{name}, {who}: {len(given)} numbers, {1e3 * each:.1f} ms to prepare a scenario."
+        )
+
+        def run() -> None:
+            y, _, *more = start()
+            batch.advance(0, STEPS, STEP, y, given, *more, threads=1)
+
+        self.calls[name, who] = run
 
     def _add_c(
         self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any], folder: Path
@@ -205,6 +233,8 @@ def _print(rows: list[dict[str, Any]], seconds: dict[tuple[str, str], list[float
                 met = "met" if over <= AT_MOST_C else "MISSED"
                 print(f"{name}: numba over {floor}, 1 thread each {over:.2f}, "
                       f"target {AT_MOST_C}: {met}")  # fmt: skip
+        for who in (variants.STAR, variants.BODIES):
+            print(f"{name}: {who} over fixed {ratio(seconds, (name, who), (name, ONE)):.2f}")
         for ours in (ALL, ONE):
             for who in (COLUMNS, TRACED):
                 times = STEPS * ratio(seconds, (name, who), (name, ours))

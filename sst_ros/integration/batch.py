@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,20 +17,21 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import backend
 from sst_ros.integration.blocks import LANES, NOT_FINITE, batch_source
-from sst_ros.integration.system import System
+from sst_ros.integration.family import Family
+from sst_ros.integration.starts import SAID, starts
 from sst_ros.integration.tableaux import DOP853, Tableau
-from sst_ros.limits import Limit, limits_of
-from sst_ros.mechanism import kernel, kinematics, virtual_work
-from sst_ros.mechanism.compiled import QUATERNION, RATE, Dynamics
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.trace import Program, trace
-from sst_ros.mechanism.triples import dot, rotation_rows
+from sst_ros.integration.variants import Variants
+from sst_ros.mechanism.compiled import TORQUE
+from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.trace import Program
 from sst_ros.progress import slices
 from sst_ros.scene import Scene
 
 _CHUNKS = 50
-_NO_START = -1
+_UNUSED = {
+    "initial": "is given to run, not as a parameter",
+    **dict.fromkeys(("motion", "markers", "duration"), "is nothing that a batch uses"),
+}
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,26 @@ class Batch:
         scene: what is simulated; its ends must not be rigid (impact).
         method: explicit method.
         profile: apply the scene's own torques over time on top of none given to `run`.
+        parameters: numbers of the scene that differ between scenarios, by their keys in the
+            document, as in {"star.inertia.zz": [...], "gravity.acceleration": [[...], ...]}: a row
+            a scenario. A list without an index means all of its entries.
+        progress: draw a bar on a terminal while scenarios are prepared.
 
     Raises:
-        InputError: numba is not installed, or the scene has impacts or no torque to apply.
+        InputError: numba is not installed, the scene has impacts or no torque to apply, or the
+            numbers of a scenario make no scene; says which, and what is allowed.
 
     """
 
-    def __init__(self, scene: Scene, method: Tableau = DOP853, *, profile: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        method: Tableau = DOP853,
+        *,
+        profile: bool = False,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        progress: bool = False,
+    ) -> None:
         problems = []
         if backend.numba_version() is None:
             problems.append(Problem("numba", None, "must be installed: pip install sst_ros[fast]"))
@@ -76,14 +91,19 @@ class Batch:
             problems.append(Problem("stroke.at_end", "impact", "must not be impact in a batch"))
         if profile and scene.torque is None:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
+        unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
+        told = [(key, unused.get(key.partition(".")[0])) for key in parameters or ()]
+        problems += [Problem(key, "given", said) for key, said in told if said]
         if problems:
             raise InputError(scene.name, problems)
         self.scene = scene
-        self.geometry = Geometry.of(scene)
-        self._dynamics = Dynamics(scene)
-        self._system = System(self._dynamics, scene.torque if profile else None)
-        self._limits = tuple(limits_of(scene, self.geometry))
-        self._module = self._compile(method)
+        self._variants = Variants(scene, parameters or {})
+        self._family = Family(self._variants, profile=profile, progress=progress)
+        self._method = method
+
+    def scenario(self, row: int) -> Scene:
+        """Return the scene of a scenario: a document that runs by itself."""
+        return self._variants.scene(row)
 
     def run(
         self,
@@ -100,9 +120,10 @@ class Batch:
         """Run all scenarios for `count` steps.
 
         Args:
-            gamma: initial actuator angles [rad], shape (N, 3).
+            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters vary.
             gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
-            torque: constant torques [N m], shape (N, 3) or (3,); not used with a profile.
+            torque: constant torques [N m], shape (N, 3) or (3,), within the actuators' limit where
+                they have one; not used with a profile.
             step: length of a step [s].
             count: number of steps.
             keep_every: keep the states every so many steps; 0 keeps none.
@@ -110,13 +131,14 @@ class Batch:
             progress: draw a bar on a terminal.
 
         Raises:
-            InputError: an argument is not finite or has another shape.
+            InputError: an argument is not allowed; says which and what is.
 
         """
-        gamma = _rows("gamma", gamma, None)
-        y, code = self.start(gamma, gamma_dot)
-        given = self.drives(torque, len(gamma))
-        when, error = np.full(len(gamma), np.nan), np.zeros(len(gamma))
+        _refuse_bad_steps(step, count, keep_every, threads)
+        y, code = self.start(gamma, gamma_dot, progress=progress)
+        number = y.shape[1]
+        given = self.drives(torque, number)
+        when, error = np.full(number, np.nan), np.zeros(number)
         kept = [y[:7].T.copy()] if keep_every else []
         size = keep_every or max(1, count // _CHUNKS)
         for part in slices(count, size, self.scene.name, progress):
@@ -124,39 +146,38 @@ class Batch:
             self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
             if keep_every and span == keep_every:
                 kept.append(y[:7].T.copy())
-        when[code == _NO_START] = 0.0
+        when[code < 0] = 0.0
         return Scenarios(
             quaternion=y[:4].T.copy(),
             body_rate=y[4:7].T.copy(),
-            fault=tuple(self._said(int(number)) for number in code),
+            fault=tuple(self._said(row, int(number)) for row, number in enumerate(code)),
             fault_time=when,
             local_error=error,
             kept=np.stack(kept) if kept else None,
         )
 
-    def start(self, gamma: Array, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-        """States at t = 0, a column a scenario, and codes: 0, or of those that cannot start."""
-        rates = _rows("gamma_dot", gamma_dot, len(gamma))
-        y = np.zeros((len(self.state), len(gamma)))
-        y[3] = 1.0
-        code = np.full(len(gamma), _NO_START, dtype=np.int64)
-        found = kinematics.direct_many(self.geometry, gamma)
-        counts = np.bincount(found.configuration[found.admissible], minlength=len(gamma))
-        for row in np.flatnonzero(found.admissible):
-            n = int(found.configuration[row])
-            if counts[n] == 1:
-                rotation = found.rotation[row]
-                posture = virtual_work.posture(self.geometry, gamma[n], rotation)
-                y[:4, n] = quaternion_of(rotation)
-                y[4:7, n] = rotation.T @ posture.j @ rates[n]
-                code[n] = 0
+    def start(
+        self, gamma: ArrayLike, gamma_dot: ArrayLike, *, progress: bool = False
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
+        angles = _rows("gamma", gamma, self._variants.count)
+        rates = _rows("gamma_dot", gamma_dot, len(angles))
+        family, number = self._family, len(angles)
+        which = np.broadcast_to(family.geometry, number)
+        label = f"{self.scene.name}, starting"
+        quaternion, rate, code = starts(family.geometries, which, angles, rates, label, progress)
+        y = np.zeros((len(self.state), number))
+        y[:4], y[4:7] = quaternion.T, rate.T
         return y, code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
-        """Return what acts from outside, a column a scenario."""
-        given = np.zeros((max(len(self._system.drive), 1), number))
-        if len(self._system.drive) >= 3:
-            given[:3] = _rows("torque", torque, number).T
+        """Return what acts from outside and what differs, a column a scenario."""
+        drive, columns = self._family.system.drive, self._family.columns
+        given = np.zeros((max(len(drive) + len(columns), 1), number))
+        if drive[:3] == TORQUE:
+            limit = self._family.torque_limit
+            given[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
+        given[len(drive) : len(drive) + len(columns)] = columns
         return given
 
     def advance(
@@ -168,48 +189,36 @@ class Batch:
         """
         threads = threads or len(os.sched_getaffinity(0))
         shares = _shares(-(-columns[0].shape[1] // LANES), threads)
-
-        def run(share: tuple[int, int]) -> None:
-            self._module.batch(step, first, count, *share, *columns)
-
+        run = self._module.batch
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, shares))
-
-    def _said(self, code: int) -> str:
-        if code == 0:
-            return ""
-        if code == _NO_START:
-            return "no unique admissible assembly"
-        return "not finite" if code == NOT_FINITE else self._limits[code - 1].reason
+            list(pool.map(lambda share: run(step, first, count, *share, *columns), shares))
 
     @property
     def state(self) -> tuple[str, ...]:
         """Names of the state's numbers."""
-        return self._system.state
+        return self._family.system.state
 
     @property
     def program(self) -> Program:
-        """Derivative of the state."""
-        return self._system.program
+        """Derivative of the state; inputs t, state, drive, and the numbers that differ."""
+        return self._family.program
 
-    def _compile(self, method: Tableau) -> ModuleType:
-        text = batch_source(self.program, self.margins, method, len(self.state))
-        nodes = {"NODES": method.c}
-        return backend.load([text], nodes, numba=True, nogil=True)
+    @property
+    def margins(self) -> Program:
+        """Distances to the limits; inputs are quaternion, body rate and the numbers that differ."""
+        return self._family.margins
 
     @cached_property
-    def margins(self) -> Program:
-        """Signs of the limits without an angle: positive inside, for angles less than pi away."""
-        model = self._dynamics.model
+    def _module(self) -> ModuleType:
+        text = batch_source(self.program, self.margins, self._method, len(self.state))
+        return backend.load([text], {"NODES": self._method.c}, numba=True, nogil=True)
 
-        def signs(*state: Any) -> tuple[Any, ...]:
-            rows = rotation_rows(state[:4])
-            legs = [kernel.leg_motion(leg, rows, state[4:7]) for leg in model.legs]
-            return tuple(
-                _sign(limit, legs[limit.leg], model.legs[limit.leg]) for limit in self._limits
-            )
-
-        return trace(signs, (*QUATERNION, *RATE))
+    def _said(self, row: int, code: int) -> str:
+        if code == 0:
+            return ""
+        if code < 0:
+            return SAID[code]
+        return "not finite" if code == NOT_FINITE else self._family.limits(row)[code - 1].reason
 
 
 def _shares(blocks: int, threads: int) -> list[tuple[int, int]]:
@@ -218,16 +227,15 @@ def _shares(blocks: int, threads: int) -> list[tuple[int, int]]:
     return [(first, min(first + size, blocks)) for first in range(0, blocks, size)]
 
 
-def _sign(limit: Limit, at: Any, leg: kernel.Leg) -> Any:
-    """sin(sign * (angle - end)) times something positive."""
-    if limit.joint < 3:
-        along, across = dot(at.outward, leg.v), dot(at.outward, leg.across)
-    elif limit.joint < 6:
-        return at.u - np.sin(limit.end) ** 2
-    else:
-        along, across = at.p[2], at.p[0] * leg.e1 - at.p[1] * leg.e0
-    cosine, sine = float(np.cos(limit.end)), float(np.sin(limit.end))
-    return limit.sign * (across * cosine - along * sine)
+def _refuse_bad_steps(step: float, count: int, keep_every: int, threads: int) -> None:
+    problems = []
+    if not (np.isfinite(step) and step > 0.0):
+        problems.append(Problem("step", step, "must be finite and > 0 [s]"))
+    for name, value in (("count", count), ("keep_every", keep_every), ("threads", threads)):
+        if value < 0:
+            problems.append(Problem(name, value, "must be >= 0"))
+    if problems:
+        raise InputError("batch", problems)
 
 
 def _rows(name: str, value: ArrayLike, count: int | None) -> Array:

@@ -21,9 +21,9 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
     """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
 
     Args:
-        program: derivative; inputs t, state, drive.
-        margins: numbers that are positive as long as the state is valid; inputs as the state's
-            first seven.
+        program: derivative; inputs t, state, drive, of which the last may be parameters.
+        margins: numbers that are positive as long as the state is valid; inputs are the state's
+            first seven, and the parameters.
         tableau: explicit method.
         size: numbers in the state.
 
@@ -34,7 +34,9 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
         LANES, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
         far=len(margins.outputs), code=1, when=1, error=1,
     )  # fmt: skip
-    given = ["time", *at.rows("s", size), *at.rows("d", drive)]
+    outside = at.rows("d", drive)
+    given = ["time", *at.rows("s", size), *outside]
+    valid = [*at.rows("new", 7), *outside[drive - (len(margins.inputs) - 7) :]]
     lines = [
         "def batch(h, first, count, begin, end, y, d, code, when, error):",
         f"    block = vector({at.numbers})",
@@ -54,7 +56,7 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
         *indented(16, evaluated(program, given, at, "f")),
         *indented(16, _kept(tableau, size, at)),
         *indented(12, _results(tableau, size, at)),
-        *indented(12, evaluated(margins, at.rows("new", 7), at, "far")),
+        *indented(12, evaluated(margins, valid, at, "far")),
         *indented(12, _judged(size, len(margins.outputs), at)),
         "        for i in range(last + 1):",
         *(f"            y[{j}, lo + i] = {at.lane('y', j)}" for j in range(size)),

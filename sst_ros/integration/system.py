@@ -41,12 +41,12 @@ class System:
     @cached_property
     def program(self) -> Program:
         """The derivative."""
-        return trace(self._derivative, self._inputs)
+        return trace(self.derivative, self._inputs)
 
     @cached_property
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
-        return with_jacobian(self._derivative, self._inputs, ("t", *self.state))
+        return with_jacobian(self.derivative, self._inputs, ("t", *self.state))
 
     @property
     def joints(self) -> Program:
@@ -57,7 +57,8 @@ class System:
     def _inputs(self) -> tuple[str, ...]:
         return ("t", *self.state, *self.drive)
 
-    def _derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+    def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return the derivative at the time, the state and the drive given, of any kind."""
         size = len(self._dynamics.state)
         state, drive = inputs[:size], inputs[len(self.state) :]
         torque, rest = drive[:3], drive[3:]

@@ -27,6 +27,10 @@ BODY_ACCELERATION = ("ax", "ay", "az")
 class Dynamics:
     """Programs of a scene.
 
+    Args:
+        scene: what is simulated.
+        model: its constants, where they are known or not all of them numbers.
+
     Attributes:
         model: constants.
         state: names of the state's numbers: quaternion, body rate, lagged torques if any.
@@ -34,8 +38,8 @@ class Dynamics:
 
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.model = kernel.model_of(scene)
+    def __init__(self, scene: Scene, model: kernel.Model | None = None) -> None:
+        self.model = kernel.model_of(scene) if model is None else model
         lagging = self.model.time_constant is not None
         self.state = (*QUATERNION, *RATE, *(LAG if lagging else ()))
         self.moved = scene.moment is not None and scene.moment.topic

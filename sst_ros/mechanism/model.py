@@ -56,9 +56,9 @@ class Model(NamedTuple):
     time_constant: float | None = None
 
 
-def model_of(scene: Scene) -> Model:
-    """Collect the constants of a scene."""
-    geometry, star = Geometry.of(scene), scene.star_inertia
+def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
+    """Collect the constants of a scene; its geometry may be given where it is known."""
+    geometry, star = geometry or Geometry.of(scene), scene.star_inertia
     drives, links = scene.actuated_inertias, scene.intermediate_inertias
     legs = []
     for k in range(3):

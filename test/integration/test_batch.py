@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from sst_ros.integration.machine import Machine
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE
 from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.scene import Initial
+from sst_ros.scene import Actuators, Initial, Moment
 
 EXAMPLE2 = load_scene("example2")
 N = 100
@@ -21,7 +23,7 @@ N = 100
 def batch(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return Batch(EXAMPLE2, profile=True)
+        yield Batch(EXAMPLE2, profile=True)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +39,6 @@ def result(batch, gamma):
 
 
 def single(gamma):
-    from dataclasses import replace
-
     simulation = Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))), "dop853")
     torque = sine(EXAMPLE2.torque)
     try:
@@ -102,6 +102,31 @@ def test_its_local_error_is_told_and_small(result):
     started = np.array([text != "no unique admissible assembly" for text in result.fault])
     assert np.all(result.local_error[started] < 1e-9)
     assert np.all(result.local_error[started] > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ({"step": 0.0, "count": 1}, "step = 0.0: must be finite and > 0"),
+        ({"step": np.nan, "count": 1}, "step = nan: must be finite and > 0"),
+        ({"step": 0.01, "count": -1}, "count = -1: must be >= 0"),
+        ({"step": 0.01, "count": 1, "threads": -1}, "threads = -1: must be >= 0"),
+    ],
+)
+def test_bad_steps_are_refused_by_name(batch, gamma, argument, said):
+    with pytest.raises(InputError, match=said):
+        batch.run(gamma, (0, 0, 0), **argument)
+
+
+def test_torques_are_no_moments_where_a_profile_takes_their_place():
+    scene = replace(EXAMPLE2, moment=Moment(topic=True))
+    assert not Batch(scene, profile=True).drives((1.0, 2.0, 3.0), 2).any()
+
+
+def test_a_profile_that_actuators_would_clamp_is_refused():
+    scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=4.5))
+    with pytest.raises(InputError, match=r"actuators.torque_limit = 4.5: must not be less than"):
+        Batch(scene, profile=True)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters as arrays: every row is the scene that has these numbers in its document."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from loaded_scenes import IGNORE, REST, loaded
+from models import seeded_samples
+
+from sst_ros import Simulation, load_scene
+from sst_ros.errors import AssemblyError, InputError, RunStopped
+from sst_ros.integration import blocks
+from sst_ros.integration.batch import Batch
+from sst_ros.integration.machine import Machine
+from sst_ros.integration.starts import NO_RATE
+from sst_ros.integration.system import System
+from sst_ros.integration.tableaux import DORMAND_PRINCE, RK4
+from sst_ros.mechanism import singularities, workspace
+from sst_ros.mechanism.compiled import Dynamics, compiled
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import Actuators, Initial, Link, Spring
+
+EXAMPLE2 = load_scene("example2")
+HOME = np.pi / 4
+N = blocks.LANES + 5
+TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def tensors(name, samples, body):
+    return {
+        f"{name}.inertia.{key}": [getattr(body(one.scene).inertia, key) for one in samples]
+        for key in TENSOR
+    }
+
+
+@pytest.fixture(scope="module")
+def samples():
+    inside = [
+        one
+        for one in seeded_samples(7, 2 * N)
+        if np.all((one.gamma > 0.0) & (one.gamma < one.geometry.arc))
+    ]
+    assert len(inside) > N
+    return inside[:N]
+
+
+@pytest.fixture(scope="module")
+def manipulators(samples):
+    """Random base triangles, stars and inertias: all numbers differ."""
+    parameters = {
+        "base.v": [one.scene.base.v for one in samples],
+        "star.alpha_deg": [one.scene.star.alpha_deg for one in samples],
+        **tensors("star", samples, lambda scene: scene.star),
+    }
+    for links in ("actuated_links", "intermediate_links"):
+        for k in range(3):
+            parameters |= tensors(
+                f"{links}[{k}]", samples, lambda scene, links=links, k=k: getattr(scene, links)[k]
+            )
+    return Batch(samples[0].scene, DORMAND_PRINCE, parameters=parameters)
+
+
+def starts(samples):
+    gamma, gamma_dot, torque = (
+        np.array([getattr(one, name) for one in samples])
+        for name in ("gamma", "gamma_dot", "torque")
+    )
+    return gamma, 0.5 * gamma_dot, 0.1 * torque
+
+
+@pytest.fixture(scope="module")
+def result(manipulators, samples):
+    return manipulators.run(*starts(samples), step=2e-3, count=100, threads=3)
+
+
+def test_a_row_is_the_scene_with_these_numbers(manipulators, samples):
+    assert [manipulators.scenario(n) for n in range(N)] == [one.scene for one in samples]
+
+
+def alone(scene, gamma, gamma_dot, torque):
+    """A run by variable steps of a simulation of its own."""
+    scene = dataclasses.replace(scene, initial=Initial(gamma=gamma, gamma_dot=gamma_dot))
+    try:
+        simulation = Simulation(scene, "dop853")
+    except AssemblyError:
+        return None, "no unique admissible assembly", 0.0
+    try:
+        simulation.step(tuple(torque), 200_000_000)
+    except RunStopped as stopped:
+        return None, stopped.reason, stopped.time
+    return simulation.state, "", None
+
+
+def test_a_row_goes_as_a_simulation_of_its_scene(result, samples):
+    for n, at in list(enumerate(zip(*starts(samples), strict=True)))[::2]:
+        state, reason, time = alone(samples[n].scene, *at)
+        assert result.fault[n] == reason
+        if state is None:
+            assert 0.0 <= result.fault_time[n] - time < 2e-3 + 1e-12
+        else:
+            sign = np.sign(result.quaternion[n] @ state.quaternion)
+            np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=1e-9)
+            np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=1e-8)
+
+
+def test_faults_stay_with_their_row_and_tell_its_own_end(result):
+    """What is told is what the row's own simulation says, see above; here: of different ends."""
+    told = [text for text in result.fault if text]
+    assert 0 < len(told) < N
+    assert len({text for text in told if ">" in text}) > 1
+    assert np.all(np.isfinite(result.quaternion))
+
+
+def test_a_row_has_the_bits_of_steps_of_its_scene(manipulators, samples, result):
+    gamma, gamma_dot, torque = starts(samples)
+    y, _ = manipulators.start(gamma, gamma_dot)
+    for n in [n for n, text in enumerate(result.fault) if not text][:4]:
+        system = System(Dynamics(manipulators.scenario(n)))
+        machine = Machine(system, DORMAND_PRINCE, compiled=False)
+        ended = machine.march(0.0, 2e-3, 100, y[:, n].tolist(), torque[n].tolist())
+        assert ended == [*result.quaternion[n], *result.body_rate[n]]
+
+
+def test_threads_change_no_bit(manipulators, samples, result):
+    again = manipulators.run(*starts(samples), step=2e-3, count=100, threads=1)
+    assert np.array_equal(again.quaternion, result.quaternion)
+    assert np.array_equal(again.body_rate, result.body_rate)
+    assert again.fault == result.fault
+
+
+def test_springs_swing_with_the_root_of_stiffness_over_inertia():
+    """At home of the isotropic design gamma_dot_k = omega / sqrt(3): k / I is that of the star."""
+    stiffness, inertia = np.meshgrid([50.0, 120.0, 300.0], [0.15, 0.2, 0.3, 0.4])
+    scene = dataclasses.replace(
+        EXAMPLE2,
+        actuated_links=(Link(),) * 3,
+        intermediate_links=(Link(),) * 3,
+        springs=[Spring(joint=f"gamma_{k}", stiffness=1.0, rest=HOME) for k in (1, 2, 3)],
+    )
+    parameters = {"springs.stiffness": stiffness.ravel(), "star.inertia.zz": inertia.ravel()}
+    batch = Batch(scene, RK4, parameters=parameters)
+    small, step, count = 1e-4, 1e-3, 1000
+    found = batch.run((HOME,) * 3, (small,) * 3, step=step, count=count, keep_every=50)
+    times = step * np.arange(0, count + 1, 50)
+    omega = np.sqrt(stiffness / inertia).ravel()
+    expected = np.sqrt(3.0) * small * np.cos(np.outer(times, omega))
+    np.testing.assert_allclose(found.kept[:, :, 6], expected, atol=1e-5 * small)
+
+
+RANGES = {
+    "star.mass": (0.5, 1.0, True),
+    "star.inertia.zz": (0.95, 1.05, False),
+    "payload.mass": (0.5, 1.5, False),
+    "payload.centre": (0.8, 1.1, True),
+    "gravity.acceleration": (0.5, 1.5, True),
+    "friction.gamma.viscous": (0.5, 1.5, True),
+    "friction.gamma.coulomb": (0.5, 1.0, True),
+    "friction.gamma.static": (1.0, 1.5, True),
+    "friction.gamma.smoothing": (0.5, 1.5, False),
+    "friction.gamma.stribeck": (0.5, 1.5, False),
+    "friction.mu.viscous": (0.5, 1.5, True),
+    "friction.mu.coulomb": (0.5, 1.5, True),
+    "friction.beta.viscous": (0.5, 1.5, True),
+    "springs[0].rest": (0.5, 1.5, True),
+    "springs[1].stiffness": (0.5, 1.5, True),
+    "actuators.rotor_inertia": (0.5, 1.5, True),
+    "actuators.gear_ratio": (0.5, 1.5, False),
+    "actuators.time_constant": (0.5, 1.5, False),
+    "stroke.stiffness": (0.5, 1.5, False),
+    "stroke.damping": (0.5, 1.5, True),
+    "actuated_links[2].mass": (0.9, 1.0, True),
+    "actuated_links[2].inertia.xz": (0.9, 1.0, True),
+    "intermediate_links[0].inertia.xy": (0.5, 1.1, True),
+    "intermediate_links[1].inertia.zz": (0.99, 1.0, False),
+    "base.v": (0.9, 1.1, False),
+    "workspace.beta_max_deg": (0.5, 1.0, False),
+    "torque.amplitude": (0.5, 1.5, True),
+    "torque.frequency": (0.5, 1.5, True),
+}
+"""Factors of what the document says, and whether zero is allowed too."""
+
+LOADED = dataclasses.replace(
+    loaded(), stroke=load_scene("elastic_stops").stroke, torque=EXAMPLE2.torque
+)
+LOADED = dataclasses.replace(
+    LOADED, actuators=dataclasses.replace(LOADED.actuators, torque_limit=None)
+)
+
+
+def drawn(seed):
+    """Some numbers of a scene with every term, three rows of each, zero in some of them."""
+    rng, found = np.random.default_rng(seed), {}
+    for key, (low, high, may_vanish) in RANGES.items():
+        if rng.random() < 0.3:
+            factors = rng.uniform(low, high, 3)
+            if may_vanish:
+                factors[rng.random(3) < 0.3] = 0.0
+            found[key] = np.multiply.outer(factors, np.array(eval(f"LOADED.{key}")))
+    return found
+
+
+STATE = (0.1, -0.3, 0.2, 0.9, 1.0, -2.0, 0.5, 0.3, -0.2, 0.1)
+DRIVE = (0.4, -0.1, 0.2)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_programs_have_the_bits_of_those_of_each_row(seed):
+    """Zero in one row and not in another is one program; nothing but the inputs differs."""
+    batch = Batch(LOADED, RK4, profile=True, parameters=drawn(seed))
+    columns = batch.drives(REST, 3)
+    for row in range(3):
+        own = Batch(batch.scenario(row), RK4, profile=True)
+        at, drive = (0.1, *STATE), (*DRIVE, *columns[3:, row])
+        assert compiled(batch.program)(*at, *drive) == compiled(own.program)(*at, *DRIVE)
+        inside = compiled(batch.margins)(*STATE[:7], *columns[3:, row])
+        assert inside == compiled(own.margins)(*STATE[:7])
+
+
+def test_what_is_the_same_in_all_rows_costs_nothing():
+    same = {"star.inertia.zz": [0.3] * 3, "actuators.time_constant": [5e-3] * 3}
+    batch = Batch(LOADED, RK4, parameters=same)
+    assert batch.program == Batch(batch.scenario(0), RK4).program
+
+
+def test_other_values_are_the_same_code():
+    def text(low, high):
+        batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [low, high]})
+        return blocks.batch_source(batch.program, batch.margins, RK4, len(batch.state))
+
+    assert text(0.2, 0.3) == text(0.25, 0.4)
+
+
+def test_commands_are_limited_as_those_of_a_simulation():
+    scene = load_scene("fast_spin")
+    scene = dataclasses.replace(scene, actuators=Actuators(torque_limit=1.0))
+    batch = Batch(scene, RK4, parameters={"actuators.torque_limit": [0.5, 2.0]})
+    asked = (3.0, -1.0, 0.2)
+    np.testing.assert_array_equal(
+        batch.drives(asked, 2)[:3].T, [(0.5, -0.5, 0.2), (2.0, -1.0, 0.2)]
+    )
+
+
+def test_a_singular_start_stops_no_other():
+    """Where det J2 = 0 gamma_dot says nothing of the body rate; rest stays rest."""
+    odd = (210.0, 75.0, 75.0)
+    scene = dataclasses.replace(EXAMPLE2, **IGNORE)
+    of_odd = dataclasses.replace(scene, star=dataclasses.replace(scene.star, alpha_deg=odd))
+    geometry = Geometry.of(of_odd)
+    chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
+    gamma = singularities.parallel(chart).gamma[0]
+    batch = Batch(scene, RK4, parameters={"star.alpha_deg": [odd, scene.star.alpha_deg]})
+    y, code = batch.start(gamma, REST)
+    assert code.tolist() == [0, 0]
+    assert np.all(y[4:7] == 0.0)
+    assert batch.start(gamma, (1.0, 0.0, 0.0))[1].tolist() == [NO_RATE, 0]
+
+
+REFUSED = [
+    ({"star.weight": [1.0]}, r"star.weight = \[1.0\]: unknown key; allowed are alpha_deg, radius"),
+    ({"payload.mass": [1.0]}, "payload.mass = .*: the scene has no payload"),
+    ({"springs[0].rest": [1.0]}, "the scene has 0 springs"),
+    ({"actuated_links[3].mass": [1.0]}, "the scene has 3 actuated_links"),
+    ({"star.inertia": [1.0]}, "must name a number, as star.mass does"),
+    ({"stroke.at_end": [1.0]}, "must name a number, as star.mass does"),
+    ({"base.v[0]": np.ones((2, 3))}, "must name a number, as star.mass does"),
+    ({"base.v": np.eye(3)}, r"must have the shape \(N, 3, 3\), a row a scenario; it has \(3, 3\)"),
+    ({"base.radius": 1.0}, r"must have the shape \(N,\)"),
+    ({"base.radius": []}, r"must have the shape \(N,\)"),
+    ({"star.inertia.zz": ["much"]}, "could not convert string"),
+    ({"star.inertia.zz": [0.3, 0.3], "star.inertia.xx": [0.3]}, r"must have the shape \(2,\)"),
+    (
+        {"actuated_links.mass": [0.0], "actuated_links[1].mass": [0.0]},
+        r"actuated_links\[1\].mass = .*: is given twice",
+    ),
+    (
+        {"star.inertia.zz": [0.3, -1.0]},
+        r"scenario 1: star.inertia = .*: principal moments of inertia must be > 0",
+    ),
+    (
+        {"actuated_links[2].mass": [0.0, -1.0]},
+        r"scenario 1: actuated_links\[2\].mass = -1.0: must be a finite number >= 0 \[kg\]",
+    ),
+    ({"star.inertia.zz": [0.3, np.nan]}, "scenario 1: star.inertia.zz = nan: must be a finite"),
+    ({"actuated_links[0].centre": [(0.0, 0.0, np.nan)]}, r"scenario 0: actuated_links\[0\].centre"),
+    ({"star.alpha_deg": [(120.0, 120.0, 121.0)]}, "scenario 0: star.alpha_deg = .*must sum to 360"),
+    ({"initial.gamma": np.ones((2, 3))}, "initial.gamma = .*: is given to run"),
+    ({"torque.amplitude": np.ones((2, 3))}, "torque.amplitude = .*: acts with profile=True only"),
+    ({"duration": [1.0, 2.0]}, "duration = .*: is nothing that a batch uses"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "said"), REFUSED)
+def test_bad_parameters_are_refused_by_key_and_row(parameters, said):
+    with pytest.raises(InputError, match=f"(?s){said}"):
+        Batch(EXAMPLE2, parameters=parameters)
+
+
+def test_numbers_of_a_term_that_is_left_out_are_held_to_what_is_allowed_too():
+    """Friction of zero is none, but its smoothing is no less wrong."""
+    parameters = {
+        f"friction.beta.{key}": [value, 0.1]
+        for key, value in {"viscous": 0.0, "coulomb": 0.0, "smoothing": -1.0}.items()
+    }
+    said = "scenario 0: friction.beta.smoothing = -1.0: must be a finite number > 0"
+    with pytest.raises(InputError, match=said):
+        Batch(LOADED, parameters=parameters)
+
+
+def test_no_more_than_ten_problems_are_told():
+    with pytest.raises(InputError) as refused:
+        Batch(EXAMPLE2, parameters={"star.inertia.zz": np.full(1000, -1.0)})
+    assert len(refused.value.problems) == 10
+
+
+def test_starts_fit_the_number_of_rows():
+    batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [0.2, 0.3]})
+    with pytest.raises(
+        InputError, match=r"gamma = \(3, 3\): must have the shape \(3,\) or \(2, 3\)"
+    ):
+        batch.start(np.full((3, 3), HOME), REST)
