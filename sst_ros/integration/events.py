@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where inside a step a distance runs out."""
+"""Where inside a step a distance, or the push of an end, runs out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from scipy.optimize import brentq
 
 from sst_ros.limits import Limit
 
 Signal = Callable[[float], float]
+Meeting = tuple[Limit, Signal, Signal]
+"""What is met, a signal that becomes negative there, and the rate of the signal."""
 
 TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
@@ -30,7 +32,7 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
         if not rising:
             leaves = slope(0.0) < 0.0 or margin(h) < -GRAZING  # from rest, the latter
             return 0.0 if margin(0.0) < -GRAZING or leaves else None
-        if margin(h) >= 0.0:
+        if margin(h) >= 0.0 or (margin(h) >= -GRAZING and not falling):
             return None
         # It grew first: the crossing lies behind the top.
         begin = _root(slope, 0.0, h) if falling else 0.0
@@ -43,17 +45,20 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
     return _root(margin, begin, end)
 
 
-def first_met(
-    limits: Sequence[Limit], joints: Callable[[float], Sequence[float]], h: float
-) -> tuple[float, Limit] | None:
-    """Return the limit that is met first in [0, h], and when; `joints` are those at a time."""
+def meetings(limits: Iterable[Limit], joints: Callable[[float], Sequence[float]]) -> list[Meeting]:
+    """Distances to limits, and their rates, where `joints` are those at a time."""
+
+    def meeting(limit: Limit) -> Meeting:
+        return limit, lambda x: limit.margin(joints(x)), lambda x: limit.slope(joints(x))
+
+    return [meeting(limit) for limit in limits]
+
+
+def first_met(signals: Iterable[Meeting], h: float) -> tuple[float, Limit] | None:
+    """Return when in [0, h] the first signal becomes negative, and its limit."""
     met = []
-    for limit in limits:
-        x = first_crossing(
-            lambda x: limit.margin(joints(x)),  # noqa: B023
-            lambda x: limit.slope(joints(x)),  # noqa: B023
-            h,
-        )
+    for limit, margin, slope in signals:
+        x = first_crossing(margin, slope, h)
         if x is not None:
             met.append((x, limit))
     return min(met, key=lambda pair: pair[0]) if met else None

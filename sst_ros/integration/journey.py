@@ -3,21 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sst_ros.errors import ImpactsAccumulate
 from sst_ros.integration import companion, loops
-from sst_ros.integration.events import first_met
+from sst_ros.integration.driven import Driven
+from sst_ros.integration.ends import Ends
+from sst_ros.integration.events import first_met, meetings
 from sst_ros.integration.system import System
 from sst_ros.integration.tableaux import METHODS, Rosenbrock
-from sst_ros.integration.touches import BESIDE, just_beyond, may_touch, touches_of
+from sst_ros.integration.touches import clear_of, just_beyond, may_touch, touches_of
 from sst_ros.integration.walk import CannotStep, Change, Leg, Mark, Walk
 from sst_ros.limits import Limit, limits_of, ranges_of
 from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.compiled import compiled as plain
-from sst_ros.mechanism.contacts import RigidEnds
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene import Scene
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 _IMPACTS_PER_PERIOD = 1000
 _ENDS_PER_PERIOD = 100_000
-_RESTING_RATE = 1e-7
 
 Book = tuple[tuple[Limit, ...], float, int, Mark, Mark]
 
@@ -58,19 +56,16 @@ class Journey:
         self._system = System(dynamics, work=True)
         self._limits = tuple(limits_of(scene, geometry))
         self._kinks = tuple(touches_of(scene, geometry))
-        self._ranges = ranges_of([*self._limits, *map(_clear_of, filter(_is_inner, self._kinks))])
-        self._ends = RigidEnds(dynamics)
-        self._limit = scene.actuators.torque_limit if scene.actuators else None
+        self._ranges = ranges_of([*self._limits, *clear_of(self._kinks)])
+        self._ends = Ends(dynamics, scene.stroke.restitution or 0.0)
+        limit = scene.actuators.torque_limit if scene.actuators else None
+        self._driven = Driven(self._system, limit)
         self._walk = Walk(
             self._system, integrator, tolerance, compiled=compiled, ranges=self._ranges
         )
         explicit = integrator if not isinstance(METHODS.get(integrator), Rosenbrock) else "auto"
         # Torques that are functions, and ends that hold: the slope is put together in Python.
         self._slow = Walk(self._system, explicit, tolerance, compiled=False, slope=self._slope)
-        self._rhs: Callable[..., tuple[float, ...]] | None = None
-        self._torque: Callable[[float], Triple] | None = None
-        self._start = 0.0
-        self._resting: tuple[Limit, ...] = ()
         self._legs, self._lost = 0, 0.0
         self._first = self._book = self._mark()
 
@@ -81,10 +76,10 @@ class Journey:
 
     def _mark(self) -> Book:
         """All that the next steps depend on beside the point at which they begin."""
-        return self._resting, self._lost, self._legs, self._walk.mark(), self._slow.mark()
+        return self._ends.resting, self._lost, self._legs, self._walk.mark(), self._slow.mark()
 
     def _go_back(self, mark: Book) -> None:
-        self._resting, self._lost, self._legs, fast, slow = mark
+        self._ends.resting, self._lost, self._legs, fast, slow = mark
         self._walk.go_back(fast)
         self._slow.go_back(slow)
 
@@ -105,14 +100,7 @@ class Journey:
 
     def limited(self, torque: Triple) -> Triple:
         """Clamp torques to the limit of the actuators."""
-        if self._limit is None:
-            return torque
-        limit, (first, second, third) = self._limit, torque
-        return (
-            min(max(first, -limit), limit),
-            min(max(second, -limit), limit),
-            min(max(third, -limit), limit),
-        )
+        return self._driven.limited(torque)
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
@@ -129,7 +117,7 @@ class Journey:
 
         Returns where the last period ended that was done, and how many were.
         """
-        if self._resting or callable(torque):
+        if self._ends.resting or callable(torque):
             return at, 0
         book, drive = self._mark(), (*self.limited(torque), *more)
         done, (y, z, joints) = self._walk.glide(h, count, (at.y, at.z, at.joints), drive, at.order)
@@ -156,25 +144,27 @@ class Journey:
 
         """
         kept = self._book = self._mark()
-        self._start = self._walk.origin = start
-        self._torque = torque if callable(torque) else None
-        drive = (*((0.0,) * 3 if callable(torque) else self.limited(torque)), *more)
+        self._walk.origin = start
+        drive = (*self._driven.begin(torque, start), *more)
         try:
             x, impacts = 0.0, 0
+            if self._ends.resting:
+                free = self._driven.free(drive)
+                at = self._point(*self._ends.settled(x, at.y, at.z, free), at.order)
             for _ in range(_ENDS_PER_PERIOD):
-                at, x, hit = self._until_limit(at, x, h, drive)
-                if hit is None:
-                    self._release(at, h, drive)
-                    return at
-                if hit in self._kinks:
-                    continue
-                if hit.error is not None:
+                at, x, hit = self._until_met(at, x, h, drive)
+                if hit is not None and hit.error is not None:
                     raise hit.error(hit.reason, start + x, state)
-                impacts += 1
-                if impacts > _IMPACTS_PER_PERIOD:
-                    raise ImpactsAccumulate(hit.reason, start + x, state)
-                at = self._strike(at, hit, x, drive)
-            raise CannotStep(f"elastic ends are met {_ENDS_PER_PERIOD} times in one period")
+                if hit is None or hit in self._ends.resting:
+                    at = self._let_go(at, hit)
+                elif hit not in self._kinks:
+                    impacts += 1
+                    if impacts > _IMPACTS_PER_PERIOD:
+                        raise ImpactsAccumulate(hit.reason, start + x, state)
+                    at = self._strike(at, hit, x, drive)
+                if x >= h:
+                    return at
+            raise CannotStep(f"ends are met or left {_ENDS_PER_PERIOD} times in one period")
         except Exception:
             self._go_back(kept)
             raise
@@ -191,92 +181,70 @@ class Journey:
             self._go_back(now)
             self._book = began
 
-    def _until_limit(
+    def _until_met(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
-        """Go on from x to h, or to the first limit that is met before."""
-        slow = self._torque is not None or bool(self._resting)
-        walk = self._slow if slow else self._walk
+        """Go on from x to h, or to the first limit, kink or release before."""
+        slow = self._driven.by_function or bool(self._ends.resting)
+        walk, free = self._slow if slow else self._walk, self._driven.free(drive)
         for leg in walk.legs(x, h, at.y, at.z, drive, at.order):
             self._legs += 1
-            joints = self._dynamics.joints(*leg.y[:7])
-            if loops.all_far(self._ranges, at.joints, joints):  # type: ignore[no-untyped-call]
-                at = Point(leg.y, leg.z, joints, leg.order)
+            end = self._point(leg.y, leg.z, leg.order)
+            if not self._ends.resting and loops.all_far(self._ranges, at.joints, end.joints):  # type: ignore[no-untyped-call]
+                at = end
                 continue
-            near = [
-                limit
-                for limit in self._limits
-                if limit.may_be_crossed(at.joints, joints) and limit not in self._resting
-            ]
-            near += [kink for kink in self._kinks if may_touch(kink, at.joints, joints)]
-            again = partial(self._part, walk, leg, at, drive)
-            met = first_met(near, lambda x: again(x).joints, leg.h) if near else None  # noqa: B023
+            again = cache(partial(self._part, walk, leg, at, end, drive))
+            signals = meetings(self._near(at, end), lambda x: again(x).joints)  # noqa: B023
+            signals += self._ends.releases(leg.t, leg.h, lambda x: again(x).y, free)  # noqa: B023
+            met = first_met(signals, leg.h)
             if met is not None:
                 x, limit = met
                 if limit in self._kinks:
                     x = just_beyond(limit, x, again(x).joints, leg.h)
                 return again(x), leg.t + x, limit
-            at = Point(leg.y, leg.z, joints, leg.order)
+            at = end
         return at, h, None
 
-    def _part(self, walk: Walk, leg: Leg, at: Point, drive: tuple[float, ...], x: float) -> Point:
-        """Go again from `at`, where a leg began, a part x [s] of it."""
-        y, z, order = walk.retake(leg.t, x, at.y, at.z, drive, at.order)
+    def _near(self, at: Point, end: Point) -> list[Limit]:
+        """Limits and kinks that may be met on a leg."""
+        still = [limit.joint for limit in self._ends.resting]
+        near = [
+            limit
+            for limit in self._limits
+            if limit.joint not in still and limit.may_be_crossed(at.joints, end.joints)
+        ]
+        return near + [kink for kink in self._kinks if may_touch(kink, at.joints, end.joints)]
+
+    def _part(
+        self, walk: Walk, leg: Leg, at: Point, end: Point, drive: tuple[float, ...], x: float
+    ) -> Point:
+        """Go again from `at`, where a leg began that led to `end`, a part x [s] of it."""
+        if x == leg.h:
+            return end
+        return self._point(*walk.retake(leg.t, x, at.y, at.z, drive, at.order))
+
+    def _point(self, y: list[float], z: list[float], order: int) -> Point:
         return Point(y, z, self._dynamics.joints(*y[:7]), order)
 
     def _strike(self, at: Point, limit: Limit, x: float, drive: tuple[float, ...]) -> Point:
-        """Bounce off a limit, or come to rest where the bounce is not worth the name."""
-        # The companion comes to the end a little earlier or later: go there, bounce, come back.
-        z = at.z
-        late = companion.time_to(limit, self._dynamics.joints(*z[:7]))
-        z = companion.moved(z, self._slope(x, *z, *drive), late)
-        restitution = self._scene.stroke.restitution or 0.0
-        if abs(limit.slope(at.joints)) * restitution < _RESTING_RATE:
-            restitution = 0.0
-            self._resting = (*self._resting, limit)
+        """Bounce off a limit or come to rest there, and count the energy that is lost."""
         before = self._kinetic(at.y)
-        y = list(self._ends.after_impact(tuple(at.y), limit.leg, restitution))
-        z = list(self._ends.after_impact(tuple(z), limit.leg, restitution))
-        z = companion.moved(z, self._slope(x, *z, *drive), -late)
+        y, z = self._ends.strike(x, at.y, at.z, limit, self._driven.free(drive))
         self._lost += before - self._kinetic(y)
-        return Point(y, z, self._dynamics.joints(*y[:7]), at.order)
+        return self._point(y, z, at.order)
 
-    def _release(self, at: Point, h: float, drive: tuple[float, ...]) -> None:
-        """Let go of ends that would have to pull."""
-        if self._resting:
-            legs = [limit.leg for limit in self._resting]
-            slope = self._free_slope(h, *at.y, *drive)
-            torques = self._ends.held(tuple(at.y), slope, legs)[1]
-            pushing = zip(self._resting, torques, strict=True)
-            self._resting = tuple(limit for limit, torque in pushing if limit.sign * torque > 0.0)
+    def _let_go(self, at: Point, limit: Limit | None) -> Point:
+        """Let go of an end, or of none; what rests is put exactly where it does."""
+        if not self._ends.resting:
+            return at
+        leaving = () if limit is None else (limit,)
+        return self._point(*self._ends.let_go(at.y, at.z, leaving), at.order)
 
     def _slope(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state under torques that are a function, or held by ends."""
-        slope = self._free_slope(t, *inputs)
-        if not self._resting:
-            return slope
-        legs = [limit.leg for limit in self._resting]
-        return self._ends.held(inputs[: len(self._system.state)], slope, legs)[0]
-
-    def _free_slope(self, t: float, *inputs: Any) -> tuple[float, ...]:
-        if self._rhs is None:
-            self._rhs = plain(self._system.program)
-        if self._torque is not None:
-            size = len(self._system.state)
-            torque = self.limited(self._torque(self._start + t))
-            inputs = (*inputs[:size], *torque, *inputs[size + 3 :])
-        return self._rhs(t, *inputs)
+        free = self._driven.slope(t, *inputs)
+        return self._ends.slope(inputs[: len(self._system.state)], free)
 
     def _kinetic(self, y: list[float]) -> float:
         size = len(self._dynamics.state)
         return self._dynamics.energies(*y[:size], *(0.0,) * len(self._dynamics.drive))[0]
-
-
-def _is_inner(kink: Limit) -> bool:
-    """Whether an elastic end is met by going through this kink."""
-    return (kink.end == 0.0) == (kink.sign > 0.0)
-
-
-def _clear_of(kink: Limit) -> Limit:
-    """Return a limit before which the kink is surely not touched."""
-    return kink._replace(end=kink.end + 4.0 * BESIDE * kink.sign)

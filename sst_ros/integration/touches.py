@@ -35,3 +35,9 @@ def may_touch(kink: Limit, begin: Sequence[float], end: Sequence[float]) -> bool
 def just_beyond(kink: Limit, x: float, joints: Sequence[float], h: float) -> float:
     """Time at which the kink is surely behind, for the Jacobian there must be that of its side."""
     return min(x + min(1e-14 / max(abs(kink.slope(joints)), 1e-200), 1e-3 * h), h)
+
+
+def clear_of(kinks: Sequence[Limit]) -> list[Limit]:
+    """Return limits before which elastic ends are surely not touched."""
+    inner = [kink for kink in kinks if (kink.end == 0.0) == (kink.sign > 0.0)]
+    return [kink._replace(end=kink.end + 4.0 * BESIDE * kink.sign) for kink in inner]

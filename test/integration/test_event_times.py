@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from integration.paper_form import PaperForm
 from loaded_scenes import REST, apart
 from models import inertia_of
-from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque import sine
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
@@ -114,53 +114,6 @@ def admissible():
     return np.array(state.joints.gamma), rotation_matrix(state.quaternion)
 
 
-class PaperForm:
-    """The paper's equations on (q, gamma_dot) under SciPy at its tightest."""
-
-    def __init__(self, scene):
-        self.geometry, self.torque = Geometry.of(scene), sine(scene.torque)
-        self.mechanism = virtual_work.Mechanism.of(scene)
-        state = Simulation(scene).state
-        self.start = np.array([*state.quaternion, *state.joints.gamma_dot])
-
-    def posture(self, y):
-        rotation = rotation_matrix(y[:4] / np.linalg.norm(y[:4]))
-        gamma = kinematics.inverse(self.geometry, rotation)[0]
-        return virtual_work.posture(self.geometry, gamma, rotation)
-
-    def slope(self, t, y):
-        at = self.posture(y)
-        answer = virtual_work.direct_dynamics(self.mechanism, at, y[4:], self.torque(t))
-        spin = at.j @ y[4:]
-        vector, scalar = y[:3], y[3]
-        turning = [*(scalar * spin + np.cross(spin, vector)), -spin @ vector]
-        return np.concatenate([0.5 * np.array(turning), answer])
-
-    def inertia(self, y):
-        """M = -T1 of the paper."""
-        return -virtual_work.equation_of_motion(self.mechanism, self.posture(y), y[4:])[0]
-
-    def travelled(self, begin, end, y):
-        found = solve_ivp(self.slope, (begin, end), y, method="DOP853", rtol=2.3e-14, atol=1e-14)
-        return found.t, found.y
-
-    def first_end(self, begin, y, span):
-        """Time, leg and state of the first end that is met: Newton's method by whole solutions."""
-        times, states = self.travelled(begin, begin + span, y)
-        for i in range(1, len(times)):
-            gamma = self.posture(states[:, i]).gamma
-            outside = np.flatnonzero((gamma < 0.0) | (gamma > self.geometry.arc))
-            if len(outside):
-                leg = int(outside[0])
-                end = 0.0 if gamma[leg] < 0.0 else self.geometry.arc[leg]
-                t, at = times[i], states[:, i]
-                for _ in range(4):
-                    t -= (self.posture(at).gamma[leg] - end) / at[4 + leg]
-                    at = self.travelled(times[i - 1], t, states[:, i - 1])[1][:, -1]
-                return t, leg, at
-        raise AssertionError("no end is met")
-
-
 def test_impacts_come_when_the_papers_equations_have_them(monkeypatch):
     scene = load("impacts")
     struck, strike = [], Journey._strike
@@ -173,13 +126,15 @@ def test_impacts_come_when_the_papers_equations_have_them(monkeypatch):
     simulation = Simulation(scene, "dop853", tolerance=1e-14)
     while len(struck) < 2:
         simulation.step(sine(scene.torque), 10 * MILLISECOND)
-    paper, t, y = PaperForm(scene), 0.0, None
+    paper = PaperForm(scene, sine(scene.torque))
+    ends = [(leg, upper, paper.end(leg, upper)) for leg in range(3) for upper in (False, True)]
+    t, y = 0.0, paper.start
     for time, leg in struck:
-        t, hit, y = paper.first_end(t, paper.start if y is None else y, 1.0)
+        t, y = paper.first_zero(lambda t, y: min(end(t, y) for *_, end in ends), t, y, t + 0.95)
+        hit = min(ends, key=lambda end: end[2](t, y))[0]
         assert hit == leg
         assert abs(time - t) < 1e-12
-        impulse = np.linalg.solve(paper.inertia(y), np.eye(3)[leg])
-        y[4:] -= (1.0 + scene.stroke.restitution) * y[4 + leg] / impulse[leg] * impulse
+        y = paper.struck(y, leg, scene.stroke.restitution)
 
 
 def contact_time(stiffness):

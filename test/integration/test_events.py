@@ -46,3 +46,8 @@ def test_pushed_from_rest_through_an_end_is_a_crossing_at_once():
 
 def test_rest_at_an_end_is_no_crossing():
     assert crossing(lambda t: -1e-16, lambda t: 0.0, 1.0) is None
+
+
+def test_rounding_on_the_way_inwards_is_no_crossing():
+    """What has just left an end at almost no rate is off it by less than an angle's rounding."""
+    assert crossing(lambda t: 1e-14 * t - 1e-16, lambda t: 1e-14, 1e-3) is None

@@ -2,6 +2,7 @@
 """Impacts and rest at rigid ends of the stroke, against momentum and the paper's T1."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from sst_ros import Simulation, load_scene
 from sst_ros.control.torque import sine
 from sst_ros.errors import ImpactsAccumulate
 from sst_ros.integration import journey
-from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.contacts import RigidEnds
+from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.terms import Friction, Initial, JointFriction, Stroke, Workspace
 
 MILLISECOND = 1_000_000
@@ -54,6 +56,60 @@ def test_held_actuators_do_not_accelerate_and_others_feel_only_the_coupling(samp
     scale = np.abs(sample.torque).max() + np.abs(push).max()
     assert np.abs(gamma_ddot[[0, 2]]).max() <= 1e-11 * np.abs(gamma_ddot).max()
     assert expected - np.array(torque) == pytest.approx([push[0], 0.0, push[1]], abs=1e-11 * scale)
+
+
+ALL_SIGNS = list(itertools.product((1.0, -1.0), repeat=3))
+
+
+def complementary(impulse, motion, inward):
+    """Ends push or their actuators leave: never both, never neither, never the other way."""
+    for leg, sign in inward.items():
+        pushes, leaves = sign * impulse[leg], sign * motion[leg]
+        assert min(pushes, leaves) > -1e-11
+        assert min(abs(pushes), abs(leaves)) < 1e-11
+
+
+@pytest.mark.parametrize("signs", ALL_SIGNS)
+@pytest.mark.parametrize("sample", seeded_samples(13, 4))
+def test_ends_hold_what_they_push_and_leave_what_they_would_pull(sample, signs):
+    dynamics = Dynamics(sample.scene)
+    ends, inward = RigidEnds(dynamics), dict(enumerate(signs))
+    still = dataclasses.replace(sample, gamma_dot=np.zeros(3))
+    torque = tuple(sample.torque.tolist())
+    slope = dynamics.derivative(*still.state, *torque)
+    legs = ends.holding(still.state, slope, inward)
+    held = ends.held(still.state, slope, legs)[0] if legs else slope
+    at = still.posture
+    gamma_ddot = np.linalg.solve(at.j, still.rotation @ np.array(held[4:]))
+    needed = virtual_work.inverse_dynamics(still.mechanism, at, np.zeros(3), gamma_ddot)
+    complementary(needed - np.array(torque), gamma_ddot, inward)
+
+
+@pytest.mark.parametrize("signs", ALL_SIGNS)
+@pytest.mark.parametrize("sample", seeded_samples(14, 4))
+def test_an_impact_presses_on_what_rests_or_tears_it_off(sample, signs):
+    """The actuator of leg 0 comes to its end; the others rest against theirs."""
+    ends, inward = RigidEnds(Dynamics(sample.scene)), dict(enumerate(signs))
+    coming = dataclasses.replace(sample, gamma_dot=np.array([-signs[0], 0.0, 0.0]))
+    legs = ends.kicked(coming.state, 0, inward)
+    assert legs[0] == 0
+    after = actuator_rates(sample, ends.after_impact(coming.state, 0, 0.0, legs[1:])[4:])
+    mass = -virtual_work.equation_of_motion(sample.mechanism, sample.posture, after)[0]
+    complementary(mass @ (after - coming.gamma_dot), after, inward)
+
+
+@pytest.mark.parametrize("sample", seeded_samples(15, 4))
+def test_what_has_drifted_off_its_end_is_put_back(sample):
+    ends = RigidEnds(Dynamics(sample.scene))
+    wanted = {0: sample.gamma[0] + 1e-6, 2: sample.gamma[2] - 1e-6}
+    state = ends.with_rates(ends.with_angles(sample.state, wanted), {1: 0.5})
+    rotation = rotation_matrix(np.array(state[:4]))
+    gamma = kinematics.inverse(sample.geometry, rotation)[0]
+    assert gamma[[0, 2]] == pytest.approx(list(wanted.values()), abs=1e-15)
+    assert abs(gamma[1] - sample.gamma[1]) < 1e-5
+    at = virtual_work.posture(sample.geometry, gamma, rotation)
+    rate = np.linalg.solve(at.j, rotation @ np.array(state[4:]))
+    assert rate[1] == pytest.approx(0.5, abs=1e-13)
 
 
 def near_the_end(**stroke):
