@@ -27,30 +27,37 @@ def series(task: Task, quick: bool) -> list[Series]:
     found = []
     for name, (tableau, first, last) in METHODS.items():
         found.append(_series(task, f"{name}, numba", tableau, True, ladder(first, last, factor)))
-    found.append(_collocation(task))
+    found += [_collocation(task, nodes) for nodes in (8, 12)]
     plain = ladder(5, 80, 2.0 if quick else 1.3)
     return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
 
 
-def _collocation(task: Task) -> Series:
-    """Few long steps; how often each is iterated is part of the setting."""
-    method = Collocation(task.system)
-    start = np.array(task.start)
+def _collocation(task: Task, nodes: int) -> Series:
+    """Few long steps; how often each is iterated is part of the setting.
+
+    Numbers are laid out before, as MuJoCo's and Pinocchio's data are; `fly` is the whole second,
+    from the start, torques at all nodes included, in one call from Python.
+    """
+    method = Collocation(task.system, nodes)
 
     def acceleration(at: Moving) -> np.ndarray:
         return task.kernel_answer(at.y, at.torque)
 
     def setting(steps: int, iterations: int) -> Setting:
-        def whole() -> list[float]:
-            return method.march(0.0, DURATION / steps, steps, start, iterations=iterations).y
+        def prepare() -> Run:
+            course = method.course(0.0, DURATION / steps, steps, task.start, iterations=iterations)
 
-        return Setting(
-            f"{steps} steps of {iterations} iterations", steps * iterations,
-            lambda: Run(whole, lambda pieces: [task.pose_of(whole())]), samples=False,
-        )  # fmt: skip
+            def poses(pieces: int) -> list[Pose]:
+                course.fly()
+                return [task.pose_of(course.end)]
 
-    settings = [setting(n, m) for n in range(4, 13) for m in range(1, 8)]
-    name = "Gauss collocation, order 16, numba"
+            return Run(course.fly, poses)
+
+        label = f"{steps} steps of {iterations} iterations"
+        return Setting(label, steps * iterations, prepare, samples=False)
+
+    settings = [setting(n, m) for n in range(2, 13) for m in range(1, 9)]
+    name = f"Gauss collocation, order {2 * nodes}, numba"
     return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)
 
 

@@ -41,7 +41,7 @@ longer take the engines:
 {floor}
 
 A ratio beyond a peer's in this table cannot be had by evaluations one at a time. The collocation
-of sst_ros evaluates eight at once, by SIMD, and iterates.
+of sst_ros evaluates eight or twelve at once, by SIMD, and iterates.
 
 ## By method
 
@@ -84,6 +84,13 @@ is not timed.
   most would write first, not what SciPy can do with a compiled right-hand side. With the state
   (γ, γ̇) it solves the direct kinematics for all eight assemblies at every evaluation, as the paper
   says; with (q, γ̇) it need not.
+- **What is laid out before.** Every engine has its data ready, and its clock begins at the start:
+  MuJoCo's `mjData`, Pinocchio's arrays and views, the `Course` of our collocation (its coefficients
+  times the step; `fly()` is what is clocked, one call from Python, some 0.1 us of its time).
+  Torques are evaluated while the clock runs, on all engines but for MuJoCo's rollout.
+- **Rounding.** Collocation alone is compiled with fused multiply-adds and shared reciprocals, so
+  its last digits are not those of plain Python. Its sines are arithmetic (`integration.sines`):
+  a call of the library would end SIMD.
 - **Not in the times:** compiling (numba, first call: some seconds, then from a cache), building
   models, and turning the end state into an orientation.
 - **The machine** was not idle, so times are of the processor (of all threads of the process), not

@@ -54,7 +54,7 @@ from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
 import numba
 import numpy as np
 
-jit = numba.njit(cache={cache}, error_model="numpy", nogil={nogil})
+jit = numba.njit(cache={cache}, error_model="numpy", nogil={nogil}{more})
 
 @jit
 def vector(n):
@@ -68,6 +68,8 @@ def square(n):
 def rows(m, n):
     return np.zeros((m, n))
 """
+
+_FREE_ROUNDING = ', fastmath={"arcp", "contract"}'
 
 
 def numba_version() -> str | None:
@@ -122,15 +124,25 @@ def source(
 
 
 def load(
-    texts: list[str], constants: dict[str, Any], *, numba: bool, nogil: bool = False
+    texts: list[str],
+    constants: dict[str, Any],
+    *,
+    numba: bool,
+    nogil: bool = False,
+    rounding: bool = True,
 ) -> ModuleType:
-    """Turn function texts into a module, for the interpreter or compiled by numba."""
+    """Turn function texts into a module, for the interpreter or compiled by numba.
+
+    Without `rounding` as written, the compiler may multiply and add in one, and multiply by one
+    reciprocal instead of dividing by the same number several times.
+    """
     if not numba:
         named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
         return _executed("\n".join([_PLAIN, named, *texts]), "sst_ros_plain")
-    path = _cached_file(_for_numba(texts, constants, nogil=nogil))
+    more = "" if rounding else _FREE_ROUNDING
+    path = _cached_file(_for_numba(texts, constants, nogil=nogil, more=more))
     if path is None:
-        head = _NUMBA.format(cache=False, nogil=nogil)
+        head = _NUMBA.format(cache=False, nogil=nogil, more=more)
         return _executed(head + _body(texts, constants), "sst_ros_compiled")
     return _imported(path)
 
@@ -185,8 +197,10 @@ def has_code(texts: list[str], constants: dict[str, Any], functions: Sequence[st
     return all(any(cached.glob(f"{path.stem}.{name}-*.nbi")) for name in functions)
 
 
-def _for_numba(texts: list[str], constants: dict[str, Any], *, nogil: bool = False) -> str:
-    return _NUMBA.format(cache=True, nogil=nogil) + _body(texts, constants)
+def _for_numba(
+    texts: list[str], constants: dict[str, Any], *, nogil: bool = False, more: str = ""
+) -> str:
+    return _NUMBA.format(cache=True, nogil=nogil, more=more) + _body(texts, constants)
 
 
 def _body(texts: list[str], constants: dict[str, Any]) -> str:

@@ -4,8 +4,8 @@
 A step puts a polynomial through the accelerations at the Gauss nodes (order 2 s with s nodes). Its
 equations are solved by iteration (Picard; van der Houwen & Sommeijer, J. Comput. Appl. Math. 29
 (1990) 111-127): all s accelerations are evaluated at once, which costs a compiler with SIMD little
-more than one. An iteration takes rates from accelerations, then turns the quaternion with these
-rates, then evaluates. It begins with the polynomial of the step before, continued.
+more than one. The first evaluation of a step is at the state of its beginning, where only time
+differs from lane to lane. Steps know nothing of each other.
 
 For motions that are smooth over long steps, as under torques that are functions of time in a
 scene; not for stiff scenes, nor for torques that jump, nor for ends.
@@ -13,14 +13,16 @@ scene; not for stiff scenes, nor for torques that jump, nor for ends.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from sst_ros.integration import backend
-from sst_ros.integration.lanes import Layout, indented, loop, split
+from sst_ros.errors import InputError, Problem
+from sst_ros.integration import backend, picard
 from sst_ros.integration.system import System
 from sst_ros.mechanism.geometry import Array
 
@@ -41,6 +43,40 @@ class Flight(NamedTuple):
     change: float
 
 
+class Course:
+    """A stretch of motion whose numbers are laid out once, to be flown as often as one likes.
+
+    Attributes:
+        fly: go from the beginning to the end; returns the change of `Flight`, infinite where the
+            motion has no finite end. It takes no argument and allocates nothing.
+
+    """
+
+    def __init__(self, march: Callable[[Any], float], block: Any, at: picard.Places) -> None:
+        self._block, self._at = block, at
+        self.fly: Callable[[], float] = partial(march, block)
+
+    def begin(self, t: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
+        """Say where `fly` begins: time [s], state, and a drive that is constant.
+
+        Raises:
+            InputError: there are more or fewer numbers than in the system's state and drive.
+
+        """
+        place = self._at.begin
+        wanted, found = place.stop - place.start - 1, len(y) + len(d)
+        if found != wanted:
+            told = f"state and drive must have {wanted} numbers"
+            raise InputError("collocation", [Problem("y, d", found, told)])
+        for number, value in enumerate((t, *y, *d), start=place.start):
+            self._block[number] = value
+
+    @property
+    def end(self) -> list[float]:
+        """State where the last flight ended."""
+        return [float(value) for value in self._block[self._at.end]]
+
+
 class Collocation:
     """Motions of a system by Gauss collocation with steps of one length.
 
@@ -49,20 +85,25 @@ class Collocation:
         nodes: of a step; the order is twice as many.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
 
+    Raises:
+        InputError: nodes is less than 1.
+
     """
 
     def __init__(self, system: System, nodes: int = NODES, *, compiled: bool = True) -> None:
+        _refuse(nodes=nodes)
         self._compiled = compiled and backend.numba_version() is not None
-        self._module = backend.load([collocation_source(system, nodes)], {}, numba=self._compiled)
-        self._vector: Callable[[Sequence[float]], Any] = np.array if self._compiled else list
-        self._tables = self._vector(tables(nodes).ravel().tolist())
-        self._none = self._vector([0.0])
+        self._nodes = nodes
+        self._at = picard.places(system, nodes)
+        self._module = backend.load(
+            picard.source(system, nodes), {}, numba=self._compiled, rounding=False
+        )
 
-    def march(
+    def course(
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
         *, iterations: int = 5,
-    ) -> Flight:  # fmt: skip
-        """Go on from t by `count` steps of h.
+    ) -> Course:  # fmt: skip
+        """Lay out `count` steps of h from t.
 
         Args:
             t: time [s].
@@ -70,111 +111,69 @@ class Collocation:
             count: number of steps.
             y: state.
             d: drive, constant.
-            iterations: evaluations of all nodes a step; the first step takes two more.
+            iterations: evaluations of all nodes a step.
+
+        Raises:
+            InputError: count or iterations is less than 1.
 
         """
-        new, drive = self._vector(y), self._vector(d) if d else self._none
-        change = self._module.march(t, h, count, iterations, new, drive, self._tables)
-        return Flight(new.tolist() if self._compiled else new, change)
+        _refuse(count=count, iterations=iterations)
+        at, block = self._at, _aligned(self._at.numbers)
+        block[at.counts] = count, iterations, h
+        block[at.tables] = h * tables(self._nodes).ravel()
+        numbers = block if self._compiled else block.tolist()
+        march = _direct(self._module.march) if self._compiled else self._module.march
+        course = Course(march, numbers, at)
+        course.begin(t, y, d)
+        return course
+
+    def march(
+        self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
+        *, iterations: int = 5,
+    ) -> Flight:  # fmt: skip
+        """Go on from t by `count` steps of h, see `course`.
+
+        Raises:
+            ArithmeticError: the motion has no finite end.
+
+        """
+        course = self.course(t, h, count, y, d, iterations=iterations)
+        change = course.fly()
+        if not math.isfinite(change):
+            raise ArithmeticError(f"{count} steps of {h:g} s from t = {t:g} s end nowhere finite")
+        return Flight(course.end, change)
 
 
 def tables(nodes: int) -> Array:
-    """Rows: nodes, weights, then columns of A, then of the continuation.
+    """Rows: nodes, weights, then columns of A.
 
-    A integrates the polynomial through the nodes from 0 to each node; the continuation gives its
-    values one step later.
+    A integrates the polynomial through the nodes from 0 to each node.
     """
     x, w = legendre.leggauss(nodes)
     inverse = np.linalg.inv(legendre.legvander(x, nodes - 1))
     basis = [legendre.Legendre.basis(k) for k in range(nodes)]
     integrals = np.stack([p.integ(lbnd=-1)(x) / 2.0 for p in basis], axis=1) @ inverse
-    later = legendre.legvander(x + 2.0, nodes - 1) @ inverse
-    return np.vstack([(x + 1.0) / 2.0, w / 2.0, integrals.T, later.T])
+    return np.vstack([(x + 1.0) / 2.0, w / 2.0, integrals.T])
 
 
-def collocation_source(system: System, nodes: int) -> str:
-    """Text of `march(t, h, count, iterations, y, d, tables)`: y becomes the state at the end."""
-    size, inputs = len(system.state), len(system.program.inputs)
-    fixed = [True, *(False,) * size, *(True,) * len(system.drive)]
-    before, after, results = split(system.program, fixed)
-    _, turn, turned = split(system.program.first(4), fixed)
-    early = [line.split(" = ")[0] for line in before]
-    at = Layout(
-        nodes, node=1, weight=1, a=nodes, later=nodes, early=max(1, len(early)), s=size, f=size,
-        old=size,
-    )  # fmt: skip
+def _direct(function: Any) -> Callable[[Any], float]:
+    """Machine code for one array: numba then need not look at the argument in each call."""
+    import numba
 
-    def applied(matrix: str, row: int) -> str:
-        """Lane i of a matrix times a row of values that are read."""
-        return " + ".join(f"{at.lane(matrix, k)} * g{row}_{k}" for k in range(nodes))
-
-    def read(values: str, rows: range) -> list[str]:
-        """Lines that read what is the same for all lanes, before a loop, for it to be SIMD."""
-        return [f"g{j}_{k} = {at.lane(values, j, k)}" for j in rows for k in range(nodes)]
-
-    def integrated(rows: range) -> list[str]:
-        """Texts of the state at the nodes, from the slopes that are read."""
-        return [f"y{j} + h * ({applied('a', j)})" for j in rows]
-
-    rates, quaternion, everything = range(4, size), range(4), range(size)
-    loaded = [f"u{1 + j} = {at.lane('s', j)}" for j in everything]
-    moved = [f"{at.lane('s', 4 + j)} = {text}" for j, text in enumerate(integrated(rates))]
-    tried = [f"u{1 + j} = {text}" for j, text in enumerate(integrated(quaternion))]
-    stores = [f"{at.lane('f', j)} = {result}" for j, result in enumerate(turned)]
-    prepared = [
-        *read("f", rates),
-        *loop(at, moved),
-        *read("f", quaternion),
-        *loop(at, [*tried, *loaded[4:], *turn, *stores]),
-    ]
-    evaluated = [
-        *read("f", quaternion),
-        *loop(
-            at,
-            [
-                *(f"{at.lane('old', j)} = {at.lane('f', j)}" for j in rates),
-                *(f"{name} = {at.lane('early', r)}" for r, name in enumerate(early)),
-                *tried,
-                *loaded[4:],
-                *after,
-                *(f"{at.lane('f', j)} = {result}" for j, result in enumerate(results)),
-            ],
-        ),
-    ]
-    kept = [f"{at.lane('early', r)} = {name}" for r, name in enumerate(early)]
-    copied = [f"{at.lane('old', j)} = {at.lane('f', j)}" for j in everything]
-    continued = [f"{at.lane('f', j)} = {applied('later', j)}" for j in everything]
-    changes = [_weighted(at, "({f} - {old})", j) for j in range(4, 7)]
-    lines = [
-        "def march(t, h, count, iterations, y, d, tables):",
-        f"    block = vector({at.numbers})",
-        f"    for i in range({(2 + 2 * nodes) * nodes}):",
-        "        block[i] = tables[i]",
-        *(f"    y{j} = y[{j}]" for j in everything),
-        *(f"    u{i} = d[{i - 1 - size}]" for i in range(1 + size, inputs)),
-        "    worst = 0.0",
-        "    for step in range(count):",
-        "        begin = t + step * h",
-        *indented(8, loop(at, [f"u0 = begin + {at.lane('node')} * h", *before, *kept])),
-        "        if step > 0:",
-        *indented(12, [*loop(at, copied), *read("old", everything), *loop(at, continued)]),
-        "        for iteration in range(iterations if step > 0 else iterations + 2):",
-        *indented(12, [*prepared, *evaluated]),
-        *indented(8, prepared),
-        *(f"        worst = max(worst, abs(h * ({change})))" for change in changes),
-        *(f"        y{j} = y{j} + h * ({_weighted(at, '{f}', j)})" for j in everything),
-        "        factor = 1.0 / sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)",
-        *(f"        y{j} = y{j} * factor" for j in quaternion),
-        *(f"    y[{j}] = y{j}" for j in everything),
-        "    return worst",
-    ]
-    return "\n".join(lines) + "\n"
+    signature = (numba.types.Array(numba.float64, 1, "C"),)
+    function.compile(signature)
+    found: Callable[[Any], float] = function.get_overload(signature)
+    return found
 
 
-def _weighted(at: Layout, text: str, row: int) -> str:
-    """Sum over the nodes of weights times a text about rows f and old."""
-    return " + ".join(
-        f"{at.lane('weight', 0, k)} * "
-        + text.format(f=at.lane("f", row, k), old=at.lane("old", row, k))
-        for k in range(at.lanes)
-    )
+def _aligned(count: int) -> Array:
+    """Return zeros whose address is that of a cache line, as no register then lies across two."""
+    numbers = np.zeros(count + 8)
+    first = -(numbers.ctypes.data // 8) % 8
+    return numbers[first : first + count]
+
+
+def _refuse(**counts: int) -> None:
+    problems = [Problem(name, n, "must be at least 1") for name, n in counts.items() if n < 1]
+    if problems:
+        raise InputError("collocation", problems)

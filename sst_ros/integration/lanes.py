@@ -30,6 +30,10 @@ class Layout:
         self.lanes = lanes
         self.numbers = ends[-1] * lanes
 
+    def first(self, group: str) -> int:
+        """Return where a group begins."""
+        return self._first[group] * self.lanes
+
     def lane(self, group: str, row: int = 0, lane: str | int = "i") -> str:
         """Return a lane of a row."""
         first = (self._first[group] + row) * self.lanes

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
 from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque import sine
+from sst_ros.errors import InputError
 from sst_ros.integration.collocation import Collocation, tables
+from sst_ros.integration.sines import flat_sin
 from sst_ros.integration.system import System
 from sst_ros.mechanism import kernel
 from sst_ros.mechanism.compiled import Dynamics
@@ -24,15 +27,13 @@ STATE = [*START.quaternion, *START.body_rate]
 
 
 @pytest.mark.parametrize("nodes", [2, 4, 8])
-def test_tables_integrate_and_continue_all_polynomials_that_they_can(nodes):
+def test_tables_integrate_all_polynomials_that_they_can(nodes):
     rows = tables(nodes)
-    c, b, a, later = rows[0], rows[1], rows[2 : 2 + nodes].T, rows[2 + nodes :].T
+    c, b, a = rows[0], rows[1], rows[2:].T
     for power in range(2 * nodes):
         assert b @ c**power == pytest.approx(1.0 / (power + 1), abs=1e-14)
     for power in range(nodes):
         np.testing.assert_allclose(a @ c**power, c ** (power + 1) / (power + 1), atol=1e-14)
-        # Continued over a step, rounding grows with the numbers: up to 2^power, and the basis.
-        np.testing.assert_allclose(later @ c**power, (1.0 + c) ** power, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +55,12 @@ def apart(y, truth):
 
 
 @pytest.mark.parametrize(
-    ("steps", "iterations", "error"), [(6, 3, 1e-6), (7, 5, 1e-9), (9, 6, 1e-12)]
+    ("nodes", "steps", "iterations", "error"),
+    [(8, 3, 5, 1e-6), (8, 6, 6, 1e-9), (12, 3, 6, 1e-9), (12, 5, 8, 1e-12)],
 )
-def test_a_second_of_example_2_in_a_few_steps(truth, steps, iterations, error):
+def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, error):
     system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
-    method = Collocation(system, compiled=False)
+    method = Collocation(system, nodes, compiled=False)
     flight = method.march(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
     assert apart(flight.y, truth) < error
     assert math.dist(flight.y[4:], truth[4:]) < 10.0 * error
@@ -78,12 +80,54 @@ def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
     assert math.log2(coarse / fine) == pytest.approx(2 * nodes, abs=0.1)
 
 
-def test_numba_has_the_digits_of_plain_python(tmp_path, monkeypatch):
-    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+@pytest.fixture(scope="module")
+def methods(tmp_path_factory):
+    """The same method compiled and plain."""
     system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
-    compiled, plain = (Collocation(system, compiled=c) for c in (True, False))
-    one, other = (m.march(0.1, 0.1, 5, STATE, iterations=4) for m in (compiled, plain))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        compiled = Collocation(system, 4)
+        compiled.march(0.0, 0.1, 1, STATE)
+    return {"compiled": compiled, "plain": Collocation(system, 4, compiled=False)}
+
+
+def test_numba_has_the_digits_of_plain_python(methods):
+    """All but the last: compiled code may multiply and add in one."""
+    one, other = (m.march(0.1, 0.1, 5, STATE, iterations=4) for m in methods.values())
     np.testing.assert_allclose(one.y, other.y, rtol=0, atol=1e-14)
+    assert one.change == pytest.approx(other.change, rel=1e-9)
+
+
+@pytest.mark.parametrize("way", ["compiled", "plain"])
+def test_a_course_is_flown_again_and_again_and_from_elsewhere(truth, methods, way):
+    course = methods[way].course(0.0, 0.025, 20, STATE, iterations=6)
+    changes = [course.fly() for _ in range(3)]
+    assert changes == [changes[0]] * 3
+    course.begin(0.5, course.end)
+    course.fly()
+    assert apart(course.end, truth) < 1e-9
+
+
+@pytest.mark.parametrize("way", ["compiled", "plain"])
+def test_what_cannot_be_flown_is_refused(methods, way):
+    with pytest.raises(InputError, match="nodes"):
+        Collocation(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), 0)
+    method = methods[way]
+    with pytest.raises(InputError, match=r"count(.|\n)*iterations"):
+        method.course(0.0, 0.1, 0, STATE, iterations=0)
+    with pytest.raises(InputError, match="must have 7 numbers"):
+        method.course(0.0, 0.1, 1, STATE, [0.0, 0.0, 0.0])
+    with pytest.raises(ArithmeticError):
+        method.march(0.0, math.inf, 1, STATE)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9, 1e14])
+def test_the_flat_sine_is_the_sine(scale):
+    rng = np.random.default_rng(5)
+    for x in [*rng.uniform(-scale, scale, 500), *(k * math.pi / 4.0 for k in range(-9, 10))]:
+        sine_of_x = float(mpmath.sin(mpmath.mpf(float(x))))
+        within = 2.0 * max(math.ulp(sine_of_x), 0.5 * math.ulp(x) * (abs(x) > 1e6))
+        assert abs(flat_sin(float(x)) - sine_of_x) <= within
 
 
 def test_every_term_lag_and_a_drive_are_carried_along():
