@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -82,9 +83,9 @@ def held_against_single_ticks(name, ticks, glided, *, compiled):
     glided.clear()
     for at_once in (20, 60):
         assert run(scene, at_once, ticks, compiled=compiled, **how) == one
-    if name in ("example2", "rk4"):
+    if name in ("example2", "loaded", "rk4"):
         assert (60, 60) in glided
-    if name in ("loaded", "impacts", "elastic"):
+    if name in ("impacts", "elastic"):
         assert any(0 < done < count for count, done in glided)
     return one
 
@@ -114,6 +115,22 @@ def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
         ends.append((told(simulation), caught.value.time))
     assert ends[0] == ends[1]
     assert ends[0][0][0].time_ns % (50 * MILLISECOND)
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_numba)])
+def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside(compiled):
+    scene = replace(
+        load("example2"),
+        initial=Initial(gamma=(math.pi / 2 - 0.005, 0.4, 1.0), gamma_dot=(0.5, 0.0, 0.0)),
+        workspace=Workspace(at_edge="ignore"),
+    )
+    fine = Simulation(scene, "dop853", compiled=compiled)
+    with pytest.raises(StrokeExceeded) as expected:
+        fine.steps((-10.0, 0.0, 0.0), MILLISECOND, 45)
+    whole = Simulation(scene, "dop853", tolerance=1e-6, compiled=compiled)
+    with pytest.raises(StrokeExceeded) as found:
+        whole.step((-10.0, 0.0, 0.0), 45 * MILLISECOND)
+    assert found.value.time == pytest.approx(expected.value.time, abs=1e-6)
 
 
 def test_a_state_within_ticks_that_were_done_at_once_is_on_the_way():

@@ -190,7 +190,8 @@ class Journey:
         for leg in walk.legs(x, h, at.y, at.z, drive, at.order):
             self._legs += 1
             end = self._point(leg.y, leg.z, leg.order)
-            if not self._ends.resting and loops.all_far(self._ranges, at.joints, end.joints):  # type: ignore[no-untyped-call]
+            far = loops.all_far(self._ranges, at.joints, end.joints, leg.h)  # type: ignore[no-untyped-call]
+            if far and not self._ends.resting:
                 at = end
                 continue
             again = cache(partial(self._part, walk, leg, at, end, drive))

@@ -87,7 +87,7 @@ def glide(count, h, tolerance, y, z, d, ranges, joints, sizes):
         if not size <= tolerance:
             return k
         joints_of(new_y, found)
-        if not all_far(ranges, joints, found):
+        if not all_far(ranges, joints, found, h):
             return k
         for i in range(SIZE):
             y[i] = new_y[i]
@@ -98,14 +98,21 @@ def glide(count, h, tolerance, y, z, d, ranges, joints, sizes):
     return count
 
 
-def all_far(ranges, begin, end):
-    """Say quickly that no limit may have been crossed: inside at both ends, no rate turned."""
+def all_far(ranges, begin, end, h):
+    """Say quickly that no limit may have been crossed in h.
+
+    That is so where a joint is inside before and after, and its rate has not turned, or the joint
+    is farther from the limits than it would come in ten times h.
+    """
     for row in ranges:
         joint = int(row[0])
         if not (row[1] < begin[joint] < row[2] and row[1] <= end[joint] <= row[2]):
             return False
         if begin[joint + 9] * end[joint + 9] < 0.0:
-            return False
+            way = 10.0 * h * max(abs(begin[joint + 9]), abs(end[joint + 9]))
+            least, most = min(begin[joint], end[joint]), max(begin[joint], end[joint])
+            if not (row[1] + way < least and most < row[2] - way):
+                return False
     return True
 
 
