@@ -17,7 +17,6 @@ from pathlib import Path
 from sst_ros import scene
 from sst_ros.control.motions import motion_of
 from sst_ros.errors import SstError
-from sst_ros.integration import backend
 from sst_ros.report import tracking_run
 from sst_ros.report.run import report
 from sst_ros.report.table import table
@@ -71,18 +70,13 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
         SstError: a node failed or did not end in time; says which.
 
     """
-    with _node("recorder", output=str(bag)) as recorder:
-        run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
-        with _node("simulator", publish_rate=CONTROL_RATE, **run) as simulator:
-            _wait_until_ready(recorder)
-            followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
-            followed |= {"stamped": True, "feedforward_at": "middle"}
-            waits = {"wait_for_subscribers": 2, "wait_for_recorder": True}
-            with _node("inverse_dynamics", **followed, **waits) as companion:
-                _wait_for_end("inverse_dynamics", companion, 20.0 * seconds + _END_S)
-                _wait_for_end("simulator", simulator, _END_S)
-        recorder.send_signal(signal.SIGINT)
-        _wait_for_end("recorder", recorder, _END_S)
+    run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
+    with _recorded(bag, publish_rate=CONTROL_RATE, **run):
+        followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
+        followed |= {"stamped": True, "feedforward_at": "middle"}
+        waits = {"wait_for_subscribers": 2, "wait_for_recorder": True}
+        with _node("inverse_dynamics", **followed, **waits) as companion:
+            _wait_for_end("inverse_dynamics", companion, 20.0 * seconds + _END_S)
 
 
 def record(name: str, bag: Path) -> None:
@@ -93,14 +87,21 @@ def record(name: str, bag: Path) -> None:
 
     """
     duration = scene.load(name).duration or 1.0
+    with (
+        _recorded(bag, scene=name, wait_for_command=True, duration=duration),
+        _node("torque_player", scene=name, wait_for_subscribers=2) as player,
+    ):
+        _wait_for_end("torque_player", player, duration + _END_S)
+
+
+@contextmanager
+def _recorded(bag: Path, **run: object) -> Iterator[None]:
+    """Record a run of the simulator, which ends by itself after what the block does."""
     with _node("recorder", output=str(bag)) as recorder:
-        compiled = backend.numba_version() is not None
-        run = {"scene": name, "wait_for_command": True, "duration": duration, "compiled": compiled}
         with _node("simulator", **run) as simulator:
             _wait_until_ready(recorder)
-            with _node("torque_player", scene=name, wait_for_subscribers=2) as player:
-                _wait_for_end("torque_player", player, duration + _END_S)
-                _wait_for_end("simulator", simulator, _END_S)
+            yield
+            _wait_for_end("simulator", simulator, _END_S)
         recorder.send_signal(signal.SIGINT)
         _wait_for_end("recorder", recorder, _END_S)
 

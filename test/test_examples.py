@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_freedom import inertia, slope
 from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque import sine
@@ -20,17 +21,11 @@ EXAMPLE1, EXAMPLE2, THIN = load("example1"), load("example2"), load("example2_th
 
 def swing(t_end):
     """Example 1 reduced to x = gamma - pi/4 by its symmetry, by another integrator."""
-    star = EXAMPLE1.star.inertia
-    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
-
-    def inertia(x):
-        d, c = 2.0 - np.cos(2 * x), np.cos(x)
-        return star.zz / d**2 + drive.zz + link.yy + 2.0 * link.xx * c**2 / d**2
 
     def rates(t, y):
         x, rate = y
-        slope = inertia(x + 1e-20j).imag / 1e-20
-        return rate, (1.13 * np.sin(12.0 * t) - 0.5 * slope * rate**2) / inertia(x)
+        push = 1.13 * np.sin(12.0 * t) - 0.5 * slope(EXAMPLE1, x) * rate**2
+        return rate, push / inertia(EXAMPLE1, x)
 
     start = (0.0, EXAMPLE1.initial.gamma_dot[0])
     run = solve_ivp(rates, (0, t_end), start, method="DOP853", rtol=1e-13, atol=1e-15)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +30,9 @@ class StarMotion(PlannedMotion):
         super().__init__(duration, parts(duration, count))
         self._coordinates = Coordinates(geometry)
 
+    @abstractmethod
     def star(self, time: float) -> StarState:
         """Quaternion, W and W_dot at a time [s] between 0 and the duration."""
-        raise NotImplementedError
 
     def _inside(self, time: float) -> Desired:
         try:

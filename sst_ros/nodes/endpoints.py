@@ -163,21 +163,19 @@ SIMULATOR = (
     RESET,
 )
 
+
+def _torques(doc: str) -> tuple[Endpoint, Endpoint]:
+    """Give the commands of a node whose parameter `stamped` says which of them there are."""
+    plain, stamped = "{simulator}/commands", "{simulator}/commands_stamped"
+    same = "the same, by name and stamp"
+    return (
+        Endpoint(PUBLISHES, plain, Float64MultiArray, doc, when="stamped is false"),
+        Endpoint(PUBLISHES, stamped, JointState, same, when="stamped is true"),
+    )
+
+
 PLAYER = (
-    Endpoint(
-        PUBLISHES,
-        "{simulator}/commands",
-        Float64MultiArray,
-        "the profile's torques [N m] at the stamp of each joint_states",
-        when="stamped is false",
-    ),
-    Endpoint(
-        PUBLISHES,
-        "{simulator}/commands_stamped",
-        JointState,
-        "the same, by name and stamp",
-        when="stamped is true",
-    ),
+    *_torques("the profile's torques [N m] at the stamp of each joint_states"),
     Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered"),
     Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
 )
@@ -223,20 +221,7 @@ JOINT_TRAJECTORY = Endpoint(
 )
 
 COMPANION = (
-    Endpoint(
-        PUBLISHES,
-        "{simulator}/commands",
-        Float64MultiArray,
-        "torques [N m] that answer each joint_states",
-        when="stamped is false",
-    ),
-    Endpoint(
-        PUBLISHES,
-        "{simulator}/commands_stamped",
-        JointState,
-        "the same, by name and stamp",
-        when="stamped is true",
-    ),
+    *_torques("torques [N m] that answer each joint_states"),
     REFERENCE,
     TRACKING_ERROR,
     Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of the control, at 1 Hz"),

@@ -25,23 +25,23 @@ GAUGES = {
 def read(simulation: Simulation) -> dict[str, object]:
     """Read all gauges; in the thread that steps it. What there is none of is left out."""
     state = simulation.state
-    conditioning = getattr(simulation, "conditioning", {})
+    conditioning = simulation.conditioning
     angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
     margins: dict[bool, list[float]] = {True: [], False: []}
     for limit in limits_of(simulation.scene, simulation.geometry):
         if limit.joint < 3 or limit.joint >= 6:
             margins[limit.joint < 3].append(limit.margin(angles))
     values: dict[str, object] = {
-        "error_estimate": getattr(simulation, "error_estimate", None),
-        "rate_error_estimate": getattr(simulation, "rate_error_estimate", None),
-        "energy_residual_J": getattr(simulation, "energy_residual", None),
-        "closure_residual": getattr(simulation, "closure_residual", None),
-        "singularity_serial": conditioning.get("sin_mu"),
-        "singularity_parallel": conditioning.get("det_j2"),
+        "error_estimate": simulation.error_estimate,
+        "rate_error_estimate": simulation.rate_error_estimate,
+        "energy_residual_J": simulation.energy_residual,
+        "closure_residual": simulation.closure_residual,
+        "singularity_serial": conditioning["sin_mu"],
+        "singularity_parallel": conditioning["det_j2"],
         "stroke_margin_rad": min(margins[True], default=None),
         "workspace_margin_rad": min(margins[False], default=None),
         "integrator": simulation.method,
-        "integrator_changes": len(getattr(simulation, "changes", ())),
+        "integrator_changes": len(simulation.changes),
     }
     return {key: value for key, value in values.items() if _is_known(value)}
 

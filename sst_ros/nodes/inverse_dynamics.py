@@ -7,14 +7,13 @@ import sys
 import threading
 import time
 from array import array
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import scene
@@ -27,8 +26,8 @@ from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.commands import ACTUATORS
 from sst_ros.nodes.companion_pursuit import Pursuit, Stage
 from sst_ros.nodes.companion_settings import CompanionParameters
-from sst_ros.nodes.messages import diagnostics, nanoseconds
-from sst_ros.simulation import Triple
+from sst_ros.nodes.messages import diagnostics
+from sst_ros.nodes.torque_commands import TorqueCommands
 
 _ACKNOWLEDGE_S = 2.0
 """Longest wait at the end for readers to have it all."""
@@ -55,22 +54,13 @@ class InverseDynamics:
         self.done = threading.Event()
         given = self._parameters = parameters.declare(self.node, CompanionParameters)
         self._pursuit = Pursuit(scene.load(given.scene), given)
-        if given.stamped:
-            topic = f"{given.simulator}/commands_stamped"
-            self._message: Any = JointState(name=ACTUATORS, effort=array("d", ZERO))
-            self._torques = self._message.effort
-        else:
-            topic = f"{given.simulator}/commands"
-            self._message = Float64MultiArray(data=array("d", ZERO))
-            self._torques = self._message.data
-        self._commands = self.node.create_publisher(type(self._message), topic, 10)
+        self._commands = TorqueCommands(self.node, given)
         self._reference = endpoints.REFERENCE.publisher(self.node)
         self._error = endpoints.TRACKING_ERROR.publisher(self.node)
         self._diagnostics = endpoints.DIAGNOSTICS.publisher(self.node)
         self._seen: Measured | None = None
         self._places: tuple[list[str], list[int]] = ([], [])
         self._began = self._finished = False
-        self._heard = time.monotonic()
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, f"{given.simulator}/phase", self._hear, latched)
         self.node.create_subscription(JointState, "joint_states", self._answer, 1)
@@ -82,11 +72,12 @@ class InverseDynamics:
     def close(self) -> None:
         """Leave the actuators without torque, and tell how well the motion was followed."""
         if self._began and not self.done.is_set():
-            self._send(ZERO)
+            self._commands.send(ZERO)
         self._report()
         self._tell()
         deadline = time.monotonic() + _ACKNOWLEDGE_S
-        for publisher in (self._commands, self._reference, self._error, self._diagnostics):
+        told = (self._commands.publisher, self._reference, self._error, self._diagnostics)
+        for publisher in told:
             left = max(0.0, deadline - time.monotonic())
             publisher.wait_for_all_acked(Duration(seconds=left))
 
@@ -104,33 +95,30 @@ class InverseDynamics:
 
     def _answer(self, state: JointState) -> None:
         """Answer a sample; stamp zero means that it is of no run."""
-        self._heard = time.monotonic()
+        self._commands.heard()
         self._seen = self._measured(state)
         if not self._is_read():
             return
-        stamp_ns = nanoseconds(state.header.stamp)
-        if self._parameters.stamped:
-            self._message.header.stamp = state.header.stamp
+        stamp_ns = self._commands.answering(state)
         if stamp_ns == 0:
             command = None if self._began else self._pursuit.preview(self._seen)
             if command is not None:
-                self._send(command.torque)
+                self._commands.send(command.torque)
             return
         command = self._pursuit.answer(stamp_ns, self._seen)
         if command is None:
             return
         self._began = True
-        self._send(command.torque)
+        self._commands.send(command.torque)
         self._publish(state, self._seen, command)
         if self._pursuit.stage is Stage.ENDED:
             self.done.set()
 
     def _is_read(self) -> bool:
         """Tell whether those are there whom the parameters say to wait for."""
-        given = self._parameters
-        if self._began or self._commands.get_subscription_count() < given.wait_for_subscribers:
+        if self._began or not self._commands.are_read():
             return self._began
-        told = (self._reference, self._error) if given.wait_for_recorder else ()
+        told = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in told)
 
     def _measured(self, state: JointState) -> Measured:
@@ -151,10 +139,6 @@ class InverseDynamics:
         i, j, k = self._places[1]
         p, v = state.position, state.velocity
         return Measured((p[i], p[j], p[k]), (v[i], v[j], v[k]))
-
-    def _send(self, torque: Triple) -> None:
-        self._torques[0], self._torques[1], self._torques[2] = torque
-        self._commands.publish(self._message)
 
     def _publish(self, state: JointState, seen: Measured, command: Command) -> None:
         """Tell what was wanted and what was missing, under the stamp of the sample."""
@@ -181,17 +165,16 @@ class InverseDynamics:
             self._report()
             return
         finally:
-            self._heard = time.monotonic()  # nothing could be heard during the check
+            self._commands.heard()  # nothing could be heard during the check
         if judged is not None:
             print(table(judged), flush=True)
         log.info(f"trajectory of {len(trajectory.points)} points taken")
 
     def _watch(self) -> None:
-        silent = time.monotonic() - self._heard
         if self._finished:
             self.done.set()
-        elif silent > self._parameters.timeout:
-            raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
+        else:
+            self._commands.watch()
 
     def _report(self) -> None:
         """Publish the diagnostics."""

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.plot import control, energy, motion, sphere
 from sst_ros.report import figures
 from sst_ros.report.contents import SCENE
@@ -123,13 +124,9 @@ def save(figure: Figure, title: str, out: Path, stem: str) -> list[Path]:
     """
     figure.suptitle(title, fontsize=11)
     paths = [out / f"{stem}.{form}" for form in FORMATS]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out, "plot"):
         for path in paths:
             figure.savefig(path)
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError("plot", [Problem("out", str(out), allowed)]) from None
     return paths
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sst_ros import scene
-from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.report.accuracy import Study, study
 from sst_ros.report.accuracy_table import advice, as_csv, as_json, made, milliseconds, setting, text
 from sst_ros.report.precise import EXTENDED
@@ -50,15 +50,11 @@ def report(
     for each in scenes:
         studies.append(study(each, kind=kind, compiled=compiled, shown=True))
         print(text(studies[-1]), flush=True)
-        try:
-            out.mkdir(parents=True, exist_ok=True)
+        with writing(out, "report"):
             draw(studies[-1], out / f"accuracy_{each.name}.png")
             (out / "accuracy.csv").write_text(as_csv(studies), encoding="utf-8")
             (out / "accuracy.json").write_text(as_json(studies), encoding="utf-8")
             (out / "accuracy.md").write_text(page(studies), encoding="utf-8")
-        except OSError as error:
-            allowed = f"must be a folder that can be written ({error})"
-            raise InputError("report", [Problem("out", str(out), allowed)]) from None
     return studies
 
 

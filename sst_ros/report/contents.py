@@ -14,7 +14,15 @@ import numpy as np
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report.bag import Topic
 from sst_ros.report.columns import Columns
-from sst_ros.report.messages import ACTUATED, JOINTS, KINDS, MOMENTS
+from sst_ros.report.messages import (
+    ACTUATED,
+    JOINTS,
+    KINDS,
+    MOMENTS,
+    joint_state,
+    multi_array,
+    trajectory,
+)
 from sst_ros.report.rows import Integers
 
 
@@ -53,8 +61,7 @@ class Source(NamedTuple):
 
 def _joints(names: Sequence[str], efforts: Sequence[str]) -> Fields:
     def fields(message: Columns) -> Rows:
-        stamp, found = message.stamp(), message.texts()
-        parts = [message.sequence() for _ in range(3)]
+        stamp, found, parts = joint_state(message)
         wanted = (names, names, efforts)
         columns = [part[:, _places(found, at)] for part, at in zip(parts, wanted, strict=True)]
         return [(stamp, np.hstack(columns))]
@@ -73,15 +80,14 @@ def _numbers(count: int, before: int = 0) -> Fields:
 
 def _ticks(message: Columns) -> Rows:
     """Give the length of each tick beside its torques: exact in a double."""
-    begun, names = message.stamp(), message.texts() or ACTUATED
+    found = trajectory(message)
+    names = found.names or ACTUATED
     at = [*_places(names, ACTUATED), *(names.index(m) for m in MOMENTS if m in names)]
-    start, rows = begun, []
-    for _ in range(message.length()):
-        for _unused in ("positions", "velocities", "accelerations"):
-            message.sequence()
-        row = np.full((len(begun), 7), np.nan)
-        row[:, 1 : 1 + len(at)] = message.sequence()[:, at]
-        end = begun + message.nanoseconds()
+    start, rows = found.stamp, []
+    for effort, after in zip(found.efforts, found.ends, strict=True):
+        row = np.full((len(start), 7), np.nan)
+        row[:, 1 : 1 + len(at)] = effort[:, at]
+        end = found.stamp + after
         row[:, 0] = end - start
         rows.append((start, row))
         start = end
@@ -89,11 +95,7 @@ def _ticks(message: Columns) -> Rows:
 
 
 def _commands(message: Columns) -> Rows:
-    for _ in range(message.length()):
-        message.text()
-        message.numbers("u4", 2)
-    message.numbers("u4")
-    torque = message.sequence()
+    torque = multi_array(message)
     # Others are not used by the simulator either.
     return [(np.zeros(len(torque), np.int64), torque)] if torque.shape[1] == 3 else []
 

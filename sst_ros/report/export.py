@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.progress import slices
 from sst_ros.report import signals
 from sst_ros.report.contents import TIMES, Column
@@ -66,15 +67,11 @@ def export(bag: Path, out: Path, form: str = FORMATS[0]) -> list[Path]:
     """
     write = {"csv": _csv, "parquet": _parquet}[form]
     run = signals.read(bag)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out, "export"):
         paths = []
         for name in run.tables:
             paths.append(out / f"{name}.{form}")
             write(paths[-1], _columns(run, name))
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError("export", [Problem("out", str(out), allowed)]) from None
     return paths
 
 

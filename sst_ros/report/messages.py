@@ -50,7 +50,7 @@ class Commands(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """Fields of JointTrajectory messages: one array for each point."""
+    """Fields of JointTrajectory messages; of each point its efforts and time_from_start [ns]."""
 
     stamp: Integers
     names: tuple[str, ...]
@@ -98,7 +98,7 @@ class Collector:
         return Commands(received, stamps, torque)
 
     def _joint_states(self, _: Bag, block: Block) -> None:
-        for received, (stamp, names, fields) in columns.read(*block[1:], _joint_state):
+        for received, (stamp, names, fields) in columns.read(*block[1:], joint_state):
             begun = stamp != 0
             self.previews += int(np.count_nonzero(~begun))
             if not begun.any():
@@ -119,7 +119,7 @@ class Collector:
         _stamped(self.angles, block, 3)
 
     def _applied_torques(self, _: Bag, block: Block) -> None:
-        for received, found in columns.read(*block[1:], _trajectory):
+        for received, found in columns.read(*block[1:], trajectory):
             begun = found.stamp != 0
             if not begun.any():
                 continue
@@ -158,12 +158,12 @@ class Collector:
                     self.reports.append((received, values))
 
     def _commands(self, _: Bag, block: Block) -> None:
-        for received, torque in columns.read(*block[1:], _multi_array):
+        for received, torque in columns.read(*block[1:], multi_array):
             if torque.shape[1] == 3:  # others are dropped by the simulator too
                 self._asked.add(received, np.zeros_like(received), torque)
 
     def _commands_stamped(self, _: Bag, block: Block) -> None:
-        for received, (stamp, names, fields) in columns.read(*block[1:], _joint_state):
+        for received, (stamp, names, fields) in columns.read(*block[1:], joint_state):
             effort = fields[2]
             if sorted(names) == sorted(ACTUATED) and effort.shape[1] == 3:
                 at = [names.index(name) for name in ACTUATED]
@@ -177,12 +177,14 @@ class Collector:
         return [list(names).index(name) for name in wanted]
 
 
-def _joint_state(message: Columns) -> tuple[Integers, tuple[str, ...], tuple[Array, ...]]:
+def joint_state(message: Columns) -> tuple[Integers, tuple[str, ...], tuple[Array, ...]]:
+    """Read JointState messages: stamps, names, and position, velocity and effort."""
     stamp, names = message.stamp(), message.texts()
     return stamp, names, (message.sequence(), message.sequence(), message.sequence())
 
 
-def _trajectory(message: Columns) -> Trajectory:
+def trajectory(message: Columns) -> Trajectory:
+    """Read JointTrajectory messages, the efforts of their points alone."""
     found = Trajectory(message.stamp(), message.texts(), [], [])
     for _ in range(message.length()):
         for _unused in ("positions", "velocities", "accelerations"):
@@ -192,7 +194,8 @@ def _trajectory(message: Columns) -> Trajectory:
     return found
 
 
-def _multi_array(message: Columns) -> Array:
+def multi_array(message: Columns) -> Array:
+    """Read Float64MultiArray messages; how they are laid out is passed over."""
     for _ in range(message.length()):
         message.text(), message.numbers("u4", 2)
     message.numbers("u4")

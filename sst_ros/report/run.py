@@ -6,15 +6,43 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.report import figures, formulation, jitter, page, recording, reference, summary
+from sst_ros.report.jitter import Timing
+from sst_ros.report.recording import Recording
+from sst_ros.report.reference import Comparison
 from sst_ros.report.thinning import thinned
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
+
+
+class Judged(NamedTuple):
+    """A run in numbers: when what came, the two comparisons, and the summary of it all."""
+
+    told: Timing
+    integration: Comparison
+    ideal: Comparison | None
+    summary: dict[str, Any]
+
+
+def judge(run: Recording) -> Judged:
+    """Put a recorded run in numbers.
+
+    Raises:
+        AssemblyError: the scene's initial gamma has no unique admissible assembly.
+
+    """
+    told = jitter.timing(run)
+    # Compiled loops let go of the interpreter: the two comparisons run beside each other.
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(reference.ideal, run)
+        integration, ideal = reference.integration(run), beside.result()
+    result = summary.summarise(run, integration, ideal, formulation.check(run))
+    return Judged(told, integration, ideal, result | jitter.numbers(told))
 
 
 def report(bag: Path, out: Path) -> dict[str, Any]:
@@ -29,15 +57,8 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
 
     """
     run = recording.read(bag)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        told = jitter.timing(run)
-        # Compiled loops let go of the interpreter: the two comparisons run beside each other.
-        with ThreadPoolExecutor(1) as pool:
-            beside = pool.submit(reference.ideal, run)
-            integration, ideal = reference.integration(run), beside.result()
-        result = summary.summarise(run, integration, ideal, formulation.check(run))
-        result |= jitter.numbers(told)
+    with writing(out, "report"):
+        told, integration, ideal, result = judge(run)
         # Long jagged curves in one piece take hundreds of megabytes to draw.
         with mpl.rc_context({"agg.path.chunksize": 1000}):
             pictures = figures.draw(*thinned(run, integration, ideal), out)
@@ -47,7 +68,4 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
         page.write(result, out / PAGE, pictures, out / HTML)
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(text, encoding="utf-8")
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError("report", [Problem("out", str(out), allowed)]) from None
     return result

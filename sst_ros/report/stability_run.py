@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.report.stability import LONGEST_S, Stable, Verdict, family, verdicts
 from sst_ros.report.summary import made_on
 from sst_ros.report.table import made_line
@@ -37,14 +37,10 @@ def report(out: Path) -> bool:
         "largest_stable_steps": [asdict(step) for step in steps],
         **made,
     }
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out, "report"):
         (out / TEXT).write_text(said, encoding="utf-8")
         (out / JSON).write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
         draw(steps, made_line(made), out / PICTURE)
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError("report", [Problem("out", str(out), allowed)]) from None
     return all(verdict.sound for verdict in judged)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.folder import writing
 from sst_ros.study.feedforward import Plan, Study, study
 from sst_ros.study.feedforward_table import as_csv, as_json, made, notes, rows, shown, text, title
 
@@ -38,15 +38,11 @@ def report(plan: Plan, out: Path, *, workers: int | None = None) -> Study:
 
     found = study(plan, workers=workers, shown=True)
     print(text(found), flush=True)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out, "study"):
         draw(found, out / "feedforward.png")
         (out / "feedforward.csv").write_text(as_csv(found), encoding="utf-8")
         (out / "feedforward.json").write_text(as_json(found), encoding="utf-8")
         (out / "feedforward.md").write_text(page(found), encoding="utf-8")
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError("study", [Problem("out", str(out), allowed)]) from None
     return found
 
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST
+from one_freedom import inertia, slope
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -66,18 +67,10 @@ def swing(duration=TIME, **more):
 
 def swing_torque(time):
     """Of each actuator, from the inertia M1(x) of the one coordinate x = gamma - pi/4."""
-    star = EXAMPLE1.star.inertia
-    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
-
-    def inertia(x):
-        d, c = 2.0 - np.cos(2 * x), np.cos(x)
-        return star.zz / d**2 + drive.zz + link.yy + 2.0 * link.xx * c**2 / d**2
-
     law = WAY * np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     u = time / TIME
     x, rate, acceleration = law(u), law.deriv()(u) / TIME, law.deriv(2)(u) / TIME**2
-    slope = inertia(x + 1e-20j).imag / 1e-20
-    return inertia(x) * acceleration + 0.5 * slope * rate**2, rate
+    return inertia(EXAMPLE1, x) * acceleration + 0.5 * slope(EXAMPLE1, x) * rate**2, rate
 
 
 def summit(function, count=4000):
@@ -190,17 +183,10 @@ def test_a_weight_beyond_the_limit_is_infeasible_at_any_speed():
 def resonant(factor=1.0):
     """A sweep against springs: near their resonance it takes little, slower and faster it does."""
     springs = tuple(Spring(joint=f"gamma_{k}", stiffness=20.0, rest=HOME[0]) for k in (1, 2, 3))
-    inertia = swing_inertia_at_home()
-    own = factor * math.sqrt(20.0 / inertia)
+    own = factor * math.sqrt(20.0 / inertia(EXAMPLE1, 0.0))
     motion = Sweep(amplitude=(0.1,) * 3, frequency=(own,) * 3, fade=20.0 / own, duration=60.0 / own)
     scene = replace(EXAMPLE1, springs=springs, actuators=Actuators(torque_limit=1.2))
     return with_motion(scene, motion)
-
-
-def swing_inertia_at_home():
-    star = EXAMPLE1.star.inertia
-    drive, link = EXAMPLE1.actuated_links[0].inertia, EXAMPLE1.intermediate_links[0].inertia
-    return star.zz + drive.zz + link.yy + 2.0 * link.xx
 
 
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():

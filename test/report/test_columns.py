@@ -37,7 +37,7 @@ def _rows(raws):
 def test_fields_are_those_of_rosbags(bags, little, count):
     sent = [_joint_state(bags, ["a", "bcd", ""][:count], count) for _ in range(5)]
     rows = _rows([_raw(bags, message, little) for message in sent])
-    ((received, (stamp, names, fields)),) = columns.read(np.arange(5), rows, messages._joint_state)
+    ((received, (stamp, names, fields)),) = columns.read(np.arange(5), rows, messages.joint_state)
     assert received.tolist() == list(range(5)) and names == ("a", "bcd", "")[:count]
     for k, message in enumerate(sent):
         told = message.header.stamp
@@ -56,7 +56,7 @@ def test_messages_of_one_length_and_different_layout_are_told_apart(bags):
     length = max(map(len, raws))
     rows = _rows([raw for raw in raws if len(raw) == length])
     same = [message for message, raw in zip(sent, raws, strict=True) if len(raw) == length]
-    found = list(columns.read(np.arange(len(same)), rows, messages._joint_state))
+    found = list(columns.read(np.arange(len(same)), rows, messages.joint_state))
     assert len(found) > 1 and sum(len(received) for received, _ in found) == len(same)
     for received, (_, names, fields) in found:
         for row, k in enumerate(received):
@@ -69,7 +69,7 @@ def test_bytes_that_are_no_message_are_refused(bags):
     huge = whole[:16] + struct.pack("<I", 2**31) + whole[20:]
     for wrong in (b"", b"\0\1", b"\7" + whole[1:], whole[:-8], whole + b"\0" * 8, huge):
         with pytest.raises(columns.Malformed):
-            list(columns.read(np.zeros(1, np.int64), _rows([wrong]), messages._joint_state))
+            list(columns.read(np.zeros(1, np.int64), _rows([wrong]), messages.joint_state))
 
 
 def _compressed(path, entries, bags, mode=None, compressor=None):

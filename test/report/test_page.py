@@ -12,7 +12,7 @@ from matplotlib import image
 from sst_ros import scene
 from sst_ros.control.torque import sine
 from sst_ros.report import jitter, recording, reference
-from sst_ros.report.run import report
+from sst_ros.report.run import judge, report
 from sst_ros.report.table import table
 
 LATENCY_NS = 400_000
@@ -170,7 +170,7 @@ def test_ticks_that_were_missed_show_when_they_were(tmp_path, bags, example2):
 
 
 def numbers_of_run(folder):
-    return report(folder / "bag", folder / "out")
+    return judge(recording.read(folder / "bag")).summary
 
 
 def test_an_altered_effort_of_joint_states_shows_when_it_was(tmp_path, bags, example2):
