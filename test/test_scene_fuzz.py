@@ -24,7 +24,7 @@ from sst_ros.scene import Scene, names
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCES = {name: (FOLDER / f"{name}.yaml").read_text(encoding="utf-8") for name in names()}
 TREES = {name: yaml.safe_load(source) for name, source in SOURCES.items()}
-FUZZ = settings(FAST, max_examples=120)
+FUZZ = settings(FAST, max_examples=60)
 
 
 def paths(tree, path=()):

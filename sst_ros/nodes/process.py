@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from sst_ros.errors import SstError
 from sst_ros.nodes import middleware
 
-_SPIN_PERIOD_S = 0.2
+_SPIN_PERIOD_S = 0.1
 """So late may a signal be heard; to spin once takes half a millisecond, asked for or not."""
 
 
