@@ -352,7 +352,8 @@ _HEAD = """\
 Measured by `python -m benchmark.realtime --minutes 10 --write`; shorter runs say so in their
 tables. Python without a real-time kernel is soft real time. A tick is missed when the one before
 it, or the machine, makes it late by a whole period; simulated time then drops it and the
-diagnostics count it."""
+diagnostics count it. A loop that does nothing but sleep to the same deadlines, in a process of its
+own, says in the same minutes what the machine alone makes anybody miss."""
 
 
 if __name__ == "__main__":
