@@ -6,7 +6,7 @@ RUN = $(VENV)/bin/python
 ROS ?= ros
 EXTRAS = $(ROS),record,report,fast
 PYTEST = $(RUN) -m pytest
-PARALLEL = --numprocesses auto --dist worksteal
+PARALLEL = --numprocesses auto --dist loadfile
 
 .PHONY: demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
 
