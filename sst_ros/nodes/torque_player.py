@@ -60,7 +60,8 @@ class TorquePlayer:
     def _answer(self, state: JointState) -> None:
         """Play the torque of the state's instant; stamp zero means that it is of no run."""
         self._commands.heard()
-        if not self._commands.are_read():
+        # Once begun, the simulator may have its duration and leave before its last sample is heard.
+        if self._start_ns is None and not self._commands.are_read():
             return
         stamp_ns = self._commands.answering(state)
         if stamp_ns == 0:

@@ -23,6 +23,30 @@ def test_plays_a_table_against_the_stamps_it_hears(nodes, observer, tmp_path):
     assert player.wait(timeout=10) == 0
 
 
+def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, tmp_path):
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,0.1,0.2,0.3\n0.1,0,0,0\n")
+    heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    other = observer.node.create_subscription(
+        Float64MultiArray, "/sst_simulator/commands", lambda message: None, 10
+    )
+    player = nodes.run("torque_player", csv=table, wait_for_subscribers=2)
+    states = observer.publisher(JointState, "/joint_states")
+    message = JointState()
+    message.header.stamp.nanosec = 500
+
+    def begun():
+        states.publish(message)
+        return heard
+
+    observer.until(begun, "torque")
+    observer.node.destroy_subscription(other)
+    message.header.stamp.nanosec = 100_000_500
+    states.publish(message)
+    observer.until(lambda: list(heard[-1].data) == [0.0, 0.0, 0.0], "end of the profile")
+    assert player.wait(timeout=10) == 0
+
+
 def test_silence_of_the_simulator_ends_it_with_a_message(nodes):
     player = nodes.run("torque_player", timeout=0.5)
     _, err = player.communicate(timeout=20)
