@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import select
 import shutil
 import signal
 import subprocess
@@ -82,14 +83,16 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
 def record(name: str, bag: Path) -> None:
     """Play a scene's torques to its simulator, in processes of their own, and record the run.
 
+    It goes by the clock, and in lockstep: to the same bits however busy the machine is.
+
     Raises:
         SstError: a node failed or did not end in time; says which.
 
     """
     duration = scene.load(name).duration or 1.0
     with (
-        _recorded(bag, scene=name, wait_for_command=True, duration=duration),
-        _node("torque_player", scene=name, wait_for_subscribers=2) as player,
+        _recorded(bag, scene=name, sync="lockstep", duration=duration),
+        _node("torque_player", scene=name, stamped=True, wait_for_subscribers=2) as player,
     ):
         _wait_for_end("torque_player", player, duration + _END_S)
 
@@ -144,11 +147,13 @@ def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
 def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + _READY_S
     assert recorder.stdout is not None
-    os.set_blocking(recorder.stdout.fileno(), False)
-    while not (recorder.stdout.readline() or "").startswith("ready"):
-        if recorder.poll() is not None or time.monotonic() > deadline:
+    told, printed = recorder.stdout.fileno(), b""
+    while b"ready" not in printed:
+        left = max(0.0, deadline - time.monotonic())
+        more = os.read(told, 4096) if select.select([told], [], [], left)[0] else b""
+        if not more:
             raise SstError(f"the recorder heard no simulator within {_READY_S:g} s")
-        time.sleep(0.05)
+        printed += more
 
 
 def _wait_for_end(command: str, process: subprocess.Popen[str], timeout: float) -> None:

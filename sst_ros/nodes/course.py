@@ -147,8 +147,7 @@ class Course:
                 )
             time.sleep(min(max(waited / 10, 2e-5), _POLL_S))
             waited = time.monotonic() - began
-        if waited * 1e9 > self._period_ns:
-            self._pacer.start()  # to wait for an answer is no overrun
+        self._pacer.excuse(self._ticks_left())  # to wait for an answer is no overrun
         return answer
 
     def _publish(self) -> None:

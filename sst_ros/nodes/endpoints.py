@@ -174,9 +174,16 @@ def _torques(doc: str) -> tuple[Endpoint, Endpoint]:
     )
 
 
+PLAYED = Endpoint(
+    SUBSCRIBES,
+    "joint_states",
+    JointState,
+    "what is answered, sample by sample from the first",
+    depth=1000,
+)
 PLAYER = (
     *_torques("the profile's torques [N m] at the stamp of each joint_states"),
-    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered"),
+    PLAYED,
     Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
 )
 

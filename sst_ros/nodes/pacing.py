@@ -63,6 +63,16 @@ class Pacer:
         self.speed = speed
         self.start()
 
+    def excuse(self, ticks: int) -> None:
+        """Put the deadlines off if the last of the next ticks is past: that was nobody's fault."""
+        if self.speed > 0.0:
+            self._anchor += max(0, self._late(self._source.now_ns(), ticks))
+
+    def _late(self, now: int, ticks: int) -> int:
+        """Give the time from the last of the next ticks to now [ns]; negative if it is to come."""
+        interval = self._period_ns / self.speed
+        return now - self._anchor - round((self._count + ticks - 1) * interval)
+
     def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
         """Wait for the next deadline, or the last of several; False if interrupted before."""
         if self.speed == 0.0:
@@ -76,7 +86,7 @@ class Pacer:
                 self.start()
                 now = self._anchor
             self._seen = now
-            late = now - self._anchor - round((self._count + ticks - 1) * interval)
+            late = self._late(now, ticks)
             if late >= 0:
                 break
             if interrupted():

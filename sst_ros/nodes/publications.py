@@ -30,7 +30,6 @@ _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 _ACKNOWLEDGE_S = 2.0
-_LINGER_S = 1.0
 
 
 class Publications:
@@ -111,17 +110,11 @@ class Publications:
         return [] if self._clock is None else self._clock.rivals()
 
     def finish(self) -> None:
-        """Wait until readers have it all.
-
-        Fast DDS asks them now and then only, see `middleware`. What a busy reader has acknowledged
-        but not yet taken it may lose when we leave: we stay a moment longer where there are any.
-        """
+        """Wait until readers have it all; what they have not yet taken outlives us."""
         deadline = time.monotonic() + _ACKNOWLEDGE_S
         for publisher in self._node.publishers:
             left = max(0.0, deadline - time.monotonic())
             publisher.wait_for_all_acked(Duration(seconds=left))
-        if any(publisher.get_subscription_count() for publisher in self._node.publishers):
-            time.sleep(_LINGER_S)
 
     def _publish_state(self, stamp_ns: int) -> None:
         for listened, send, template in self._state:

@@ -16,7 +16,7 @@ from sst_ros import scene
 from sst_ros.control import torque
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.triples import ZERO
-from sst_ros.nodes import parameters, process
+from sst_ros.nodes import endpoints, parameters, process
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.settings import PlayerParameters
 from sst_ros.nodes.torque_commands import TorqueCommands
@@ -36,7 +36,8 @@ class TorquePlayer:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         phase = f"{self._parameters.simulator}/phase"
         self.node.create_subscription(String, phase, self._hear, latched)
-        self.node.create_subscription(JointState, "joint_states", self._answer, 10)
+        played = endpoints.PLAYED
+        self.node.create_subscription(played.kind, played.name, self._answer, played.depth)
         self.node.create_timer(0.5, self._commands.watch, clock=STEADY)
 
     def close(self) -> None:

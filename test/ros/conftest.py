@@ -11,7 +11,6 @@ import sys
 import tempfile
 import time
 from contextlib import contextmanager
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -24,30 +23,12 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
+from sst_ros.nodes import middleware  # noqa: E402
+
 DOMAINS = itertools.cycle(range(1, 101))
 
-# Fast DDS asks its readers every 3 s what they have: nodes that wait for it at their end take 2 s.
-DISTRIBUTION = os.environ.get("ROS_DISTRO", "")
-PROFILE = """\
-<dds xmlns="http://www.eprosima.com"><profiles>
-  <data_writer profile_name="quick" is_default_profile="true">
-    <times><{tag}><sec>0</sec><nanosec>50000000</nanosec></{tag}></times>
-  </data_writer>
-</profiles></dds>
-"""
-
-
-@pytest.fixture(scope="session", autouse=True)
-def quick_ends(tmp_path_factory):
-    """Have readers asked 20 times a second."""
-    # Fast DDS 2, which Jazzy has, and 3 have names of their own for the file and for the period.
-    jazzy = any(metadata.distributions(name="ros-jazzy-rclpy")) or "jazzy" in DISTRIBUTION
-    maker, tag = ("RTPS", "heartbeatPeriod") if jazzy else ("DDS", "heartbeat_period")
-    path = tmp_path_factory.mktemp("fastdds") / "quick.xml"
-    path.write_text(PROFILE.format(tag=tag))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(f"FAST{maker}_DEFAULT_PROFILES_FILE", str(path))
-        yield
+# The observer is in this process: it asks the same of the middleware as the nodes do.
+middleware.configure()
 
 
 @pytest.fixture

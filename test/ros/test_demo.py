@@ -7,9 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from sst_ros import load_scene
+from sst_ros.control import torque
 from sst_ros.demo import demo
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.report.recording import read
+from sst_ros.simulation import Simulation
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 PICTURES = {
@@ -42,6 +45,18 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
         assert summary[f"integration_error_{quantity}"] <= 1e-9
         assert summary[f"integration_reference_error_{quantity}"] <= 1e-12
     assert summary["formulation_difference_relative"] <= 1e-12
+
+
+def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
+    recording = read(out / "bag")
+    played = load_scene("example2")
+    profile = torque.sine(played.torque)
+    simulation = Simulation(played)
+    expected = [simulation.state.joints.gamma]
+    for sample in range(500):
+        simulation.steps(profile(2_000_000 * sample / 1e9), 1_000_000, 2)
+        expected.append(simulation.state.joints.gamma)
+    assert np.array_equal(recording.gamma, expected)
 
 
 @pytest.mark.parametrize("part", PICTURES)

@@ -62,6 +62,25 @@ def test_lateness_below_a_period_is_no_miss(hand):
     assert (pacer.missed, pacer.late_ns) == (0, 900_000)
 
 
+def test_what_is_excused_is_no_miss_and_costs_only_what_it_is_late(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    for waited, late in ((1_700_000, 0), (2_300_000, 300_000), (100_000, 0)):
+        before = hand.now
+        hand.now += waited
+        pacer.excuse(2)
+        assert pacer.wait(never, 2)
+        assert (hand.now, pacer.missed) == (before + 2 * MS + late, 0)
+
+
+def test_deadlines_that_have_always_come_need_no_excuse(hand):
+    pacer = Pacer(MS, 0.0, hand)
+    pacer.start()
+    pacer.excuse(2)
+    assert pacer.wait(never, 2)
+    assert hand.slept == []
+
+
 @pytest.mark.parametrize("speed", [0.5, 3.0, 7.0])
 def test_speed_stretches_the_periods_without_drift(hand, speed):
     pacer = Pacer(MS, speed, hand)

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import signal
+
 import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -44,6 +46,28 @@ def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, tmp
     message.header.stamp.nanosec = 100_000_500
     states.publish(message)
     observer.until(lambda: list(heard[-1].data) == [0.0, 0.0, 0.0], "end of the profile")
+    assert player.wait(timeout=10) == 0
+
+
+def test_a_player_that_was_held_up_counts_from_the_first_sample(nodes, observer, tmp_path):
+    """Without it the profile would be late, and the run over before the profile is."""
+    table = tmp_path / "torque.csv"
+    table.write_text("time,tau_1,tau_2,tau_3\n0,0.1,0.2,0.3\n0.2,0,0,0\n")
+    heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
+    player = nodes.run("torque_player", csv=table)
+    states = observer.node.create_publisher(JointState, "/joint_states", 1000)
+    message = JointState()
+
+    def called():
+        states.publish(message)
+        return heard
+
+    observer.until(called, "torque")
+    player.send_signal(signal.SIGSTOP)
+    for sample in range(101):
+        message.header.stamp.nanosec = 500 + 2_000_000 * sample
+        states.publish(message)
+    player.send_signal(signal.SIGCONT)
     assert player.wait(timeout=10) == 0
 
 
