@@ -6,9 +6,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 
+_PARTS = 50
 
-def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
-    """Yield slices of `size`; where `shown` and stderr is a terminal, draw a bar there."""
+
+def slices(total: int, size: int | None, label: str, shown: bool) -> Iterator[slice]:
+    """Yield slices of `size`, or some fifty; where `shown`, draw a bar if stderr is a terminal."""
+    size = size or max(1, total // _PARTS)
     drawn = shown and sys.stderr.isatty()
     for start in range(0, total, size):
         done = min(start + size, total)

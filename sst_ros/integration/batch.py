@@ -27,7 +27,6 @@ from sst_ros.mechanism.trace import Program
 from sst_ros.progress import slices
 from sst_ros.scene import Scene
 
-_CHUNKS = 50
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
     **dict.fromkeys(("motion", "markers", "duration"), "is nothing that a batch uses"),
@@ -140,8 +139,7 @@ class Batch:
         given = self.drives(torque, number)
         when, error = np.full(number, np.nan), np.zeros(number)
         kept = [y[:7].T.copy()] if keep_every else []
-        size = keep_every or max(1, count // _CHUNKS)
-        for part in slices(count, size, self.scene.name, progress):
+        for part in slices(count, keep_every or None, self.scene.name, progress):
             span = part.stop - part.start
             self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
             if keep_every and span == keep_every:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.start import SINGULAR
+from sst_ros.mechanism.start import body_rate
 from sst_ros.progress import slices
 
 NO_ASSEMBLY, NO_RATE = -1, -2
@@ -21,8 +21,6 @@ SAID = {
     NO_RATE: "gamma_dot does not determine the body rate: singular start",
 }
 """Why a scenario does not start, by its code."""
-
-_PARTS = 50
 
 
 def starts(
@@ -49,7 +47,7 @@ def starts(
     code = np.full(count, NO_ASSEMBLY, dtype=np.int64)
     order = np.argsort(which, kind="stable")
     groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(geometries)))[:-1])
-    for part in slices(len(geometries), max(1, len(geometries) // _PARTS), label, progress):
+    for part in slices(len(geometries), None, label, progress):
         for geometry, rows in zip(geometries[part], groups[part], strict=True):
             found = kinematics.direct_many(geometry, gamma[rows])
             counts = np.bincount(found.configuration[found.admissible], minlength=len(rows))
@@ -58,19 +56,8 @@ def starts(
                 if counts[one] == 1:
                     n, rotation = rows[one], found.rotation[i]
                     try:
-                        rate[n] = _rate(geometry, gamma[n], gamma_dot[n], rotation)
+                        rate[n] = body_rate(geometry, gamma[n], gamma_dot[n], rotation)
                         quaternion[n], code[n] = quaternion_of(rotation), 0
                     except SingularConfiguration:
                         code[n] = NO_RATE
     return quaternion, rate, code
-
-
-def _rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Array) -> Array:
-    """Body rate [rad/s]; rest needs no Jacobian, which a singular posture has not."""
-    if not gamma_dot.any():
-        return np.zeros(3)
-    at = virtual_work.posture(geometry, gamma, rotation)
-    determinant = float(np.linalg.det(at.j2))
-    if abs(determinant) < SINGULAR:
-        raise SingularConfiguration("parallel singularity, det J2", determinant)
-    return np.asarray(rotation.T @ at.j @ gamma_dot)

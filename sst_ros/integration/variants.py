@@ -45,7 +45,6 @@ _ACTS_ON: dict[type[Section], dict[str, tuple[str, ...]]] = {
 """A number does nothing where all of these are zero or not given."""
 
 _MOST_PROBLEMS = 10
-_PARTS = 50
 
 Tree = dict[Any, Any]
 """Names and indices down to the keys of the numbers."""
@@ -113,7 +112,7 @@ class Variants:
         problems: list[Problem] = []
         count = self.count or 1
         label = f"{self.document.name}, preparing"
-        for part in slices(count, max(1, count // _PARTS), label, progress and bool(self.keys)):
+        for part in slices(count, None, label, progress and bool(self.keys)):
             for row in range(part.start, part.stop):
                 try:
                     scene = self.scene(row)

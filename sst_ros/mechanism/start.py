@@ -8,7 +8,7 @@ import numpy as np
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import Scene
 
 SINGULAR = 1.5e-5
@@ -27,12 +27,22 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
     meant = None if initial.orientation is None else rotation_matrix(initial.orientation)
     assembly = kinematics.admissible(geometry, gamma, meant)
-    rotation = assembly.rotation
-    if not any(initial.gamma_dot):
-        return (*quaternion_of(rotation).tolist(), 0.0, 0.0, 0.0)
-    if abs(assembly.det_j2) < SINGULAR:
-        said = "gamma_dot does not determine the body rate: parallel singularity, det J2"
-        raise SingularConfiguration(said, assembly.det_j2)
+    rate = body_rate(geometry, gamma, np.array(initial.gamma_dot), assembly.rotation)
+    return (*quaternion_of(assembly.rotation).tolist(), *rate.tolist())
+
+
+def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Array) -> Array:
+    """Body rate [rad/s] of a posture; rest needs no Jacobian, which a singular one has not.
+
+    Raises:
+        SingularConfiguration: gamma_dot says nothing of it.
+
+    """
+    if not gamma_dot.any():
+        return np.zeros(3)
     at = virtual_work.posture(geometry, gamma, rotation)
-    rate = rotation.T @ at.j @ np.array(initial.gamma_dot)
-    return (*quaternion_of(rotation).tolist(), *rate.tolist())
+    determinant = float(np.linalg.det(at.j2))
+    if abs(determinant) < SINGULAR:
+        said = "gamma_dot does not determine the body rate: parallel singularity, det J2"
+        raise SingularConfiguration(said, determinant)
+    return np.asarray(rotation.T @ at.j @ gamma_dot)

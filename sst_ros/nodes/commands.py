@@ -73,14 +73,16 @@ class CommandBoard:
         self._lockstep = settings.parameters.sync == "lockstep"
         self.received = self.dropped = self.clamped = self.timeouts = 0
         self.reasons: dict[str, int] = {}
-        self.last_refusal = ""
-        self.clear()
+        self._forget()
 
     def clear(self) -> None:
         """Forget the command and what has arrived: no torque until there is another."""
         for take in (self._commands, self._stamped, self._moments or (lambda: None)):
             for _ in self._all(take):
                 pass
+        self._forget()
+
+    def _forget(self) -> None:
         self._held, self.moment = ZERO, ZERO
         self._since = self._moment_since = time.monotonic()
         self.begun = self.stale = False

@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,17 @@ class Browser:
 
     def picture(self, path: Path | None = None) -> bytes:
         """Take a PNG of the window, and keep it at a path."""
-        taken = bytes(self._driver.get_screenshot_as_png())
+        from selenium.common.exceptions import TimeoutException
+
+        taken = b""
+
+        def seen() -> bool:
+            nonlocal taken
+            with suppress(TimeoutException):  # the driver waits 10 s, a busy machine may need more
+                taken = bytes(self._driver.get_screenshot_as_png())
+            return bool(taken)
+
+        self.until(seen, "picture")
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(taken)

@@ -25,9 +25,9 @@ def stamped(stamp_ns, effort, names=("gamma_1", "gamma_2", "gamma_3")):
 
 
 class Bench:
-    def __init__(self, actuators=None, **given):
+    def __init__(self, actuators=None, commands=(), **given):
         self.parameters = SimulatorParameters(**given)
-        self.commands, self.stamped, self.moments = [], [], []
+        self.commands, self.stamped, self.moments = list(commands), [], []
         takes = [
             lambda queue=queue: queue.pop(0) if queue else None
             for queue in (self.commands, self.stamped, self.moments)
@@ -37,6 +37,13 @@ class Bench:
 
     def torque(self):
         return self.board.torque(self.moving)
+
+
+def test_what_comes_while_the_node_starts_is_not_lost():
+    bench = Bench(commands=[array(1.0, 2.0, 3.0), array(1.0)])
+    assert bench.board.look()
+    assert (bench.board.received, bench.board.dropped) == (1, 1)
+    assert bench.torque() == (1.0, 2.0, 3.0)
 
 
 def test_the_last_good_command_is_held():

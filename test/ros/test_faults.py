@@ -3,7 +3,6 @@
 
 import math
 import signal
-import threading
 import time
 from pathlib import Path
 
@@ -129,34 +128,25 @@ def test_two_publishers_are_told(nodes, observer):
 
 
 def test_a_flood_of_commands_is_bounded(nodes, observer):
-    """20 kHz for 2 s: no crash, no growth, samples go on."""
+    """20 kHz for 2 s, if the machine can: no crash, no growth, samples go on."""
     process = nodes.run("simulator")
     commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
     observer.told("phase", "running")
-    before, stop = _memory(process.pid), threading.Event()
-    good, bad = ([0.0] * 3, [math.nan] * 3)
-    messages = [Float64MultiArray(data=data) for data in (good, bad)]
-    sent = [0]
-
-    def flood():
-        start = time.monotonic()
-        while not stop.is_set() and time.monotonic() - start < 2.0:
-            for _ in range(20):
-                commands.publish(messages[sent[0] % 2])
-                sent[0] += 1
-            time.sleep(max(0.0, start + sent[0] / 20000 - time.monotonic()))
-
-    thread = threading.Thread(target=flood)
-    thread.start()
-    thread.join()
+    before, start = _memory(process.pid), time.monotonic()
+    messages = [Float64MultiArray(data=[number] * 3) for number in (0.0, math.nan)]
+    for sent in range(40_000):
+        commands.publish(messages[sent % 2])
+        if sent % 20 == 19:
+            time.sleep(max(0.0, start + sent / 20_000 - time.monotonic()))
     ticks = int(observer.told("commands_dropped", lambda n: int(n) > 100)["ticks"])
     said = observer.told("ticks", lambda n: int(n) > ticks + 500)
     taken = int(said["commands_received"]) + int(said["commands_dropped"])
-    assert sent[0] > 10000 and taken <= 10 * int(said["ticks"])
+    assert taken <= 10 * int(said["ticks"])
     assert said["phase"] == "running" and said["fault"] == ""
     assert _memory(process.pid) - before < 20_000  # kB
     status, _, err = nodes.stop(process)
-    assert status == 0 and err.count("command dropped") <= 6
+    told = err.count("command dropped")
+    assert status == 0 and 1 <= told <= time.monotonic() - start + 1.0
 
 
 def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer):
