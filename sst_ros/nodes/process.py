@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from sst_ros.errors import SstError
-from sst_ros.nodes import middleware
+from sst_ros.nodes import handles, middleware
 
 _SPIN_PERIOD_S = 0.1
 """So late may a signal be heard; to spin once takes half a millisecond, asked for or not."""
@@ -67,5 +67,6 @@ def _spin(build: Callable[[], Worker], stop: threading.Event) -> int:
             worker.close()
         finally:
             executor.shutdown()
+            handles.release()
             worker.node.destroy_node()
     return 0

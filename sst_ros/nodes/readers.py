@@ -10,6 +10,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from sst_ros.nodes import handles
 from sst_ros.nodes.endpoints import Endpoint
 
 
@@ -41,10 +42,7 @@ def reader(node: Node, topic: Endpoint) -> Callable[[], Any]:
         topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
     )
 
-    # In use until the process ends: to enter and leave it for every look costs more than the look.
-    handle = subscription.handle
-    handle.__enter__()
-    look, kind = handle.take_message, topic.kind
+    look, kind = handles.keep(subscription.handle).take_message, topic.kind
 
     def next_message() -> Any:
         result = look(kind, False)

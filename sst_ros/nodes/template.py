@@ -18,6 +18,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
 
+from sst_ros.nodes import handles
+
 Write = Callable[..., None]
 Send = Callable[[bytes], None]
 
@@ -77,10 +79,8 @@ class Template:
 
 
 def sender(publisher: Publisher) -> Send:
-    """Give what publishes bytes; to enter and leave the publisher each time costs as much again."""
-    handle = publisher.handle
-    handle.__enter__()  # in use until the process ends
-    send: Send = handle.publish_raw
+    """Give what publishes bytes."""
+    send: Send = handles.keep(publisher.handle).publish_raw
     return send
 
 

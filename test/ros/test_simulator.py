@@ -159,3 +159,12 @@ def test_refused_parameters_are_named(nodes, given, said):
     assert process.returncode == 1
     assert said in err
     assert "Traceback" not in err
+
+
+def test_who_looks_sees_at_once_that_it_has_left(nodes, observer):
+    """Otherwise it would be there for 20 s more, and a new one would not be the only one."""
+    process = nodes.run("simulator")
+    names = observer.node.get_node_names
+    observer.told("phase", "running")
+    assert nodes.stop(process)[0] == 0
+    observer.until(lambda: "sst_simulator" not in names(), "end of it", 5.0)

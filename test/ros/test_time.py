@@ -18,7 +18,7 @@ def clock(nanoseconds):
 
 
 @pytest.mark.parametrize("speed", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
-def test_other_speeds_are_reached_and_lose_no_sample(nodes, observer, speed):
+def test_other_speeds_are_kept_and_lose_no_sample(nodes, observer, speed):
     states = observer.listen(JointState, "/joint_states")
     process = nodes.run(
         "simulator", real_time_factor=speed, duration=2.0, publish_rate=100, wait_for_command=True
@@ -27,7 +27,10 @@ def test_other_speeds_are_reached_and_lose_no_sample(nodes, observer, speed):
     commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
     commands.publish(Float64MultiArray(data=[0.0, 0.0, 0.0]))
     said = observer.told("phase", "finished")
-    assert float(said["real_time_factor"]) > (1.5 if speed else 1.0)
+    if speed:
+        assert 1.5 < float(said["real_time_factor"]) <= speed
+    else:  # no tick waits, none can be late
+        assert (float(said["late_max_us"]), said["ticks_missed"]) == (0.0, "0")
 
     def stamps():
         return [observer.stamp(state) for state in states if observer.stamp(state)]

@@ -123,4 +123,4 @@ def test_ctrl_c_ends_the_page_and_the_simulator(viewed):
     started, process, _, watching = viewed
     status, _, errors = started.stop(process, signal.SIGINT, 30)
     assert status == 0 and "Traceback" not in errors
-    watching.until(lambda: "sst_simulator" not in watching.node.get_node_names(), "end of it")
+    watching.until(lambda: "sst_simulator" not in watching.node.get_node_names(), "end of it", 5.0)
