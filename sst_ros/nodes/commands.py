@@ -27,11 +27,11 @@ class Settings(Protocol):
 
 
 class Moving(Protocol):
-    """What is braked."""
+    """What is run."""
 
     @property
     def state(self) -> State:
-        """Its state now."""
+        """Its state now; put together when it is asked for."""
 
 
 class Refused(Exception):

@@ -152,5 +152,5 @@ class Course:
 
     def _publish(self) -> None:
         self._stamp_ns = self._start_ns + self._tick * self._period_ns
-        self._audience.sample(self.simulation.state, self._stamp_ns)
+        self._audience.sample(self.simulation, self._stamp_ns)
         self.counters.published += 1

@@ -35,7 +35,7 @@ from sst_ros.nodes import endpoints
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import BASE_FRAME
 from sst_ros.nodes.settings import SimulatorParameters
-from sst_ros.nodes.template import Template, marks, sender
+from sst_ros.nodes.template import Outlet, Template, marks
 from sst_ros.scene import Scene
 from sst_ros.simulation import State
 from sst_ros.terms import JOINTS
@@ -52,8 +52,13 @@ def offer(node: Node, scene: Scene, given: SimulatorParameters, state: Callable[
         endpoints.ROBOT_DESCRIPTION.publisher(node).publish(String(data=urdf(scene)))
     if scene.markers is not None:
         markers = Markers(scene, scene.markers)
-        send = sender(endpoints.MARKERS.publisher(node))
-        node.create_timer(1.0 / scene.markers.rate, lambda: send(markers.of(state())), clock=STEADY)
+        outlet = Outlet(endpoints.MARKERS.publisher(node))
+
+        def show() -> None:
+            if outlet.readers():
+                outlet.send(markers.of(state()))
+
+        node.create_timer(1.0 / scene.markers.rate, show, clock=STEADY)
 
 
 class Markers:

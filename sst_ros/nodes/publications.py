@@ -20,9 +20,9 @@ from std_msgs.msg import String
 from sst_ros.document import dump
 from sst_ros.nodes import endpoints
 from sst_ros.nodes.clocks import OwnClock
-from sst_ros.nodes.commands import Settings
+from sst_ros.nodes.commands import Moving, Settings
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
-from sst_ros.nodes.template import listeners, sender
+from sst_ros.nodes.template import Outlet, Send, Template
 from sst_ros.scene import Scene
 from sst_ros.simulation import State, Triple
 
@@ -42,17 +42,13 @@ class Publications:
         samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
         topics = (endpoints.JOINT_STATES, endpoints.ORIENTATION, endpoints.EULER_ZYZ)
-        state = [topic.publisher(node, depth) for topic in topics]
-        torques = endpoints.APPLIED_TORQUES.publisher(node, depth)
-        self._send_torques, self._torque_listeners = sender(torques), listeners(torques)
+        state = [Outlet(topic.publisher(node, depth)) for topic in topics]
+        self._torques = Outlet(endpoints.APPLIED_TORQUES.publisher(node, depth))
         self._phase = endpoints.PHASE.publisher(node)
         self._scene = endpoints.SCENE.publisher(node)
         self._scene.publish(String(data=dump(scene)))
         self._messages = StateMessages()
-        self._state = [
-            (listeners(publisher), sender(publisher), template)
-            for publisher, template in zip(state, self._messages.templates, strict=True)
-        ]
+        self._state = tuple(zip(state, self._messages.templates, strict=True))
         moments = scene.moment is not None and scene.moment.topic
         self._log = TorqueLog(given.ticks_per_sample, given.period_ns, moments=moments)
         self._period_ns = given.period_ns
@@ -69,32 +65,36 @@ class Publications:
         """Note what acted over some ticks."""
         self._log.append(torque, moment, count)
 
-    def sample(self, state: State, stamp_ns: int) -> None:
+    def sample(self, moving: Moving, stamp_ns: int) -> None:
         """Publish a sample of the run and the torques that led to it.
 
         Raises:
             NotFinite: nothing has been published.
 
         """
-        self._messages.fill(state)
+        read = self._read()
+        if read:
+            self._messages.fill(moving.state)
         if self._clock is not None:
             self._clock.tell(stamp_ns)
-        if self._log and self._torque_listeners():
-            self._send_torques(self._log.take(stamp_ns - len(self._log) * self._period_ns))
+        if self._log and self._torques.readers():
+            self._torques.send(self._log.take(stamp_ns - len(self._log) * self._period_ns))
         self._log.clear()
-        self._publish_state(stamp_ns)
+        for send, template in read:
+            send(template.stamped(stamp_ns))
 
     def idle(self, state: State, *, still: bool) -> None:
         """Show a state that is no sample: stamped zero, `still` with zero rates."""
         if self._clock is not None:
             self._clock.repeat()
         self._log.clear()
-        self._send_torques(self._log.take(0))
+        self._torques.send(self._log.take(0))
         with contextlib.suppress(NotFinite):  # then the last one that was is shown
             self._messages.fill(state)
         if still:
             self._messages.still()
-        self._publish_state(0)
+        for send, template in self._read():
+            send(template.stamped(0))
 
     def changed(self, phase: str) -> None:
         """Tell a change of the phase."""
@@ -116,7 +116,6 @@ class Publications:
             left = max(0.0, deadline - time.monotonic())
             publisher.wait_for_all_acked(Duration(seconds=left))
 
-    def _publish_state(self, stamp_ns: int) -> None:
-        for listened, send, template in self._state:
-            if listened():
-                send(template.stamped(stamp_ns))
+    def _read(self) -> list[tuple[Send, Template]]:
+        """Messages of the state that somebody reads."""
+        return [(outlet.send, template) for outlet, template in self._state if outlet.readers()]

@@ -7,6 +7,7 @@ import threading
 from enum import Enum
 from typing import NamedTuple, Protocol
 
+from sst_ros.nodes.commands import Moving
 from sst_ros.simulation import State, Triple
 
 
@@ -36,7 +37,7 @@ class Audience(Protocol):
     def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
         """Note what acted over some ticks."""
 
-    def sample(self, state: State, stamp_ns: int) -> None:
+    def sample(self, moving: Moving, stamp_ns: int) -> None:
         """Publish a sample of the run and the torques that led to it."""
 
     def idle(self, state: State, *, still: bool) -> None:

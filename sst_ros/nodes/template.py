@@ -78,16 +78,17 @@ class Template:
         return bytes(self._bytes)
 
 
-def sender(publisher: Publisher) -> Send:
-    """Give what publishes bytes."""
-    send: Send = handles.keep(publisher.handle).publish_raw
-    return send
+class Outlet:
+    """A topic for bytes.
 
+    Attributes:
+        send: publishes a message's bytes.
+        readers: tells how many read it now. What nobody reads need not be made: unless the topic
+            is latched nobody gets it later.
 
-def listeners(publisher: Publisher) -> Callable[[], int]:
-    """Give what tells how many read a topic now.
-
-    What nobody reads need not be made: unless it is latched nobody gets it later.
     """
-    count: Callable[[], int] = publisher.handle.get_subscription_count
-    return count
+
+    def __init__(self, publisher: Publisher) -> None:
+        handle = handles.keep(publisher.handle)
+        self.send: Send = handle.publish_raw
+        self.readers: Callable[[], int] = handle.get_subscription_count

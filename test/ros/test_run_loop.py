@@ -34,8 +34,8 @@ class Audience:
     def ticks(self, torque, moment, count):
         self.acted.extend([torque] * count)
 
-    def sample(self, state, stamp_ns):
-        self.samples.append((stamp_ns, state))
+    def sample(self, moving, stamp_ns):
+        self.samples.append((stamp_ns, moving.state))
 
     def idle(self, state, *, still):
         self.idles.append((state, still))
