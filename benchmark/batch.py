@@ -112,7 +112,7 @@ class _Work:
         if folder is not None:
             self._add_c(name, method, batch, start, folder)
         columns = tuple(y.copy())
-        dynamics = Dynamics(self._scene)
+        dynamics = Dynamics.of(self._scene)
         system = System(dynamics, self._scene.torque)
         slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
         for who, slope in slopes.items():

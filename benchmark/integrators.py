@@ -74,7 +74,7 @@ def counts_for(machine, arguments, truth, wanted, most):
 
 
 def compare(name, scene, span, wanted, compiled):
-    dynamics = Dynamics(scene)
+    dynamics = Dynamics.of(scene)
     system = System(dynamics, scene.torque)
     state = Simulation(replace(scene, torque=None)).state
     y = [*state.quaternion, *state.body_rate]

@@ -56,7 +56,7 @@ def _orders() -> None:
         lambda t, y: kernel.derivative(model, tuple(y), torque(t)),
         (0.0, SPAN), start, method="DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.002,
     ).y[:, -1]  # fmt: skip
-    system = System(Dynamics(scene), scene.torque)
+    system = System(Dynamics.of(scene), scene.torque)
     print(f"Orders on example2, {SPAN} s: error with n steps and with 2 n")
 
     def told(name: str, order: int, n: int, errors: list[float]) -> None:
@@ -115,7 +115,7 @@ def _between() -> None:
     whole = solve_ivp(slope, (0.0, 0.05), start, method="DOP853", rtol=1.0, atol=1.0,
                       first_step=0.05, dense_output=True)  # fmt: skip
     inside = solve_ivp(slope, (0.0, 0.02), start, method="DOP853", rtol=2.3e-14, atol=1e-15)
-    system = System(Dynamics(scene))
+    system = System(Dynamics.of(scene))
     runner = Machine(system, DOP853, compiled=False)
     again = runner.march(0.0, 0.02, 1, start, list(PUSH))
     truth = inside.y[:, -1]

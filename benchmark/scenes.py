@@ -41,7 +41,7 @@ CALLS = {"python": 400, "numba": 20_000}
 def programs() -> dict[str, Program]:
     """The bare kernel and every shipped scene."""
     return {"bare": program_of(load(PLAIN))} | {
-        name: Dynamics(load(name)).program for name in names()
+        name: Dynamics.of(load(name)).program for name in names()
     }
 
 

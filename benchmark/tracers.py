@@ -51,7 +51,7 @@ def _row(casadi: Any, name: str, rounds: int) -> str:
     import numba
 
     scene = scenes.load(name)
-    system = System(Dynamics(scene), scene.torque)
+    system = System(Dynamics.of(scene), scene.torque)
     start = Simulation(scene).state
     drive = len(system.drive)
     given = [0.0, *start.quaternion, *start.body_rate, *(0.0,) * drive]

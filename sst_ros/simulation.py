@@ -97,7 +97,7 @@ class Simulation:
             raise InputError("simulation", [Problem("tolerance", tolerance, "must be > 0")])
         self.scene = scene
         self.geometry = Geometry.of(scene)
-        self.dynamics = Dynamics(scene)
+        self.dynamics = Dynamics.of(scene)
         self.compiled = compiled and numba_version() is not None
         if compiled and not self.compiled:
             said = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"

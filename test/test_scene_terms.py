@@ -190,7 +190,7 @@ def massless(*which):
 
 def test_links_without_inertia_are_legal_and_cost_nothing():
     counts = [
-        sum(Dynamics(scene).program.operations.values())
+        sum(Dynamics.of(scene).program.operations.values())
         for scene in (
             load("example2"),
             massless("actuated"),
@@ -200,7 +200,7 @@ def test_links_without_inertia_are_legal_and_cost_nothing():
     ]
     assert counts[0] == counts[1] > counts[2] > counts[3]
     for scene in (massless("actuated"), massless("actuated", "intermediate")):
-        slope = Dynamics(scene).derivative(0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
+        slope = Dynamics.of(scene).derivative(0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
         assert np.all(np.isfinite(slope))
 
 

@@ -53,7 +53,7 @@ def test_the_kernel_without_optional_terms_is_the_same_physics():
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
     for name in ("example2", "general"):
         bare = compiled(program_of(load(name)))(*inputs)
-        assert Dynamics(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
+        assert Dynamics.of(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
 
 
 @every_scene
@@ -69,7 +69,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
         if term.name not in ("actuated links", "intermediate links"):
             assert term.value(scene), term.name
             scene = term.without(scene)
-    assert Dynamics(scene).program == Dynamics(load("example2_thin")).program
+    assert Dynamics.of(scene).program == Dynamics.of(load("example2_thin")).program
 
 
 def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
@@ -80,12 +80,12 @@ def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
 
 
 def test_no_angle_and_no_root_is_computed_in_a_plain_scene():
-    assert set(Dynamics(EXAMPLE2).program.operations) == {"add", "sub", "mul", "div"}
+    assert set(Dynamics.of(EXAMPLE2).program.operations) == {"add", "sub", "mul", "div"}
 
 
 def test_a_viscous_friction_costs_a_few_multiplications_only():
     scene = replace(EXAMPLE2, friction=JointFriction(gamma=Friction(viscous=0.1)))
-    extra = Dynamics(scene).program.operations - Dynamics(EXAMPLE2).program.operations
+    extra = Dynamics.of(scene).program.operations - Dynamics.of(EXAMPLE2).program.operations
     assert set(extra) <= {"add", "sub", "mul"}
     assert 3 <= extra.total() <= 6
 
@@ -93,7 +93,7 @@ def test_a_viscous_friction_costs_a_few_multiplications_only():
 @every_scene
 def test_a_sheet_says_all_that_one_asks(name):
     scene, said = load(name), sheet(load(name))
-    total = sum(Dynamics(scene).program.operations.values())
+    total = sum(Dynamics.of(scene).program.operations.values())
     assert said.startswith(f"{name}: {scene.description}\n")
     assert f"right-hand side: 7 states, {total} operations" in said
     for cost in costs(scene):

@@ -273,3 +273,10 @@ def test_a_scene_names_the_assembly_that_it_means():
         named = replace(scene, initial=replace(initial, orientation=wanted))
         found = Simulation(named).state.quaternion
         np.testing.assert_allclose(found, wanted, atol=1e-15)
+
+
+def test_what_the_same_constants_move_is_traced_once():
+    scene = load("friction")
+    again = Simulation(replace(scene, initial=Initial(gamma=(0.7, 0.7, 0.7))))
+    assert again.dynamics is Simulation(scene).dynamics
+    assert Simulation(load("swing")).dynamics is not again.dynamics

@@ -67,7 +67,7 @@ class Task:
         self.scene = scenes.load("example2")
         assert self.scene.torque is not None
         self.torque = self.scene.torque
-        self.dynamics = Dynamics(self.scene)
+        self.dynamics = Dynamics.of(self.scene)
         self.system = System(self.dynamics, self.torque)
         self.geometry = geometry = Geometry.of(self.scene)
         start = Simulation(self.scene).state

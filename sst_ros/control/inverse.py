@@ -30,7 +30,7 @@ class InverseDynamics:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        dynamics = Dynamics(scene)
+        dynamics = Dynamics.of(scene)
         self._moved = dynamics.moved
         self._program = dynamics.inverse
 

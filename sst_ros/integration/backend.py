@@ -17,8 +17,9 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from sst_ros.integration import loops
@@ -159,6 +160,9 @@ def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
 
 
 def _imported(path: Path) -> ModuleType:
+    known = sys.modules.get(path.stem)
+    if known is not None and known.__file__ == str(path):
+        return known
     _drop_damaged(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
@@ -186,8 +190,13 @@ def _drop_damaged(path: Path) -> None:
 
 def _executed(text: str, name: str) -> ModuleType:
     module = ModuleType(name)
-    exec(compile(text, f"<{name}>", "exec"), module.__dict__)
+    exec(_code(text, name), module.__dict__)
     return module
+
+
+@lru_cache(maxsize=64)
+def _code(text: str, name: str) -> CodeType:
+    return compile(text, f"<{name}>", "exec")
 
 
 def has_code(texts: list[str], constants: dict[str, Any], functions: Sequence[str]) -> bool:

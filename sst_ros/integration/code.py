@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from sst_ros.integration import backend
 from sst_ros.integration.machine import Machine, Method, has_code
-from sst_ros.integration.system import System
+from sst_ros.integration.system import working
 from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RODAS4
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.scene import Scene
@@ -22,7 +22,7 @@ def is_there(scene: Scene, integrator: str) -> bool:
     """Tell whether a run of the scene would find all of its code, whatever method it turns to."""
     if backend.numba_version() is None:
         return False
-    system = System(Dynamics(scene), work=True)
+    system = working(Dynamics.of(scene))
     return all(has_code(system, method) for method in _methods(integrator))
 
 
@@ -31,7 +31,7 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
 
     Where another process makes code this does nothing: it would take the processor from it.
     """
-    system = System(Dynamics(scene), work=True)
+    system = working(Dynamics.of(scene))
     folder = backend.cache_folder()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:

@@ -81,7 +81,8 @@ class Family:
             limits.append(member.torque_limit)
             self.scene = scene
         torque = self.scene.torque if profile else None
-        self.system = System(Dynamics(self.scene), torque)
+        dynamics = Dynamics.of(self.scene)
+        self.system, self._moved = System(dynamics, torque), dynamics.moved
         self.geometry: NDArray[np.intp] = np.array(which)
         self.torque_limit: Array = np.array(limits)
         self._tree: Constants = reduce(joined, [constants for constants, _ in kinds.values()])
@@ -106,7 +107,7 @@ class Family:
 
         def slope(*inputs: Expression) -> tuple[Any, ...]:
             at = self._constants(inputs[len(known) :])
-            system = System(Dynamics(self.scene, at.model), at.torque)
+            system = System(Dynamics(at.model, moved=self._moved), at.torque)
             return system.derivative(*inputs[: len(known)])
 
         return trace(slope, (*known, *self._names))

@@ -11,7 +11,7 @@ from sst_ros.integration import companion, loops
 from sst_ros.integration.driven import Driven
 from sst_ros.integration.ends import Ends
 from sst_ros.integration.events import first_met, meetings
-from sst_ros.integration.system import System
+from sst_ros.integration.system import working
 from sst_ros.integration.tableaux import METHODS, Rosenbrock
 from sst_ros.integration.touches import clear_of, just_beyond, may_touch, touches_of
 from sst_ros.integration.walk import CannotStep, Change, Leg, Mark, Walk
@@ -53,7 +53,7 @@ class Journey:
     ) -> None:
         self._scene = scene
         self._dynamics = dynamics
-        self._system = System(dynamics, work=True)
+        self._system = working(dynamics)
         self._limits = tuple(limits_of(scene, geometry))
         self._kinks = tuple(touches_of(scene, geometry))
         self._ranges = ranges_of([*self._limits, *clear_of(self._kinks)])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from operator import is_
 from types import ModuleType
 from typing import Any
@@ -132,6 +133,7 @@ def has_code(system: System, method: Method) -> bool:
     return backend.has_code(*_source(system, method), ("pair", "glide"))
 
 
+@lru_cache(maxsize=64)
 def _source(system: System, method: Method) -> tuple[list[str], dict[str, Any]]:
     """Functions of the machine's module, and its constants."""
     implicit, size = isinstance(method, Rosenbrock), len(system.state)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 from sst_ros.mechanism import energy, kernel
@@ -73,3 +73,9 @@ class System:
         if not self._work:
             return slope
         return (*slope, energy.power(model, state, torque, moment))
+
+
+@lru_cache(maxsize=32)
+def working(dynamics: Dynamics) -> System:
+    """Give the system that counts work: traced once for all runs of the same dynamics."""
+    return System(dynamics, work=True)

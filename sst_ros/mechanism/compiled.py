@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 from sst_ros.mechanism import energy, kernel
@@ -23,27 +23,34 @@ TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
+_MOST_RECENT = 32
+
 
 class Dynamics:
-    """Programs of a scene.
+    """Programs of a manipulator.
 
     Args:
-        scene: what is simulated.
-        model: its constants, where they are known or not all of them numbers.
+        model: its constants, numbers or not.
+        moved: by a moment that comes from a topic.
 
     Attributes:
-        model: constants.
+        model, moved: as given.
         state: names of the state's numbers: quaternion, body rate, lagged torques if any.
         drive: names of what acts from outside: torques, and a moment if it comes from a topic.
 
     """
 
-    def __init__(self, scene: Scene, model: kernel.Model | None = None) -> None:
-        self.model = kernel.model_of(scene) if model is None else model
-        lagging = self.model.time_constant is not None
+    def __init__(self, model: kernel.Model, *, moved: bool = False) -> None:
+        self.model, self.moved = model, moved
+        lagging = model.time_constant is not None
         self.state = (*QUATERNION, *RATE, *(LAG if lagging else ()))
-        self.moved = scene.moment is not None and scene.moment.topic
-        self.drive = (*TORQUE, *(MOMENT if self.moved else ()))
+        self.drive = (*TORQUE, *(MOMENT if moved else ()))
+
+    @staticmethod
+    def of(scene: Scene) -> Dynamics:
+        """Give those of a scene: traced once for all scenes that have the same constants."""
+        moved = scene.moment is not None and scene.moment.topic
+        return recent(kernel.model_of(scene), moved=moved)
 
     @cached_property
     def program(self) -> Program:
@@ -120,6 +127,9 @@ class Dynamics:
     def _split(self, inputs: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         size = len(self.state)
         return inputs[:size], inputs[size : size + 3], inputs[size + 3 :] or None
+
+
+recent = lru_cache(maxsize=_MOST_RECENT)(Dynamics)
 
 
 def compiled(program: Program) -> Function:

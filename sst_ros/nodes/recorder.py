@@ -27,7 +27,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from sst_ros.nodes import parameters, process
+from sst_ros.nodes import endpoints, parameters, process
 from sst_ros.nodes.bag_file import BagFile
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.readers import NeverSpun, take
@@ -67,16 +67,28 @@ class Recorder:
         """Subscribe to wanted topics as they appear; say once when all that speak were heard.
 
         DDS finds the topics of a node one after the other: none may have come since the last look.
+        Commands have to wait until a simulator is heard on all of its own, see `_answered`.
         """
-        known = len(self._readers)
+        settled = True
         for topic, kinds in self.node.get_topic_names_and_types():
             if topic in self._wanted and topic not in self._readers:
-                self._subscribe(topic, kinds[0])
+                settled = False
+                if self._answered(topic) <= self._heard.keys():
+                    self._subscribe(topic, kinds[0])
         speaking = {topic for topic in self._readers if self.node.count_publishers(topic)}
-        settled = known == len(self._readers)
         if not self._ready and settled and speaking and speaking <= self._heard.keys():
             self._ready = True
             print(f"ready: {len(self._readers)} topics", flush=True)
+
+    def _answered(self, topic: str) -> set[str]:
+        """Wanted topics that a simulator always publishes, if the topic is one of its commands.
+
+        Who commands may wait for readers of the commands, and then expects the run to be recorded.
+        """
+        node = topic.rpartition("/")[0]
+        if topic not in _names(node, endpoints.SUBSCRIBES):
+            return set()
+        return _names(node, endpoints.PUBLISHES) & self._wanted
 
     def _subscribe(self, topic: str, kind: str) -> None:
         if not self._bag.knows(kind):  # also keeps names that others chose away from the import
@@ -107,6 +119,13 @@ class Recorder:
                 self._bag.write(connection, received_ns, data)
                 self._heard[topic] = self._heard.get(topic, 0) + 1
         self._bag.save()
+
+
+def _names(node: str, use: str) -> set[str]:
+    """Topics of a simulator's node that are always there."""
+    found = (one.name for one in endpoints.SIMULATOR if one.use == use and not one.when)
+    space = node.rpartition("/")[0]
+    return {name.replace("~", node) if name[0] in "~/" else f"{space}/{name}" for name in found}
 
 
 def _taken(reader: Subscription) -> Iterator[tuple[bytes, int]]:

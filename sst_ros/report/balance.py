@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.integration import backend
-from sst_ros.integration.system import System
+from sst_ros.integration.system import working
 from sst_ros.mechanism import energy
 from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -48,7 +48,7 @@ def residual(recording: Recording, missing: list[str]) -> Array | None:
         until = recording.seconds[count - 1]
         missing.append(f"energy after {until:g} s: there is no numba to balance it")
     stored, work = np.full((2, len(recording.time_ns)), np.nan)
-    dynamics, geometry = Dynamics(recording.scene), Geometry.of(recording.scene)
+    dynamics, geometry = Dynamics.of(recording.scene), Geometry.of(recording.scene)
     workers = _Workers(dynamics, course, recording, compiled=many)
     for part in slices(count, CHUNK, "energy", shown=False):
         rows = slice(part.start, min(part.stop + 1, count))
@@ -71,7 +71,7 @@ class _Workers:
         self._course = course
         self._energy = trace(lambda *state: (_stored(dynamics.model, state),), dynamics.state)
         self._compiled = compiled and backend.numba_version() is not None
-        system = System(dynamics, work=True)
+        system = working(dynamics)
         size, drive = len(system.state), len(system.drive)
         self._module = module(system.program, dynamics, size, drive, compiled=self._compiled)
         self._time = recording.time_ns

@@ -99,7 +99,7 @@ TERMS = (
 
 def operations(scene: Scene) -> int:
     """Operations in one evaluation of the right-hand side."""
-    return sum(Dynamics(scene).program.operations.values())
+    return sum(Dynamics.of(scene).program.operations.values())
 
 
 @dataclass(frozen=True)

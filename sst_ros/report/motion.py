@@ -73,7 +73,7 @@ class Motion:
     """
 
     def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
-        self.dynamics = Dynamics(scene)
+        self.dynamics = Dynamics.of(scene)
         self.compiled = compiled and backend.numba_version() is not None
         drive = self.dynamics.drive if torque is None else ()
         size = len(self.dynamics.state)
@@ -119,7 +119,7 @@ class Motion:
 
 def held(recording: Recording) -> Course:
     """Return the recorded ticks, torques within the limit of the actuators."""
-    ticks, dynamics = recording.ticks, Dynamics(recording.scene)
+    ticks, dynamics = recording.ticks, Dynamics.of(recording.scene)
     limit = _limit(recording.scene)
     torque = ticks.torque if limit is None else np.clip(ticks.torque, -limit, limit)
     if dynamics.moved and ticks.moment is not None:

@@ -20,7 +20,7 @@ WIDTH = 100
 
 def sheet(scene: Scene) -> str:
     """Write the sheet of a scene as text."""
-    dynamics = Dynamics(scene)
+    dynamics = Dynamics.of(scene)
     parts = (
         [f"{scene.name}: {scene.description}"],
         ["geometry", *_columns(_geometry(scene))],

@@ -83,7 +83,7 @@ class Trial:
     def __init__(self, scene: Scene, like: Trial | None = None) -> None:
         self.scene = scene
         self.geometry = Geometry.of(scene)
-        self.dynamics = Dynamics(scene)
+        self.dynamics = Dynamics.of(scene)
         self.system = System(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)

@@ -47,7 +47,7 @@ def rounding(scene, sample, acceleration, torque, moment=None):
 def test_direct_dynamics_undo_inverse_dynamics_with_every_term(sample, number, acceleration):
     scene = loaded(sample, number)
     torque = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, acceleration)
-    found = Dynamics(scene).derivative(*sample.state, *torque)[4:]
+    found = Dynamics.of(scene).derivative(*sample.state, *torque)[4:]
     error = np.abs(np.subtract(found, acceleration)).max()
     assert error <= rounding(scene, sample, acceleration, torque)
 
@@ -59,7 +59,7 @@ def test_a_moment_from_a_topic_counts(sample, acceleration):
     moment = tuple(sample.moment.tolist())
     inverse = InverseDynamics(scene)
     torque = inverse.torque(sample.quaternion, sample.body_rate, acceleration, moment)
-    found = Dynamics(scene).derivative(*sample.state, *torque, *moment)[4:]
+    found = Dynamics.of(scene).derivative(*sample.state, *torque, *moment)[4:]
     error = np.abs(np.subtract(found, acceleration)).max()
     assert error <= rounding(scene, sample, acceleration, torque, moment)
 
@@ -103,7 +103,7 @@ def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
 
 
 def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():
-    assert Dynamics(load("example1")).program.operations.total() <= 290
+    assert Dynamics.of(load("example1")).program.operations.total() <= 290
 
 
 def test_near_a_serial_singularity_a_torque_is_finite_or_refused():

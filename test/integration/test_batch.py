@@ -86,7 +86,7 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
     free = ~np.isfinite(found.fault_time)
     assert free.sum() > LANES
     start, _ = batch.start(inside, (0.0, 0.0, 0.0))
-    machine = Machine(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), method, compiled=False)
+    machine = Machine(System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), method, compiled=False)
     for n in np.flatnonzero(free):
         alone = machine.march(0.0, 2e-3, 60, start[:, n].tolist(), [])
         assert alone == [*found.quaternion[n], *found.body_rate[n]]

@@ -123,7 +123,7 @@ def test_a_row_has_the_bits_of_steps_of_its_scene(manipulators, samples, result)
     gamma, gamma_dot, torque = starts(samples)
     y, _ = manipulators.start(gamma, gamma_dot)
     for n in [n for n, text in enumerate(result.fault) if not text][:4]:
-        system = System(Dynamics(manipulators.scenario(n)))
+        system = System(Dynamics.of(manipulators.scenario(n)))
         machine = Machine(system, DORMAND_PRINCE, compiled=False)
         ended = machine.march(0.0, 2e-3, 100, y[:, n].tolist(), torque[n].tolist())
         assert ended == [*result.quaternion[n], *result.body_rate[n]]

@@ -59,7 +59,7 @@ def apart(y, truth):
     [(8, 3, 5, 1e-6), (8, 6, 6, 1e-9), (12, 3, 6, 1e-9), (12, 5, 8, 1e-12)],
 )
 def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, error):
-    system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
+    system = System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
     method = Collocation(system, nodes, compiled=False)
     flight = method.march(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
     assert apart(flight.y, truth) < error
@@ -71,7 +71,7 @@ def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, e
 @pytest.mark.parametrize(("nodes", "steps"), [(2, 128), (3, 48), (4, 24)])
 def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
     """Iterated to the end. Eight nodes come to rounding before their limit."""
-    method = Collocation(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
+    method = Collocation(System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
     coarse, fine = (
         apart(method.march(0.0, 1.0 / n, n, STATE, iterations=20).y, truth)
         for n in (steps, 2 * steps)
@@ -83,7 +83,7 @@ def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
 @pytest.fixture(scope="module")
 def methods(tmp_path_factory):
     """The same method compiled and plain."""
-    system = System(Dynamics(EXAMPLE2), EXAMPLE2.torque)
+    system = System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
         compiled = Collocation(system, 4)
@@ -111,7 +111,7 @@ def test_a_course_is_flown_again_and_again_and_from_elsewhere(truth, methods, wa
 @pytest.mark.parametrize("way", ["compiled", "plain"])
 def test_what_cannot_be_flown_is_refused(methods, way):
     with pytest.raises(InputError, match="nodes"):
-        Collocation(System(Dynamics(EXAMPLE2), EXAMPLE2.torque), 0)
+        Collocation(System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), 0)
     method = methods[way]
     with pytest.raises(InputError, match=r"count(.|\n)*iterations"):
         method.course(0.0, 0.1, 0, STATE, iterations=0)
@@ -136,7 +136,7 @@ def test_every_term_lag_and_a_drive_are_carried_along():
     from sst_ros.integration.tableaux import DOP853
 
     scene = loaded()
-    system = System(Dynamics(scene), work=True)
+    system = System(Dynamics.of(scene), work=True)
     state = Simulation(scene).state
     y = [*state.quaternion, *state.body_rate, *(0.0,) * (len(system.state) - 7)]
     drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]

@@ -33,7 +33,7 @@ def start(scene, size):
 
 
 def system_of(scene, torque=None, work=False):
-    return System(Dynamics(scene), torque, work=work)
+    return System(Dynamics.of(scene), torque, work=work)
 
 
 def both(scene, method, cache, monkeypatch):
@@ -84,7 +84,7 @@ def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method(tmp_path, 
     y = [0.0, 0.6, 0.0, 0.8, 1.0, -2.0, 30.0]
     ends = []
     for by_numba in (False, True):
-        machine = Machine(Top(Dynamics(EXAMPLE2)), RODAS4, compiled=by_numba)
+        machine = Machine(Top(Dynamics.of(EXAMPLE2)), RODAS4, compiled=by_numba)
         ends.append(machine.pair(0.0, 0.01, y, y, DRIVE))
     assert ends[0] == ends[1]
     assert math.dist(ends[0][0], y) > 0.1
@@ -154,7 +154,7 @@ def test_jacobians_are_exact(what, seed):
     """
     (sample,) = seeded_samples(seed + 80, 1)
     scene = loaded() if what == "loaded" else sample.scene
-    dynamics = Dynamics(scene)
+    dynamics = Dynamics.of(scene)
     y = [*start(scene, 7)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
     y = [x + 0.003 * (seed + 1) * (-1) ** i for i, x in enumerate(y)]
     slope, by_time, matrix = linearised(scene, None, 0.0, [*y, 0.0], (*DRIVE, *MOMENT))
@@ -180,7 +180,7 @@ def test_the_derivative_by_time_is_exact():
     y = [*start(EXAMPLE2, 7)[:4], 0.3, -0.2, 0.4, 0.0]
     slope, by_time, _ = linearised(EXAMPLE2, torque, t, y, ())
     rows = list(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
-    model = Dynamics(EXAMPLE2).model
+    model = Dynamics.of(EXAMPLE2).model
     now = tuple(a * math.sin(f * t + p) for a, f, p in rows)
     rate = tuple(a * f * math.cos(f * t + p) for a, f, p in rows)
     moving, free = (np.array(derivative(model, tuple(y[:7]), tau)) for tau in (rate, (0.0,) * 3))

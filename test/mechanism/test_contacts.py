@@ -28,7 +28,7 @@ def actuator_rates(sample, body_rate):
 @pytest.mark.parametrize("sample", seeded_samples(11, 4))
 @pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 def test_an_impact_keeps_the_momenta_of_the_other_actuators(sample, restitution):
-    ends = RigidEnds(Dynamics(sample.scene))
+    ends = RigidEnds(Dynamics.of(sample.scene))
     after = actuator_rates(sample, ends.after_impact(sample.state, 1, restitution)[4:])
     before = sample.gamma_dot
     mass = -virtual_work.equation_of_motion(sample.mechanism, sample.posture, before)[0]
@@ -44,7 +44,7 @@ def test_an_impact_keeps_the_momenta_of_the_other_actuators(sample, restitution)
 
 @pytest.mark.parametrize("sample", seeded_samples(12, 4))
 def test_held_actuators_do_not_accelerate_and_others_feel_only_the_coupling(sample):
-    dynamics = Dynamics(sample.scene)
+    dynamics = Dynamics.of(sample.scene)
     still = dataclasses.replace(sample, gamma_dot=np.array([0.0, sample.gamma_dot[1], 0.0]))
     torque = tuple(sample.torque.tolist())
     slope = dynamics.derivative(*still.state, *torque)
@@ -72,7 +72,7 @@ def complementary(impulse, motion, inward):
 @pytest.mark.parametrize("signs", ALL_SIGNS)
 @pytest.mark.parametrize("sample", seeded_samples(13, 4))
 def test_ends_hold_what_they_push_and_leave_what_they_would_pull(sample, signs):
-    dynamics = Dynamics(sample.scene)
+    dynamics = Dynamics.of(sample.scene)
     ends, inward = RigidEnds(dynamics), dict(enumerate(signs))
     still = dataclasses.replace(sample, gamma_dot=np.zeros(3))
     torque = tuple(sample.torque.tolist())
@@ -89,7 +89,7 @@ def test_ends_hold_what_they_push_and_leave_what_they_would_pull(sample, signs):
 @pytest.mark.parametrize("sample", seeded_samples(14, 4))
 def test_an_impact_presses_on_what_rests_or_tears_it_off(sample, signs):
     """The actuator of leg 0 comes to its end; the others rest against theirs."""
-    ends, inward = RigidEnds(Dynamics(sample.scene)), dict(enumerate(signs))
+    ends, inward = RigidEnds(Dynamics.of(sample.scene)), dict(enumerate(signs))
     coming = dataclasses.replace(sample, gamma_dot=np.array([-signs[0], 0.0, 0.0]))
     legs = ends.kicked(coming.state, 0, inward)
     assert legs[0] == 0
@@ -100,7 +100,7 @@ def test_an_impact_presses_on_what_rests_or_tears_it_off(sample, signs):
 
 @pytest.mark.parametrize("sample", seeded_samples(15, 4))
 def test_what_has_drifted_off_its_end_is_put_back(sample):
-    ends = RigidEnds(Dynamics(sample.scene))
+    ends = RigidEnds(Dynamics.of(sample.scene))
     wanted = {0: sample.gamma[0] + 1e-6, 2: sample.gamma[2] - 1e-6}
     state = ends.with_rates(ends.with_angles(sample.state, wanted), {1: 0.5})
     rotation = rotation_matrix(np.array(state[:4]))

@@ -145,8 +145,8 @@ def test_rotor_and_gear_are_an_inertia_of_the_actuated_link():
         Link(inertia=dataclasses.replace(link.inertia, xx=1.0, yy=1.0, zz=link.inertia.zz + 0.05))
         for link in sample.scene.actuated_links
     )
-    expected = Dynamics(only(sample, actuated_links=heavier)).derivative
-    found = Dynamics(with_rotor).derivative
+    expected = Dynamics.of(only(sample, actuated_links=heavier)).derivative
+    found = Dynamics.of(with_rotor).derivative
     inputs = (*sample.state, *sample.torque)
     assert found(*inputs) == pytest.approx(expected(*inputs), rel=1e-13)
 
@@ -174,8 +174,10 @@ def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
     )
     star = dataclasses.replace(sample.scene.star, inertia=inertia)
     inputs = (*sample.state, *sample.torque)
-    found = Dynamics(carried).derivative(*inputs)
-    assert found == pytest.approx(Dynamics(only(sample, star=star)).derivative(*inputs), rel=1e-13)
+    found = Dynamics.of(carried).derivative(*inputs)
+    assert found == pytest.approx(
+        Dynamics.of(only(sample, star=star)).derivative(*inputs), rel=1e-13
+    )
 
 
 def test_elastic_ends_push_only_beyond_the_stroke_and_never_pull():
@@ -210,8 +212,8 @@ def test_springs_at_one_joint_add_up():
 def test_lagging_actuators_follow_the_command_with_their_time_constant():
     scene = only(seeded_samples(10, 1)[0], actuators=Actuators(time_constant=0.05))
     sample = seeded_samples(10, 1)[0]
-    dynamics = Dynamics(scene)
+    dynamics = Dynamics.of(scene)
     has, asked = (0.1, 0.2, 0.3), (1.0, -1.0, 0.5)
     found = dynamics.derivative(*sample.state, *has, *asked)
     assert found[7:] == pytest.approx([18.0, -24.0, 4.0], rel=1e-14)
-    assert found[:7] == Dynamics(sample.scene).derivative(*sample.state, *has)
+    assert found[:7] == Dynamics.of(sample.scene).derivative(*sample.state, *has)

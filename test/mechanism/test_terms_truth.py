@@ -73,7 +73,7 @@ def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
     truth = LoadedLagrange(scene, sample.rotation)
     loads = truth.loads(sample.gamma, sample.gamma_dot)
     expected = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque + loads)
-    slope = Dynamics(scene).derivative(*sample.state, *sample.torque.tolist())
+    slope = Dynamics.of(scene).derivative(*sample.state, *sample.torque.tolist())
     bias = virtual_work.bias(sample.posture, sample.gamma_dot).omega_dot
     found = np.linalg.solve(sample.posture.j, sample.rotation @ np.array(slope[4:]) - bias)
     expected = np.array(expected, dtype=float)
@@ -122,7 +122,7 @@ def resistance(friction, v):
 def test_work_becomes_kinetic_energy_and_heat_by_scipys_integrator():
     """Work and heat are integrated beside the motion; 1e-9 of the work is asked for."""
     scene, torque = load_scene("friction"), sine(load_scene("friction").torque)
-    dynamics = Dynamics(scene)
+    dynamics = Dynamics.of(scene)
     kinds = (scene.friction.gamma, scene.friction.mu, scene.friction.beta)
 
     def rates(t, y):
@@ -156,7 +156,7 @@ def test_friction_alone_never_speeds_anything_up():
 
 def period(scene, start, direction):
     """Time between the first and the last of some zeros of the motion along a direction [s]."""
-    dynamics, simulation = Dynamics(scene), Simulation(scene)
+    dynamics, simulation = Dynamics.of(scene), Simulation(scene)
     here = (*simulation.state.quaternion, *simulation.state.body_rate)
 
     def crossing(_, y):
@@ -275,5 +275,5 @@ def test_a_link_without_inertia_is_one_of_vanishing_inertia():
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
     bare = replace(scene, intermediate_links=(Link(),) * 3)
     light = replace(scene, intermediate_links=(Link(inertia=tiny),) * 3)
-    found, expected = (Dynamics(s).derivative(*inputs) for s in (bare, light))
+    found, expected = (Dynamics.of(s).derivative(*inputs) for s in (bare, light))
     assert found == pytest.approx(expected, rel=1e-9)

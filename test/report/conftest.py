@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sst_ros import scene
+from sst_ros.mechanism import compiled, kernel
 
 # bags.py is loaded by its path: as `report.bags` it would need a package test/report.
 _SPEC = importlib.util.spec_from_file_location(
@@ -37,3 +38,16 @@ def written(tmp_path, bags):
         return bags.write(tmp_path / "bag", entries, **options)
 
     return write
+
+
+@pytest.fixture
+def wrong_kernel(monkeypatch):
+    """Falsify what the kernel's derivative gives, and what has been traced from it or will be."""
+    right = kernel.derivative
+
+    def put(wrong):
+        monkeypatch.setattr(kernel, "derivative", lambda *given: wrong(right(*given)))
+        compiled.recent.cache_clear()
+
+    yield put
+    compiled.recent.cache_clear()

@@ -14,7 +14,6 @@ from matplotlib import image
 from sst_ros import scene
 from sst_ros.bodies import Inertia
 from sst_ros.errors import InputError
-from sst_ros.mechanism import kernel
 from sst_ros.report.accuracy import ABOVE_REFERENCE, study
 from sst_ros.report.accuracy_figure import draw
 from sst_ros.report.accuracy_run import page
@@ -107,15 +106,9 @@ def test_another_inertia_in_the_runs_is_seen():
     assert "WARNING" in text(found)
 
 
-def test_a_kernel_that_is_wrong_everywhere_is_seen(monkeypatch):
+def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
     """Where reference and runs share the fault, the paper's equations do not."""
-    right = kernel.derivative
-
-    def wrong(*arguments):
-        *rest, last = right(*arguments)[:7]
-        return (*rest, last * (1.0 + 1e-7))
-
-    monkeypatch.setattr(kernel, "derivative", wrong)
+    wrong_kernel(lambda right: (*right[:6], right[6] * (1.0 + 1e-7)))
     found = study(BRIEF, compiled=False, longest_s=0.001)
     assert 1e-9 < found.formulation < 1e-6
     assert any("paper's equations" in words for words in found.warnings)

@@ -28,7 +28,7 @@ def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():
 def test_the_advised_steps_of_other_scenes_resolve_their_motion(name):
     scene = load(name)
     step = float(re.match(r"dopri5 with steps of (\S+) s or less", advise(scene))[1])
-    system = System(Dynamics(scene))
+    system = System(Dynamics.of(scene))
     machine = Machine(system, DORMAND_PRINCE, compiled=False)
     start = list(states.initial(scene))
     drive = [0.0] * len(system.drive)

@@ -156,21 +156,15 @@ def test_long_ticks_are_cut_into_short_steps(run):
     assert found.steps >= 20 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
 
 
-def test_the_formulations_agree_and_a_wrong_kernel_is_seen(run, monkeypatch):
+def test_the_formulations_agree_and_a_wrong_kernel_is_seen(run, wrong_kernel):
     found = formulation.check(run)
     assert found.states == 20 and found.relative < 1e-12
-    right = kernel.derivative
-    monkeypatch.setattr(
-        kernel, "derivative", lambda *given: tuple(1.0000001 * x for x in right(*given))
-    )
+    wrong_kernel(lambda right: [1.0000001 * x for x in right])
     assert 5e-8 < formulation.check(run).relative < 2e-7
 
 
-def test_a_kernel_that_is_wrong_shows_in_the_integration_too(run, monkeypatch):
-    right = kernel.derivative
-    monkeypatch.setattr(
-        kernel, "derivative", lambda *given: tuple(1.0000001 * x for x in right(*given))
-    )
+def test_a_kernel_that_is_wrong_shows_in_the_integration_too(run, wrong_kernel):
+    wrong_kernel(lambda right: [1.0000001 * x for x in right])
     assert reference.integration(run).error.gamma.max() > 1e-9
 
 

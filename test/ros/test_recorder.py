@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 import signal
+from functools import partial
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from std_msgs.msg import Float64MultiArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
 
 pytestmark = pytest.mark.ros
 
@@ -31,6 +36,39 @@ def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path
                 stamps.append(stamp.sec * 10**9 + stamp.nanosec)
     run = [stamp for stamp in stamps if stamp]
     assert run == [run[0] + 2_000_000 * k for k in range(151)]
+
+
+def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observer, tmp_path):
+    """Who commands waits for their readers: what the recorder has not found would be lost."""
+    node = "/sst_simulator"
+    kinds = {
+        "/joint_states": JointState,
+        f"{node}/orientation": QuaternionStamped,
+        f"{node}/euler_zyz": Vector3Stamped,
+        f"{node}/applied_torques": JointTrajectory,
+        f"{node}/scene": String,
+        f"{node}/phase": String,
+        "/diagnostics": DiagnosticArray,
+    }
+    make = observer.node.create_publisher
+    speak = [(make(kind, topic, 10), kind()) for topic, kind in kinds.items() if "ori" not in topic]
+    observer.node.create_subscription(Float64MultiArray, f"{node}/commands", print, 10)
+    recorder = nodes.run("recorder", output=tmp_path / "bag")
+    said = 0
+
+    def say_all(times):
+        nonlocal said
+        for publisher, message in speak:
+            publisher.publish(message)
+        said += all(publisher.get_subscription_count() for publisher, _ in speak)
+        return said > times
+
+    commanded = partial(observer.node.count_subscribers, f"{node}/commands")
+    observer.until(partial(say_all, 20), "readers of all but one")  # 20 x 0.05 s: many looks
+    assert commanded() == 1
+    speak.append((make(QuaternionStamped, f"{node}/orientation", 10), QuaternionStamped()))
+    observer.until(lambda: say_all(0) and commanded() == 2, "reader of the commands")
+    assert nodes.line(recorder) == "ready: 8 topics\n"
 
 
 def test_an_existing_folder_is_refused(nodes, tmp_path):
