@@ -9,13 +9,12 @@ import select
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sst_ros import scene
+from sst_ros import child, scene
 from sst_ros.control.motions import motion_of
 from sst_ros.errors import SstError
 from sst_ros.report import tracking_run
@@ -120,22 +119,8 @@ def _room(folder: Path) -> Path:
 
 @contextmanager
 def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
-    """Start a node of ours in a domain of this demo; it does not outlive the block."""
-    values = (
-        (key, str(value).lower() if isinstance(value, bool) else value)
-        for key, value in given.items()
-    )
-    options = [word for key, value in values for word in ("-p", f"{key}:={value}")]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sst_ros", command, "--ros-args", *options],
-        env={
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            **os.environ,
-        },
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    """Start a node; it does not outlive the block."""
+    process = child.start(command, given, stdout=subprocess.PIPE)
     try:
         yield process
     finally:

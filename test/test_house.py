@@ -10,7 +10,7 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"errors", "folder", "schema", "document", "progress", "json_schema", "partial"},
+    {"child", "errors", "folder", "schema", "document", "progress", "json_schema", "partial"},
     {"bodies", "terms", "desired_motions", "scene"},
     {"mechanism"},
     {"limits", "integration"},

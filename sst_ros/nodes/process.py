@@ -15,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from sst_ros.child import orphaned
 from sst_ros.errors import SstError
 from sst_ros.nodes import handles, middleware
 
@@ -33,7 +34,7 @@ class Worker(Protocol):
 
 
 def run(name: str, build: Callable[[], Worker], args: list[str] | None = None) -> int:
-    """Run until SIGINT, SIGTERM or the worker is done; return the exit status.
+    """Run until SIGINT, SIGTERM, or the worker is done, or its parent; return the exit status.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker close.
     """
@@ -60,7 +61,7 @@ def _spin(build: Callable[[], Worker], stop: threading.Event) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(worker.node)
     try:
-        while not stop.is_set() and not worker.done.is_set():
+        while not (stop.is_set() or worker.done.is_set() or orphaned()):
             executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
     finally:
         try:

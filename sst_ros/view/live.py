@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from sst_ros import child
 
 PUBLISH_RATE = 100
 """Samples a second [Hz]: more than a screen shows."""
@@ -17,18 +17,9 @@ _END_S = 10.0
 
 @contextmanager
 def simulator(scene: str, speed: float = 1.0) -> Iterator[None]:
-    """Run a simulator of a scene in a ROS domain of this process, on this machine only.
-
-    A domain that the environment names is used as it is; `speed` is simulated time per time.
-    """
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    """Run a simulator of a scene; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": PUBLISH_RATE, "real_time_factor": speed}
-    words = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sst_ros", "simulator", "--ros-args", *words],
-        stdout=subprocess.DEVNULL,
-    )
+    process = child.start("simulator", given, stdout=subprocess.DEVNULL)
     try:
         yield
     finally:

@@ -3,6 +3,8 @@
 
 import math
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -147,6 +149,16 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
     status, _, err = nodes.stop(process)
     told = err.count("command dropped")
     assert status == 0 and 1 <= told <= time.monotonic() - start + 1.0
+
+
+def test_kill_of_a_view_ends_its_simulator(nodes, observer):
+    looking = "from sst_ros.view.live import simulator\nwith simulator('swing'): input()"
+    viewer = subprocess.Popen([sys.executable, "-c", looking], stdin=subprocess.PIPE)
+    names = observer.node.get_node_names
+    observer.until(lambda: "sst_simulator" in names(), "simulator")
+    viewer.kill()
+    viewer.communicate()
+    observer.until(lambda: "sst_simulator" not in names(), "end of it", 10.0)
 
 
 def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer):
