@@ -33,6 +33,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
 from benchmark import machine
+from sst_ros import child
 from sst_ros.nodes import realtime
 from sst_ros.nodes.pacing import Pacer, SteadyTime
 
@@ -75,8 +76,7 @@ class Process:
     """A node in a process of its own, and the kernel's account of it."""
 
     def __init__(self, command: str, namespace: str = "/", **given: Any) -> None:
-        words = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
-        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words]
+        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *child.words(given)]
         argv += ["-r", f"__ns:={namespace}"]
         self._process = subprocess.Popen(
             argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

@@ -24,17 +24,21 @@ def start(command: str, given: dict[str, object], **more: Any) -> subprocess.Pop
     # A domain that the environment names is used as it is.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    values = (
-        (key, str(value).lower() if isinstance(value, bool) else value)
-        for key, value in given.items()
-    )
-    words = [word for key, value in values for word in ("-p", f"{key}:={value}")]
     return subprocess.Popen(
-        [sys.executable, "-m", "sst_ros", command, "--ros-args", *words],
+        [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)],
         env={**os.environ, PARENT: str(os.getpid())},
         text=True,
         **more,
     )
+
+
+def words(given: dict[str, object]) -> list[str]:
+    """Give parameters as --ros-args takes them."""
+    values = (
+        (key, str(value).lower() if isinstance(value, bool) else value)
+        for key, value in given.items()
+    )
+    return [word for key, value in values for word in ("-p", f"{key}:={value}")]
 
 
 def orphaned() -> bool:

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 _PARTS = 50
 
 
-def slices(total: int, size: int | None, label: str, shown: bool) -> Iterator[slice]:
-    """Yield slices of `size`, or some fifty; where `shown`, draw a bar if stderr is a terminal."""
+def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
+    """Yield slices of `size`, 0 for some fifty; where `shown`, draw a bar on a terminal."""
     size = size or max(1, total // _PARTS)
     drawn = shown and sys.stderr.isatty()
     for start in range(0, total, size):

@@ -9,7 +9,7 @@ import signal
 import threading
 from pathlib import Path
 
-from sst_ros import scene
+from sst_ros import child, scene
 from sst_ros.commands import Commands
 from sst_ros.errors import InputError, Problem
 
@@ -53,10 +53,9 @@ def _view(options: argparse.Namespace) -> int:
 def _live(options: argparse.Namespace) -> int:
     from sst_ros.nodes import viewer
 
-    given = {"simulator": options.simulator, "host": options.host, "port": options.port}
-    given["open"] = str(options.open).lower()
-    words = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
-    return viewer.main(["viewer", "--ros-args", "-r", f"__ns:={options.namespace}", *words])
+    given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
+    space = f"__ns:={options.namespace}"
+    return viewer.main(["viewer", "--ros-args", "-r", space, *child.words(given)])
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -139,7 +139,7 @@ class Batch:
         given = self.drives(torque, number)
         when, error = np.full(number, np.nan), np.zeros(number)
         kept = [y[:7].T.copy()] if keep_every else []
-        for part in slices(count, keep_every or None, self.scene.name, progress):
+        for part in slices(count, keep_every, self.scene.name, progress):
             span = part.stop - part.start
             self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
             if keep_every and span == keep_every:

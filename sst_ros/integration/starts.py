@@ -47,7 +47,7 @@ def starts(
     code = np.full(count, NO_ASSEMBLY, dtype=np.int64)
     order = np.argsort(which, kind="stable")
     groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(geometries)))[:-1])
-    for part in slices(len(geometries), None, label, progress):
+    for part in slices(len(geometries), 0, label, progress):
         for geometry, rows in zip(geometries[part], groups[part], strict=True):
             found = kinematics.direct_many(geometry, gamma[rows])
             counts = np.bincount(found.configuration[found.admissible], minlength=len(rows))

@@ -112,7 +112,7 @@ class Variants:
         problems: list[Problem] = []
         count = self.count or 1
         label = f"{self.document.name}, preparing"
-        for part in slices(count, None, label, progress and bool(self.keys)):
+        for part in slices(count, 0, label, progress and bool(self.keys)):
             for row in range(part.start, part.stop):
                 try:
                     scene = self.scene(row)

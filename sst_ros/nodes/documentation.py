@@ -144,8 +144,7 @@ def _rules(group: str, entry: str, right: str, names: Iterable[str]) -> Iterator
 def _names(node: Described, use: str) -> Iterator[str]:
     for endpoint in node.endpoints:
         if endpoint.use == use:
-            name = endpoint.name.replace("~", f"/{node.name}").format(simulator=f"/{SIMULATOR}")
-            yield name if name.startswith("/") else f"/{name}"
+            yield endpoint.at(f"/{node.name}").format(simulator=SIMULATOR)
 
 
 def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:

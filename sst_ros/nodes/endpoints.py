@@ -53,6 +53,11 @@ class Endpoint:
         package, form, *_ = self.kind.__module__.split(".")
         return f"{package}/{form}/{self.kind.__name__}"
 
+    def at(self, node: str) -> str:
+        """Give its full name at the node of this full name."""
+        name = self.name.replace("~", node)
+        return name if name.startswith("/") else f"{node.rpartition('/')[0]}/{name}"
+
     def publisher(self, node: Node, depth: int = 0) -> Publisher:
         """Open it for publishing."""
         durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from array import array
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -21,16 +19,13 @@ from sst_ros.control.controller import Command, Measured
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.triples import ZERO, axpy
-from sst_ros.nodes import endpoints, parameters, process
+from sst_ros.nodes import endpoints, middleware, parameters, process
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.commands import ACTUATORS
 from sst_ros.nodes.companion_pursuit import Pursuit, Stage
 from sst_ros.nodes.companion_settings import CompanionParameters
 from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.torque_commands import TorqueCommands
-
-_ACKNOWLEDGE_S = 2.0
-"""Longest wait at the end for readers to have it all."""
 
 KEYS = {
     "stage": "what it does",
@@ -75,11 +70,8 @@ class InverseDynamics:
             self._commands.send(ZERO)
         self._report()
         self._tell()
-        deadline = time.monotonic() + _ACKNOWLEDGE_S
         told = (self._commands.publisher, self._reference, self._error, self._diagnostics)
-        for publisher in told:
-            left = max(0.0, deadline - time.monotonic())
-            publisher.wait_for_all_acked(Duration(seconds=left))
+        middleware.finish(told)
 
     def _hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does."""

@@ -9,11 +9,18 @@ ten times a second it is done in a few tens of microseconds.
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
 """Of ROS 2 Kilted."""
+
+_ACKNOWLEDGE_S = 2.0
 
 
 def configure() -> None:
@@ -33,3 +40,11 @@ def _generation() -> int:
     except (PackageNotFoundError, ValueError):
         return 3
     return 3 if major >= _FIRST_RCLPY_ON_FAST_DDS_3 else 2
+
+
+def finish(publishers: Iterable[Publisher]) -> None:
+    """Wait a while until readers have it all; what they have not yet taken outlives the writer."""
+    deadline = time.monotonic() + _ACKNOWLEDGE_S
+    for publisher in publishers:
+        left = max(0.0, deadline - time.monotonic())
+        publisher.wait_for_all_acked(Duration(seconds=left))

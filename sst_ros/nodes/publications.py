@@ -11,14 +11,12 @@ only add switches between threads.
 from __future__ import annotations
 
 import contextlib
-import time
 
-from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from sst_ros.document import dump
-from sst_ros.nodes import endpoints
+from sst_ros.nodes import endpoints, middleware
 from sst_ros.nodes.clocks import OwnClock
 from sst_ros.nodes.commands import Moving, Settings
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
@@ -29,7 +27,6 @@ from sst_ros.simulation import State, Triple
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
-_ACKNOWLEDGE_S = 2.0
 
 
 class Publications:
@@ -110,11 +107,8 @@ class Publications:
         return [] if self._clock is None else self._clock.rivals()
 
     def finish(self) -> None:
-        """Wait until readers have it all; what they have not yet taken outlives us."""
-        deadline = time.monotonic() + _ACKNOWLEDGE_S
-        for publisher in self._node.publishers:
-            left = max(0.0, deadline - time.monotonic())
-            publisher.wait_for_all_acked(Duration(seconds=left))
+        """Wait until readers have it all."""
+        middleware.finish(self._node.publishers)
 
     def _read(self) -> list[tuple[Send, Template]]:
         """Messages of the state that somebody reads."""

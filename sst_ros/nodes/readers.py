@@ -41,7 +41,6 @@ def reader(node: Node, topic: Endpoint) -> Callable[[], Any]:
     subscription = node.create_subscription(
         topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
     )
-
     look, kind = handles.keep(subscription.handle).take_message, topic.kind
 
     def next_message() -> Any:

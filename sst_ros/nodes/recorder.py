@@ -67,20 +67,20 @@ class Recorder:
         """Subscribe to wanted topics as they appear; say once when all that speak were heard.
 
         DDS finds the topics of a node one after the other: none may have come since the last look.
-        Commands have to wait until a simulator is heard on all of its own, see `_answered`.
+        Commands have to wait until a simulator is heard on all of its own, see `_heard_first`.
         """
         settled = True
         for topic, kinds in self.node.get_topic_names_and_types():
             if topic in self._wanted and topic not in self._readers:
                 settled = False
-                if self._answered(topic) <= self._heard.keys():
+                if self._heard_first(topic) <= self._heard.keys():
                     self._subscribe(topic, kinds[0])
         speaking = {topic for topic in self._readers if self.node.count_publishers(topic)}
         if not self._ready and settled and speaking and speaking <= self._heard.keys():
             self._ready = True
             print(f"ready: {len(self._readers)} topics", flush=True)
 
-    def _answered(self, topic: str) -> set[str]:
+    def _heard_first(self, topic: str) -> set[str]:
         """Wanted topics that a simulator always publishes, if the topic is one of its commands.
 
         Who commands may wait for readers of the commands, and then expects the run to be recorded.
@@ -123,9 +123,7 @@ class Recorder:
 
 def _names(node: str, use: str) -> set[str]:
     """Topics of a simulator's node that are always there."""
-    found = (one.name for one in endpoints.SIMULATOR if one.use == use and not one.when)
-    space = node.rpartition("/")[0]
-    return {name.replace("~", node) if name[0] in "~/" else f"{space}/{name}" for name in found}
+    return {one.at(node) for one in endpoints.SIMULATOR if one.use == use and not one.when}
 
 
 def _taken(reader: Subscription) -> Iterator[tuple[bytes, int]]:

@@ -136,9 +136,7 @@ class Simulator:
     def _report(self) -> None:
         """Publish the diagnostics, log what is new, ask for gauges for the next time."""
         publishers = sum(
-            self.node.count_publishers(
-                topic.name.replace("~", self.node.get_fully_qualified_name())
-            )
+            self.node.count_publishers(topic.at(self.node.get_fully_qualified_name()))
             for topic in (endpoints.COMMANDS, endpoints.COMMANDS_STAMPED)
         )
         level, said, news = self._health.judge(publishers, self._publications.rivals())
