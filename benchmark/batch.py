@@ -22,13 +22,13 @@ import numpy as np
 from benchmark import c_batch, c_floor, machine, variants
 from benchmark.timing import interleaved, ratio
 from sst_ros import scene as scenes
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.blocks import LANES
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853, RK4, Tableau
-from sst_ros.mechanism import kernel
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.scene import Scene
+from sst_ros.integration.batch_source import LANES
+from sst_ros.integration.methods import DOP853, RK4, Tableau
+from sst_ros.integration.ode import System
+from sst_ros.scene.scene import Scene
 
 METHODS = {"rk4": RK4, "dop853": DOP853}
 SIMD = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")

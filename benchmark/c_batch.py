@@ -12,7 +12,7 @@ import re
 import subprocess
 from pathlib import Path
 
-from sst_ros.integration.blocks import batch_source
+from sst_ros.integration.batch_source import batch_source
 
 HEAD = """\
 #include <math.h>

@@ -13,9 +13,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from sst_ros.integration.steps import explicit_step
-from sst_ros.integration.tableaux import Tableau
-from sst_ros.mechanism.trace import Program
+from sst_ros.dynamics.expression import Program
+from sst_ros.integration.methods import Tableau
+from sst_ros.integration.runge_kutta_source import explicit_step
 
 HEAD = "#include <math.h>\n#define abs fabs\n#define max fmax\n#define nan NAN\n"
 

@@ -21,11 +21,11 @@ import numpy as np
 
 from benchmark import machine as described
 from benchmark.timing import interleaved
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import METHODS, RODAS4
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import METHODS, RODAS4
+from sst_ros.integration.ode import System
+from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
 REPEATS = 7

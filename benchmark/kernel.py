@@ -22,11 +22,11 @@ import numpy as np
 from benchmark import c_floor, machine
 from benchmark.timing import interleaved, ratio
 from sst_ros import scene as scenes
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.trace import Program
+from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
+from sst_ros.integration.ode import System
 from sst_ros.simulation import Simulation
 
 METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}

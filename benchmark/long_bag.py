@@ -27,16 +27,16 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from benchmark import machine
-from sst_ros import document
 from sst_ros import scene as scenes
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
-from sst_ros.report.messages import JOINTS
-from sst_ros.report.motion import Course, Motion
+from sst_ros.recording.collector import JOINTS
+from sst_ros.report.fixed_step_motion import Course, Motion
 from sst_ros.report.states import by_columns, initial
-from sst_ros.scene import Scene
-from sst_ros.terms import Friction, JointFriction, Spring
+from sst_ros.scene import yaml_document
+from sst_ros.scene.loads import Friction, JointFriction, Spring
+from sst_ros.scene.scene import Scene
 
 AT_MOST_S, AT_MOST_GB = 120.0, 1.5
 START_NS, TICK_NS, TICKS_A_SAMPLE = 1_700_000_000_000_000_000, 1_000_000, 2
@@ -76,7 +76,7 @@ def write(path: Path, seconds: float, *, sqlite: bool = False, shown: bool = Fal
             for topic, message in kinds.items()
         }
         raw = {t: bytes(STORE.serialize_cdr(m, m.__msgtype__)) for t, m in kinds.items()}
-        text = _make("std_msgs/String", data=document.dump(scene))
+        text = _make("std_msgs/String", data=yaml_document.dump(scene))
         told = writer.add_connection("/sst_simulator/scene", text.__msgtype__, typestore=STORE)
         writer.write(told, START_NS, STORE.serialize_cdr(text, text.__msgtype__))
         for rows, run in _run(scene, samples, shown):

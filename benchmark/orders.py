@@ -18,13 +18,13 @@ from scipy.integrate import solve_ivp
 
 from benchmark import machine
 from sst_ros import scene as scenes
-from sst_ros.control.torque import sine
-from sst_ros.integration.collocation import Collocation
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4, RODAS4
-from sst_ros.mechanism import kernel
-from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.gauss import Collocation
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, RODAS4
+from sst_ros.integration.ode import System
 from sst_ros.simulation import Simulation
 
 SPAN = 0.4

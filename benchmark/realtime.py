@@ -33,9 +33,9 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
 from benchmark import machine
-from sst_ros import child
-from sst_ros.nodes import realtime
-from sst_ros.nodes.pacing import Pacer, SteadyTime
+from sst_ros import child_process
+from sst_ros.runtime import realtime
+from sst_ros.runtime.pacing import Pacer, SteadyTime
 
 PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
 TICK = os.sysconf("SC_CLK_TCK")
@@ -76,7 +76,7 @@ class Process:
     """A node in a process of its own, and the kernel's account of it."""
 
     def __init__(self, command: str, namespace: str = "/", **given: Any) -> None:
-        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *child.words(given)]
+        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *child_process.words(given)]
         argv += ["-r", f"__ns:={namespace}"]
         self._process = subprocess.Popen(
             argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -269,7 +269,7 @@ def _growth(memory: list[tuple[float, int]], wall: float) -> str:
 
 
 def _recorded(bag: Path) -> str:
-    from sst_ros.report import recording
+    from sst_ros.recording import recording
 
     run = recording.read(bag)
     # The last sample is where the run was stopped, perhaps before its time.

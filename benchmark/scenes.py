@@ -29,9 +29,9 @@ sys.path.insert(0, str(ROOT / "test"))
 
 from mechanism.bare_kernel import program_of  # noqa: E402
 
-from sst_ros.mechanism.compiled import Dynamics  # noqa: E402
-from sst_ros.mechanism.trace import Program  # noqa: E402
-from sst_ros.scene import load, names  # noqa: E402
+from sst_ros.dynamics.expression import Program  # noqa: E402
+from sst_ros.dynamics.traced_dynamics import Dynamics  # noqa: E402
+from sst_ros.scene.scene import load, names  # noqa: E402
 
 PLAIN = "example2"
 ROUNDS = 41
@@ -53,7 +53,7 @@ def inputs(program: Program) -> tuple[float, ...]:
 
 def in_python(program: Program) -> Callable[[], float]:
     """Seconds of a call, by a loop in the interpreter."""
-    from sst_ros.mechanism.compiled import compiled
+    from sst_ros.dynamics.traced_dynamics import compiled
 
     function, at = compiled(program), inputs(program)
 

@@ -17,8 +17,8 @@ import numpy as np
 from benchmark import machine
 from benchmark.timing import interleaved
 from sst_ros import scene as scenes
-from sst_ros.integration.system import System
-from sst_ros.mechanism.compiled import Dynamics, compiled
+from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
+from sst_ros.integration.ode import System
 from sst_ros.simulation import Simulation
 
 SCENES = ("example2", "general", "gravity_payload", "friction")

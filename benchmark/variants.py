@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 COUNT = 100
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from sst_ros import load_scene
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report.figures import BLUE, GREEN, GREY, VERMILION
+from sst_ros.plot.paper_figures import BLUE, GREEN, GREY, VERMILION
 
 GAMMA = np.array([0.95, 0.62, 0.80])  # rad
 INK = "#222222"

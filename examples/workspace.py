@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_ros.mechanism import singularities, workspace
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report.workspace_figure import draw
+from sst_ros.plot.workspace import draw
 
 MANIPULATORS = {
     "Isotropic: v = I, α = 120°, 120°, 120°": Geometry.build(np.eye(3), np.radians([120] * 3)),

@@ -11,7 +11,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from sst_ros.description.urdf import urdf
-from sst_ros.scene import load
+from sst_ros.scene.scene import load
 
 ARGUMENTS = {
     "scene": ("swing", "scene, by name or by path of a .yaml file"),

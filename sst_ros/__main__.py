@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = result.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:
-        importlib.import_module(f"sst_ros.commands.{name}").add(commands)
+        importlib.import_module(f"sst_ros.cli.{name}").add(commands)
     return result
 
 

@@ -14,10 +14,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sst_ros import child, scene
-from sst_ros.control.motions import motion_of
+from sst_ros import child_process, scene
+from sst_ros.control.reference_motions import motion_of
 from sst_ros.errors import SstError
-from sst_ros.report import tracking_run
+from sst_ros.report import tracking_report
 from sst_ros.report.run import report
 from sst_ros.report.table import table
 
@@ -59,7 +59,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
         bag = _room(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
         follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
-        print(tracking_run.report(bag, out / mode), flush=True)
+        print(tracking_report.report(bag, out / mode), flush=True)
     return 0
 
 
@@ -120,7 +120,7 @@ def _room(folder: Path) -> Path:
 @contextmanager
 def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
     """Start a node; it does not outlive the block."""
-    process = child.start(command, given, stdout=subprocess.PIPE)
+    process = child_process.start(command, given, stdout=subprocess.PIPE)
     try:
         yield process
     finally:

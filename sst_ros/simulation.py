@@ -11,17 +11,17 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.kernel import Joints
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import Diverged, InputError, Problem
-from sst_ros.integration.backend import numba_version
-from sst_ros.integration.journey import Journey, Point
-from sst_ros.integration.tableaux import METHODS
-from sst_ros.integration.walk import CannotStep, Change
-from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.integration.adaptive_stepper import CannotStep, Change
+from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.methods import METHODS
+from sst_ros.integration.propagator import Journey, Point
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.kernel import Joints
-from sst_ros.mechanism.start import initial_state
-from sst_ros.mechanism.triples import axpy, cross, dot, rotation_rows, turned_back
-from sst_ros.scene import Scene
+from sst_ros.mechanism.vec3 import axpy, cross, dot, rotation_rows, turned_back
+from sst_ros.scene.scene import Scene
 
 NANOSECONDS = 1_000_000_000
 AUTO = "auto"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from sst_ros.scene import (
+from sst_ros.scene.scene import (
     Actuators,
     Friction,
     JointFriction,

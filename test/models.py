@@ -15,10 +15,11 @@ from hypothesis import HealthCheck, assume, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sst_ros.mechanism import kernel, kinematics, virtual_work
+from sst_ros.dynamics import kernel
+from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Base, Inertia, Initial, Link, Scene, Star
+from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star
 
 COUNT = 64
 FAST = settings(

@@ -8,11 +8,11 @@ import pytest
 from one_freedom import inertia, slope
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
 from sst_ros.errors import StrokeExceeded
-from sst_ros.mechanism import kernel
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.scene import load
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000

@@ -13,6 +13,7 @@ import pytest
 from loaded_scenes import IGNORE, REST
 from models import inertia_of
 
+from sst_ros.dynamics import kernel
 from sst_ros.errors import (
     AssemblyError,
     NoAdmissibleAssembly,
@@ -20,14 +21,14 @@ from sst_ros.errors import (
     SingularConfiguration,
     SstError,
 )
-from sst_ros.mechanism import kernel, kinematics, singularities, workspace
+from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report import catalogue
-from sst_ros.scene import Initial, load
+from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation import Simulation
+from sst_ros.studies import extreme_cases
 
-CASES = list(catalogue.cases())
+CASES = list(extreme_cases.cases())
 EXAMPLE2 = load("example2")
 LONGEST = 60.0
 """Seconds for any case on a busy machine: what must not happen is an endless loop."""
@@ -41,7 +42,7 @@ def finite(state):
 @pytest.mark.parametrize("case", CASES, ids=[case.name.replace(" ", "-") for case in CASES])
 def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     began = time.perf_counter()
-    outcome = catalogue.run(case)
+    outcome = extreme_cases.run(case)
     assert time.perf_counter() - began < LONGEST
     if outcome.simulation is not None:
         assert finite(outcome.simulation.state)

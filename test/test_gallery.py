@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.control.torque import sine
+from sst_ros.cli.scene_check import check
+from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.report.check import check
-from sst_ros.scene import load, names
+from sst_ros.scene.scene import load, names
 from sst_ros.simulation import Simulation
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"

@@ -10,16 +10,19 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"child", "errors", "folder", "schema", "document", "progress", "json_schema", "partial"},
-    {"bodies", "terms", "desired_motions", "scene"},
+    {"child_process", "errors", "output_folder", "progress"},
+    {"scene"},
     {"mechanism"},
-    {"limits", "integration"},
+    {"dynamics"},
+    {"integration"},
     {"simulation"},
-    {"control", "report", "description"},
-    {"study", "plot", "view"},
+    {"control", "description"},
+    {"recording"},
+    {"plot", "report", "studies", "view"},
+    {"runtime"},
     {"nodes"},
     {"demo"},
-    {"commands", "__main__"},
+    {"cli", "__main__"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 FILES = sorted(PACKAGE.rglob("*.py"))

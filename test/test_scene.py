@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from sst_ros import scene as scenes
-from sst_ros.document import dump, read
 from sst_ros.errors import InputError
-from sst_ros.scene import Inertia, Scene, load, names
+from sst_ros.scene.scene import Inertia, Scene, load, names
+from sst_ros.scene.yaml_document import dump, read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")
@@ -114,6 +114,6 @@ def test_a_copy_without_optional_parts_reads_back_equal():
 
 
 def test_an_installation_without_scenes_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(scenes, "__file__", str(tmp_path / "a" / "scene.py"))
+    monkeypatch.setattr("sst_ros.scene.scene.__file__", str(tmp_path / "a" / "scene.py"))
     with pytest.raises(InputError, match=r"config/scenes = .*: was not installed"):
         scenes.share_directory()

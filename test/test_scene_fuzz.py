@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from models import FAST
 from trees import changed
 
-from sst_ros.document import dump, read
+from sst_ros.cli.scene_check import check
 from sst_ros.errors import InputError
-from sst_ros.report.check import check
-from sst_ros.report.sheet import sheet
-from sst_ros.scene import Scene, names
+from sst_ros.scene.scene import Scene, names
+from sst_ros.scene.yaml_document import dump, read
+from sst_ros.studies.scene_summary import sheet
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCES = {name: (FOLDER / f"{name}.yaml").read_text(encoding="utf-8") for name in names()}

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from sst_ros.document import read
 from sst_ros.errors import InputError
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.document import read
+from sst_ros.cli.scene_check import check
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.report.check import check
-from sst_ros.scene import Scene, load
+from sst_ros.scene.scene import Scene, load
+from sst_ros.scene.yaml_document import read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")

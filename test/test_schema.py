@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from models import FAST
 from trees import changed
 
-from sst_ros.document import dump, read
 from sst_ros.errors import InputError
-from sst_ros.scene import Base, Inertia, Initial, Link, Scene, Star, Stroke, Workspace, load
-from sst_ros.schema import Section, flag, integer, texts
+from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star, Stroke, Workspace, load
+from sst_ros.scene.schema import Section, flag, integer, texts
+from sst_ros.scene.yaml_document import dump, read
 
 SOURCE = (Path(__file__).parents[1] / "config/scenes/example2.yaml").read_text(encoding="utf-8")
 TREE = yaml.safe_load(SOURCE)

@@ -10,12 +10,8 @@ import pytest
 from mechanism.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
-from sst_ros.mechanism.compiled import Dynamics, compiled
-from sst_ros.report.advice import advise
-from sst_ros.report.costs import TERMS, costs, operations
-from sst_ros.report.sheet import WIDTH, sheet
-from sst_ros.scene import Scene, load, names
-from sst_ros.terms import (
+from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
+from sst_ros.scene.loads import (
     Actuators,
     Friction,
     JointFriction,
@@ -23,6 +19,10 @@ from sst_ros.terms import (
     Spring,
     Stroke,
 )
+from sst_ros.scene.scene import Scene, load, names
+from sst_ros.studies.scene_summary import WIDTH, sheet
+from sst_ros.studies.step_advice import advise
+from sst_ros.studies.term_costs import TERMS, costs, operations
 
 EXAMPLE2 = load("example2")
 every_scene = pytest.mark.parametrize("name", names())

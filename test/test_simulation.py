@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from models import seeded_samples
 
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.energy import kinetic
 from sst_ros.errors import (
     AmbiguousAssembly,
     Diverged,
@@ -19,10 +21,8 @@ from sst_ros.errors import (
     StrokeExceeded,
     WorkspaceLeft,
 )
-from sst_ros.mechanism import kernel
-from sst_ros.mechanism.energy import kinetic
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.scene import Initial, Stroke, Workspace, load
+from sst_ros.scene.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000

@@ -10,9 +10,9 @@ import pytest
 from loaded_scenes import loaded, viscous
 
 from sst_ros.errors import RunStopped, StrokeExceeded
-from sst_ros.integration.backend import numba_version
-from sst_ros.integration.machine import Machine
-from sst_ros.scene import Initial, Workspace, load
+from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.scene.scene import Initial, Workspace, load
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000

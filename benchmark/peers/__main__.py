@@ -17,7 +17,7 @@ from benchmark.peers import floor, page, picture, reference, results
 from benchmark.peers.series import Series
 from benchmark.peers.study import TARGETS, studied
 from benchmark.peers.task import Task
-from sst_ros.integration.backend import numba_version
+from sst_ros.integration.codegen import numba_version
 
 MODULES = {
     "ours": "numba",

@@ -23,8 +23,8 @@ from numpy.polynomial import legendre
 from benchmark import c_floor
 from benchmark.peers.task import DURATION, Task
 from benchmark.timing import interleaved
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.tableaux import DOP853, RK4
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DOP853, RK4
 from sst_ros.mechanism.frames import rotation_matrix
 
 _STEPS = 400

@@ -7,9 +7,9 @@ import numpy as np
 
 from benchmark.peers.series import Run, Series, Setting, ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
-from sst_ros.integration.collocation import Collocation
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, RK4, Tableau
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.gauss import Collocation
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, Tableau
 
 ENGINE, PACKAGE = "sst_ros", "numba"
 

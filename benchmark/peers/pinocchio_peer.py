@@ -16,7 +16,7 @@ import numpy as np
 from benchmark.peers import tree
 from benchmark.peers.series import Failed, Run, Series, Setting, ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
-from sst_ros.integration.tableaux import DOP853, RK4, Tableau
+from sst_ros.integration.methods import DOP853, RK4, Tableau
 
 ENGINE, PACKAGE = "Pinocchio", "pin"
 MU, ITERATIONS = 0.1, 5

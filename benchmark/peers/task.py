@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros import scene as scenes
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DOP853
+from sst_ros.integration.ode import System
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.simulation import Simulation

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.control.coordinates import Coordinates
-from sst_ros.control.desired import Desired, Quadruple, Triple
-from sst_ros.control.planned import PlannedMotion
+from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.reference import Desired, Quadruple, Triple
+from sst_ros.control.rest_to_rest import PlannedMotion
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix

@@ -6,11 +6,11 @@ from __future__ import annotations
 import math
 
 from sst_ros.control.actuator_motions import Path
-from sst_ros.control.desired import Triple
-from sst_ros.control.planned import parts
 from sst_ros.control.quintic import minimum_jerk
+from sst_ros.control.reference import Triple
+from sst_ros.control.rest_to_rest import parts
 from sst_ros.control.star_motions import PIECES, timed
-from sst_ros.desired_motions import Sweep, ToAngles
+from sst_ros.scene.motions import Sweep, ToAngles
 
 
 def straight_path(start: Triple, goal: ToAngles) -> Path:

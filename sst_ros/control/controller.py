@@ -26,17 +26,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control import attitude
-from sst_ros.control.control_settings import MODES, ControlSettings
-from sst_ros.control.desired import Desired, Motion, Triple
-from sst_ros.control.inverse import InverseDynamics
-from sst_ros.control.observer import OrientationObserver
+from sst_ros.control import orientation_error
+from sst_ros.control.controller_settings import MODES, ControlSettings
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.orientation_observer import OrientationObserver
+from sst_ros.control.reference import Desired, Motion, Triple
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.triples import ZERO, added, axpy, cross, dot, rotation_rows, scaled
-from sst_ros.scene import Scene
+from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
+from sst_ros.scene.scene import Scene
 
 __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measured"]
 
@@ -196,14 +196,14 @@ class Controller:
 
     def _on_so3(self, desired: Desired, now: Desired) -> tuple[Triple, Triple]:
         """W_dot in {E}, and the rotation vector of the error."""
-        between = attitude.between(now.quaternion, desired.quaternion)
+        between = orientation_error.between(now.quaternion, desired.quaternion)
         turn = rotation_rows(between)
         rate, forward = (
             _three(dot(row, vector) for row in turn)
             for vector in (desired.body_rate, desired.body_acceleration)
         )
         moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
-        phi = attitude.rotation_vector(between)
+        phi = orientation_error.rotation_vector(between)
         wanted, summed = self._wanted(phi, axpy(1.0, rate, -1.0, now.body_rate))
         return added(moving, wanted), summed
 

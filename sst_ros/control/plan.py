@@ -12,15 +12,15 @@ import numpy as np
 from scipy.integrate import simpson
 from scipy.optimize import brentq
 
-from sst_ros.control.coordinates import Coordinates
-from sst_ros.control.desired import Desired, Triple
-from sst_ros.control.extremes import Extreme, largest, least, widest
-from sst_ros.control.inverse import InverseDynamics
-from sst_ros.control.planned import PlannedMotion
+from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.peaks import Extreme, largest, least, widest
+from sst_ros.control.reference import Desired, Triple
+from sst_ros.control.rest_to_rest import PlannedMotion
+from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
-from sst_ros.limits import SINGULAR_MU
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene import Actuators, Scene
+from sst_ros.scene.scene import Actuators, Scene
 
 SAMPLES = 16
 """Parts of a piece of the motion; even, for Simpson's rule."""

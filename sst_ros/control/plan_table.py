@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sst_ros.control.inverse import InverseDynamics
+from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.plan import Demand, Distance, Plan, limits
-from sst_ros.control.speed import Speed
+from sst_ros.control.time_scaling import Speed
 
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 

@@ -8,10 +8,10 @@ from abc import abstractmethod
 
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.coordinates import Coordinates
-from sst_ros.control.desired import Desired, Quadruple, Triple
-from sst_ros.control.planned import PlannedMotion, parts
+from sst_ros.control.actuator_space import Coordinates
 from sst_ros.control.quintic import minimum_jerk
+from sst_ros.control.reference import Desired, Quadruple, Triple
+from sst_ros.control.rest_to_rest import PlannedMotion, parts
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism.geometry import Geometry
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.bodies import Inertia, Payload
 from sst_ros.description.tree import LEGS, STAR, actuated, intermediate
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene import Scene, Vector
+from sst_ros.scene.bodies import Inertia, Payload
+from sst_ros.scene.scene import Scene, Vector
 
 PAYLOAD = "payload"
 

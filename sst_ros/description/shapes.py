@@ -14,7 +14,7 @@ import numpy as np
 
 from sst_ros.description.tree import BASE, LEGS, STAR, actuated, intermediate
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 Colour = tuple[float, float, float]
 

@@ -18,10 +18,10 @@ import numpy as np
 from sst_ros.description.inertials import Body, bodies
 from sst_ros.description.shapes import Ball, Box, Colour, Shape, shapes
 from sst_ros.description.tree import BASE, Joint, tree
-from sst_ros.limits import limits_of, ranges_of
+from sst_ros.dynamics.limits import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene import LARGEST, Friction, Scene
-from sst_ros.terms import JOINTS
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import LARGEST, Friction, Scene
 
 _NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
      star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration import backend
-from sst_ros.integration.blocks import LANES, NOT_FINITE, batch_source
-from sst_ros.integration.family import Family
-from sst_ros.integration.starts import SAID, starts
-from sst_ros.integration.tableaux import DOP853, Tableau
-from sst_ros.integration.variants import Variants
-from sst_ros.mechanism.compiled import TORQUE
+from sst_ros.integration import codegen
+from sst_ros.integration.batch_source import LANES, NOT_FINITE, batch_source
+from sst_ros.integration.initial_states import SAID, starts
+from sst_ros.integration.methods import DOP853, Tableau
+from sst_ros.integration.parametric_model import Family
+from sst_ros.integration.scenarios import Variants
 from sst_ros.mechanism.geometry import Array
-from sst_ros.mechanism.trace import Program
 from sst_ros.progress import slices
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -84,7 +84,7 @@ class Batch:
         progress: bool = False,
     ) -> None:
         problems = []
-        if backend.numba_version() is None:
+        if codegen.numba_version() is None:
             problems.append(Problem("numba", None, "must be installed: pip install sst_ros[fast]"))
         if scene.stroke.at_end == "impact":
             problems.append(Problem("stroke.at_end", "impact", "must not be impact in a batch"))
@@ -209,7 +209,7 @@ class Batch:
     @cached_property
     def _module(self) -> ModuleType:
         text = batch_source(self.program, self.margins, self._method, len(self.state))
-        return backend.load([text], {"NODES": self._method.c}, numba=True, nogil=True)
+        return codegen.load([text], {"NODES": self._method.c}, numba=True, nogil=True)
 
     def _said(self, row: int, code: int) -> str:
         if code == 0:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from scipy.optimize import brentq
 
-from sst_ros.limits import Limit
+from sst_ros.dynamics.limits import Limit
 
 Signal = Callable[[float], float]
 Meeting = tuple[Limit, Signal, Signal]

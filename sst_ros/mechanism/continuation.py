@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.assemblies import ROUNDING, cross, turned
+from sst_ros.mechanism.direct_kinematics import ROUNDING, cross, turned
 from sst_ros.mechanism.geometry import Array, Geometry
 
 SAFE = 0.18

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
-from sst_ros.mechanism.assemblies import cross, rotations
+from sst_ros.mechanism.direct_kinematics import cross, rotations
 from sst_ros.mechanism.geometry import Array, Geometry
 
 RESIDUAL = 1e-14

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.assemblies import cross
+from sst_ros.mechanism.direct_kinematics import cross
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 

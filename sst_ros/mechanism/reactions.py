@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.mechanism import rates, virtual_work
-from sst_ros.mechanism.assemblies import cross
+from sst_ros.mechanism.direct_kinematics import cross
 from sst_ros.mechanism.geometry import Array
 from sst_ros.mechanism.virtual_work import Mechanism, Posture
 

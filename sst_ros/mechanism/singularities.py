@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.assemblies import columns, cross
+from sst_ros.mechanism.direct_kinematics import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, measures, orientations
 

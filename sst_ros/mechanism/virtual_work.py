@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.assemblies import cross
+from sst_ros.mechanism.direct_kinematics import cross
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 SINGULAR = 1e-12
 """Smallest abs(det J2) and abs(c_k) for which the velocity analysis is done."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.assemblies import columns, cross
+from sst_ros.mechanism.direct_kinematics import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
 

@@ -13,8 +13,8 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.nodes import endpoints
-from sst_ros.nodes.template import Template
+from sst_ros.nodes import topics
+from sst_ros.nodes.raw_messages import Template
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must not stand still with simulated time."""
@@ -49,7 +49,7 @@ class OwnClock:
         if others:
             allowed = f"/clock is published already, by {', '.join(others)}"
             raise InputError(origin, [Problem(given, True, allowed)])
-        self._publisher = endpoints.CLOCK.publisher(node)
+        self._publisher = topics.CLOCK.publisher(node)
         self._message = Template(ClockMessage())
         self.now_ns = node.get_clock().now().nanoseconds
 

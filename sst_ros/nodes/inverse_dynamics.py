@@ -18,14 +18,14 @@ from sst_ros import scene
 from sst_ros.control.controller import Command, Measured
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
-from sst_ros.mechanism.triples import ZERO, axpy
-from sst_ros.nodes import endpoints, middleware, parameters, process
+from sst_ros.mechanism.vec3 import ZERO, axpy
+from sst_ros.nodes import middleware, parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.commands import ACTUATORS
-from sst_ros.nodes.companion_pursuit import Pursuit, Stage
-from sst_ros.nodes.companion_settings import CompanionParameters
 from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.torque_commands import TorqueCommands
+from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.trajectory_following import Pursuit, Stage
 
 KEYS = {
     "stage": "what it does",
@@ -50,16 +50,16 @@ class InverseDynamics:
         given = self._parameters = parameters.declare(self.node, CompanionParameters)
         self._pursuit = Pursuit(scene.load(given.scene), given)
         self._commands = TorqueCommands(self.node, given)
-        self._reference = endpoints.REFERENCE.publisher(self.node)
-        self._error = endpoints.TRACKING_ERROR.publisher(self.node)
-        self._diagnostics = endpoints.DIAGNOSTICS.publisher(self.node)
+        self._reference = topics.REFERENCE.publisher(self.node)
+        self._error = topics.TRACKING_ERROR.publisher(self.node)
+        self._diagnostics = topics.DIAGNOSTICS.publisher(self.node)
         self._seen: Measured | None = None
         self._places: tuple[list[str], list[int]] = ([], [])
         self._began = self._finished = False
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, f"{given.simulator}/phase", self._hear, latched)
         self.node.create_subscription(JointState, "joint_states", self._answer, 1)
-        taken = endpoints.JOINT_TRAJECTORY
+        taken = topics.JOINT_TRAJECTORY
         self.node.create_subscription(taken.kind, taken.name, self._take, taken.depth)
         self.node.create_timer(0.5, self._watch, clock=STEADY)
         self.node.create_timer(1.0, self._report, clock=STEADY)

@@ -13,8 +13,8 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.errors import SstError
-from sst_ros.nodes.commands import ACTUATORS
-from sst_ros.nodes.template import Template, Write, marks
+from sst_ros.nodes.raw_messages import Template, Write, marks
+from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation import NANOSECONDS, State
 
 JOINTS = [*ACTUATORS, "mu_1", "mu_2", "mu_3", "beta_1", "beta_2", "beta_3"]

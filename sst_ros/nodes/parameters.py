@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.schema import Section, Spec, specs
+from sst_ros.scene.schema import Section, Spec, specs
 
 P = TypeVar("P", bound=Section)
 

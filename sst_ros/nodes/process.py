@@ -15,9 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from sst_ros.child import orphaned
+from sst_ros.child_process import orphaned
 from sst_ros.errors import SstError
-from sst_ros.nodes import handles, middleware
+from sst_ros.nodes import middleware, raw_handles
 
 _SPIN_PERIOD_S = 0.1
 """So late may a signal be heard; to spin once takes half a millisecond, asked for or not."""
@@ -68,6 +68,6 @@ def _spin(build: Callable[[], Worker], stop: threading.Event) -> int:
             worker.close()
         finally:
             executor.shutdown()
-            handles.release()
+            raw_handles.release()
             worker.node.destroy_node()
     return 0

@@ -15,13 +15,13 @@ import contextlib
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from sst_ros.document import dump
-from sst_ros.nodes import endpoints, middleware
+from sst_ros.nodes import middleware, topics
 from sst_ros.nodes.clocks import OwnClock
-from sst_ros.nodes.commands import Moving, Settings
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
-from sst_ros.nodes.template import Outlet, Send, Template
-from sst_ros.scene import Scene
+from sst_ros.nodes.raw_messages import Outlet, Send, Template
+from sst_ros.runtime.torque_input import Moving, Settings
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation import State, Triple
 
 _HISTORY_S = 2
@@ -38,11 +38,11 @@ class Publications:
         self._clock = OwnClock(node) if given.publish_clock else None
         samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
-        topics = (endpoints.JOINT_STATES, endpoints.ORIENTATION, endpoints.EULER_ZYZ)
-        state = [Outlet(topic.publisher(node, depth)) for topic in topics]
-        self._torques = Outlet(endpoints.APPLIED_TORQUES.publisher(node, depth))
-        self._phase = endpoints.PHASE.publisher(node)
-        self._scene = endpoints.SCENE.publisher(node)
+        states = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ)
+        state = [Outlet(topic.publisher(node, depth)) for topic in states]
+        self._torques = Outlet(topics.APPLIED_TORQUES.publisher(node, depth))
+        self._phase = topics.PHASE.publisher(node)
+        self._scene = topics.SCENE.publisher(node)
         self._scene.publish(String(data=dump(scene)))
         self._messages = StateMessages()
         self._state = tuple(zip(state, self._messages.templates, strict=True))

@@ -27,11 +27,11 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from sst_ros.nodes import endpoints, parameters, process
-from sst_ros.nodes.bag_file import BagFile
+from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.readers import NeverSpun, take
-from sst_ros.nodes.settings import RecorderParameters
+from sst_ros.nodes.raw_readers import NeverSpun, take
+from sst_ros.recording.bag_writer import BagFile
+from sst_ros.runtime.settings import RecorderParameters
 
 _DEPTH = 10000
 _DRAIN_PERIOD_S = 0.02
@@ -86,9 +86,9 @@ class Recorder:
         Who commands may wait for readers of the commands, and then expects the run to be recorded.
         """
         node = topic.rpartition("/")[0]
-        if topic not in _names(node, endpoints.SUBSCRIBES):
+        if topic not in _names(node, topics.SUBSCRIBES):
             return set()
-        return _names(node, endpoints.PUBLISHES) & self._wanted
+        return _names(node, topics.PUBLISHES) & self._wanted
 
     def _subscribe(self, topic: str, kind: str) -> None:
         if not self._bag.knows(kind):  # also keeps names that others chose away from the import
@@ -123,7 +123,7 @@ class Recorder:
 
 def _names(node: str, use: str) -> set[str]:
     """Topics of a simulator's node that are always there."""
-    return {one.at(node) for one in endpoints.SIMULATOR if one.use == use and not one.when}
+    return {one.at(node) for one in topics.SIMULATOR if one.use == use and not one.when}
 
 
 def _taken(reader: Subscription) -> Iterator[tuple[bytes, int]]:

@@ -9,9 +9,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from sst_ros.nodes import endpoints
-from sst_ros.nodes.commands import ZERO, Refused, named
-from sst_ros.nodes.run_loop import RunLoop
+from sst_ros.nodes import topics
+from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.torque_input import ZERO, Refused, named
 
 
 class Services:
@@ -20,12 +20,12 @@ class Services:
     def __init__(self, node: Node, loop: RunLoop) -> None:
         self._node, self._loop = node, loop
         for endpoint, answer in (
-            (endpoints.PAUSE, self._pause),
-            (endpoints.STEP, self._step),
-            (endpoints.RESET, self._reset),
+            (topics.PAUSE, self._pause),
+            (topics.STEP, self._step),
+            (topics.RESET, self._reset),
         ):
             node.create_service(endpoint.kind, endpoint.name, answer)
-        topic = endpoints.SET_STATE
+        topic = topics.SET_STATE
         node.create_subscription(topic.kind, topic.name, self._set_state, topic.depth)
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

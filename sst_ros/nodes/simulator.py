@@ -15,28 +15,27 @@ from rclpy.node import Node
 from sst_ros import scene
 from sst_ros.errors import RunStopped
 from sst_ros.nodes import (
-    description,
-    endpoints,
-    gauges,
-    interfaces,
-    machine_code,
+    compiled_code,
     parameters,
     process,
-    realtime,
+    robot_description,
+    simulation_interfaces,
+    topics,
 )
 from sst_ros.nodes.clocks import HEARD_GRAIN_NS, STEADY, HeardTime, follows_clock
-from sst_ros.nodes.commands import ZERO, CommandBoard
-from sst_ros.nodes.endpoints import Endpoint
-from sst_ros.nodes.health import Health
 from sst_ros.nodes.messages import diagnostics
-from sst_ros.nodes.pacing import Pacer, SteadyTime
 from sst_ros.nodes.publications import Publications
-from sst_ros.nodes.readers import reader
-from sst_ros.nodes.run_loop import RunLoop
-from sst_ros.nodes.run_parts import Phase, Reply
+from sst_ros.nodes.raw_readers import reader
 from sst_ros.nodes.services import Services
-from sst_ros.nodes.settings import SimulatorParameters
-from sst_ros.scene import Scene
+from sst_ros.nodes.topics import Endpoint
+from sst_ros.runtime import gauges, realtime
+from sst_ros.runtime.diagnostics import Health
+from sst_ros.runtime.pacing import Pacer, SteadyTime
+from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.run_types import Phase, Reply
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import ZERO, CommandBoard
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Simulation
 
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
@@ -54,15 +53,15 @@ class Simulator:
         self._publications = Publications(self.node, simulated, self)
         self._board = CommandBoard(self, simulated.actuators, *self._readers(simulated))
         self._pacer = self._paced()
-        self._compiled = given.compiled and machine_code.use(self.node, simulated, given)
+        self._compiled = given.compiled and compiled_code.use(self.node, simulated, given)
         self._loop = RunLoop(
             simulated, self._build, self, self._board, self._pacer, self._publications
         )
         self._health = Health(self._loop, self._board, self._pacer, given.period_ns / NANOSECONDS)
-        self._diagnostics = endpoints.DIAGNOSTICS.publisher(self.node)
+        self._diagnostics = topics.DIAGNOSTICS.publisher(self.node)
         Services(self.node, self._loop)
-        interfaces.offer(self.node, self._loop)
-        description.offer(self.node, simulated, given, lambda: self._loop.simulation.state)
+        simulation_interfaces.offer(self.node, self._loop)
+        robot_description.offer(self.node, simulated, given, lambda: self._loop.simulation.state)
         self.node.create_timer(1.0, self._report, clock=STEADY)
         self._read_gauges()
         realtime.quiet()
@@ -105,10 +104,10 @@ class Simulator:
         return Pacer(given.period_ns, given.real_time_factor, SteadyTime())
 
     def _readers(self, simulated: Scene) -> list[Callable[[], Any]]:
-        topics: list[Endpoint] = [endpoints.COMMANDS, endpoints.COMMANDS_STAMPED]
+        listened: list[Endpoint] = [topics.COMMANDS, topics.COMMANDS_STAMPED]
         if simulated.moment is not None and simulated.moment.topic:
-            topics.append(endpoints.EXTERNAL_MOMENT)
-        return [reader(self.node, topic) for topic in topics]
+            listened.append(topics.EXTERNAL_MOMENT)
+        return [reader(self.node, topic) for topic in listened]
 
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
@@ -137,7 +136,7 @@ class Simulator:
         """Publish the diagnostics, log what is new, ask for gauges for the next time."""
         publishers = sum(
             self.node.count_publishers(topic.at(self.node.get_fully_qualified_name()))
-            for topic in (endpoints.COMMANDS, endpoints.COMMANDS_STAMPED)
+            for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)
         )
         level, said, news = self._health.judge(publishers, self._publications.rivals())
         for line in news:

@@ -12,11 +12,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import SstError
-from sst_ros.mechanism.triples import ZERO
-from sst_ros.nodes.commands import ACTUATORS
-from sst_ros.nodes.companion_settings import CompanionParameters
+from sst_ros.mechanism.vec3 import ZERO
 from sst_ros.nodes.messages import nanoseconds
-from sst_ros.nodes.settings import PlayerParameters
+from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.settings import PlayerParameters
+from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation import Triple
 
 

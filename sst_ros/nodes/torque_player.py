@@ -13,13 +13,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros import scene
-from sst_ros.control import torque
+from sst_ros.control import torque_profiles
 from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.mechanism.triples import ZERO
-from sst_ros.nodes import endpoints, parameters, process
+from sst_ros.mechanism.vec3 import ZERO
+from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.settings import PlayerParameters
 from sst_ros.nodes.torque_commands import TorqueCommands
+from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.simulation import NANOSECONDS
 
 
@@ -36,7 +36,7 @@ class TorquePlayer:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         phase = f"{self._parameters.simulator}/phase"
         self.node.create_subscription(String, phase, self._hear, latched)
-        played = endpoints.PLAYED
+        played = topics.PLAYED
         self.node.create_subscription(played.kind, played.name, self._answer, played.depth)
         self.node.create_timer(0.5, self._commands.watch, clock=STEADY)
 
@@ -45,14 +45,14 @@ class TorquePlayer:
         if self._start_ns is not None and not self.done.is_set():
             self._commands.send(ZERO)
 
-    def _load(self) -> tuple[torque.Profile, float]:
+    def _load(self) -> tuple[torque_profiles.Profile, float]:
         if self._parameters.csv != "-":
-            return torque.table(Path(self._parameters.csv))
+            return torque_profiles.table(Path(self._parameters.csv))
         played = scene.load(self._parameters.scene)
         if played.torque is None or played.duration is None:
             allowed = "must have torque and duration, or csv must name a file"
             raise InputError("torque_player", [Problem("scene", played.name, allowed)])
-        return torque.sine(played.torque), played.duration
+        return torque_profiles.sine(played.torque), played.duration
 
     def _hear(self, phase: String) -> None:
         if self._start_ns is not None and phase.data.startswith("fault"):

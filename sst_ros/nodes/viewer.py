@@ -18,17 +18,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sst_ros import document
 from sst_ros.errors import InputError
-from sst_ros.nodes import endpoints, parameters, process
+from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.commands import ZERO
 from sst_ros.nodes.messages import nanoseconds
-from sst_ros.nodes.readers import reader
-from sst_ros.nodes.settings import ViewerParameters
-from sst_ros.scene import Scene
+from sst_ros.nodes.raw_readers import reader
+from sst_ros.runtime.settings import ViewerParameters
+from sst_ros.runtime.torque_input import ZERO
+from sst_ros.scene import yaml_document
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Triple
-from sst_ros.terms import JOINTS
 from sst_ros.view.page import Page
 from sst_ros.view.source import Health, Sample
 
@@ -55,18 +55,18 @@ class Viewer:
         simulator = given.simulator
         self._names = {
             one: one.name.replace("~", simulator)
-            for one in (endpoints.PAUSE, endpoints.STEP, endpoints.RESET, endpoints.COMMANDS)
+            for one in (topics.PAUSE, topics.STEP, topics.RESET, topics.COMMANDS)
         }
         self._clients = {
             one: self.node.create_client(one.kind, self._names[one])
-            for one in (endpoints.PAUSE, endpoints.STEP, endpoints.RESET)
+            for one in (topics.PAUSE, topics.STEP, topics.RESET)
         }
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for one, hear in ((endpoints.SCENE, self._hear_scene), (endpoints.PHASE, self._hear_phase)):
+        for one, hear in ((topics.SCENE, self._hear_scene), (topics.PHASE, self._hear_phase)):
             name = one.name.replace("~", simulator)
             self.node.create_subscription(one.kind, name, hear, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear_health, 10)
-        self._take = reader(self.node, dataclasses.replace(endpoints.JOINT_STATES, depth=_QUEUE))
+        self._take = reader(self.node, dataclasses.replace(topics.JOINT_STATES, depth=_QUEUE))
         self.node.create_timer(_REPEAT_S, self._repeat, clock=STEADY)
         self.node.create_timer(_LOOK_S, self._look, clock=STEADY)
         self._page = Page(self, given.host, given.port)
@@ -97,15 +97,15 @@ class Viewer:
 
     def pause(self, paused: bool) -> tuple[bool, str]:
         """Hold the run, or let it go on."""
-        return self._ask(endpoints.PAUSE, SetBool.Request(data=paused))
+        return self._ask(topics.PAUSE, SetBool.Request(data=paused))
 
     def step(self) -> tuple[bool, str]:
         """Advance a held run by one sample."""
-        return self._ask(endpoints.STEP, Trigger.Request())
+        return self._ask(topics.STEP, Trigger.Request())
 
     def reset(self) -> tuple[bool, str]:
         """Go back to the initial state."""
-        reply = self._ask(endpoints.RESET, Trigger.Request())
+        reply = self._ask(topics.RESET, Trigger.Request())
         if reply[0]:
             self._begin()
         return reply
@@ -129,7 +129,7 @@ class Viewer:
 
     def _hear_scene(self, message: String) -> None:
         with contextlib.suppress(InputError):  # another version's scene
-            self.scene = document.read(Scene, message.data, self._parameters.simulator)
+            self.scene = yaml_document.read(Scene, message.data, self._parameters.simulator)
 
     def _hear_phase(self, message: String) -> None:
         if message.data == "waiting":
@@ -152,7 +152,7 @@ class Viewer:
         """See whether another node publishes commands; then leave the run to it."""
         own = self.node.get_fully_qualified_name()
         found = ""
-        for one in (endpoints.COMMANDS, endpoints.COMMANDS_STAMPED):
+        for one in (topics.COMMANDS, topics.COMMANDS_STAMPED):
             topic = self.node.resolve_topic_name(one.name.replace("~", self._parameters.simulator))
             for info in self.node.get_publishers_info_by_topic(topic):
                 name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
@@ -171,11 +171,11 @@ class Viewer:
         if not self._driving:
             return
         if self._commands is None:
-            topic = self._names[endpoints.COMMANDS]
+            topic = self._names[topics.COMMANDS]
             self._commands = self.node.create_publisher(Float64MultiArray, topic, 10)
         self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
 
-    def _ask(self, one: endpoints.Endpoint, request: Any) -> tuple[bool, str]:
+    def _ask(self, one: topics.Endpoint, request: Any) -> tuple[bool, str]:
         """Call a service from a thread of the page; the node's own takes the reply."""
         client, answered = self._clients[one], threading.Event()
         if not client.service_is_ready():

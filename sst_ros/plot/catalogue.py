@@ -12,12 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.folder import writing
-from sst_ros.plot import control, energy, motion, sphere
-from sst_ros.report import figures
-from sst_ros.report.contents import SCENE
-from sst_ros.report.signals import Signals
-from sst_ros.scene import Scene
+from sst_ros.output_folder import writing
+from sst_ros.plot import control, energy, motion, paper_figures, sphere
+from sst_ros.recording.signals import Signals
+from sst_ros.recording.topic_tables import SCENE
+from sst_ros.scene.scene import Scene
 
 FORMATS = ("pdf", "png")
 
@@ -45,8 +44,8 @@ def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
     def make(run: Signals, _: Scene | None) -> Figure:
         lost = np.full((len(run.seconds()), 3), np.nan)
         euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else lost
-        degrees = figures.angles(run.take("q_x", "q_y", "q_z", "q_w"), euler)
-        return figures.angle(run.seconds(), degrees, which)
+        degrees = paper_figures.angles(run.take("q_x", "q_y", "q_z", "q_w"), euler)
+        return paper_figures.angle(run.seconds(), degrees, which)
 
     return make
 
@@ -54,11 +53,13 @@ def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
 JOINTS, TURN, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
 PICTURES = {
     "path_of_E": Picture(
-        "Path of point E", (TURN, S), lambda run, scene: figures.path(scene, _position(run, scene))
+        "Path of point E",
+        (TURN, S),
+        lambda run, scene: paper_figures.path(scene, _position(run, scene)),
     ),
     "position_of_E": Picture(
         "Position of point E", (TURN, S),
-        lambda run, scene: figures.position_of_e(run.seconds(), _position(run, scene)),
+        lambda run, scene: paper_figures.position_of_e(run.seconds(), _position(run, scene)),
     ),
     "theta": Picture("The angle θ", (TURN,), _angle(0)),
     "phi": Picture("The angle φ", (TURN,), _angle(1)),
@@ -107,9 +108,9 @@ def draw(run: Signals, out: Path, only: Sequence[str] = ()) -> tuple[list[Path],
             continue
         scene = run.scene.name if run.scene else None
         stem, title = name, picture.title + (f", {scene}" if scene else "")
-        if name in figures.TITLES:
-            stem, title = figures.named(name, scene)
-        with mpl.rc_context(figures.STYLE):
+        if name in paper_figures.TITLES:
+            stem, title = paper_figures.named(name, scene)
+        with mpl.rc_context(paper_figures.STYLE):
             figure = picture.make(run, run.scene)  # type: ignore[arg-type]
             paths += save(figure, title, out, stem)
     return paths, missing

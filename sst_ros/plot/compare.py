@@ -23,9 +23,9 @@ from sst_ros.plot import sphere
 from sst_ros.plot.catalogue import known, save
 from sst_ros.plot.control import torques
 from sst_ros.plot.panels import legend, stack, three
-from sst_ros.report.contents import SCENE
-from sst_ros.report.figures import BLUE, GREEN, STYLE, VERMILION
-from sst_ros.report.signals import Signals
+from sst_ros.plot.paper_figures import BLUE, GREEN, STYLE, VERMILION
+from sst_ros.recording.signals import Signals
+from sst_ros.recording.topic_tables import SCENE
 
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 3.0},

@@ -6,15 +6,15 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from sst_ros.mechanism import energy as physics
+from sst_ros.dynamics import energy as physics
+from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kernel import model_of
 from sst_ros.plot.panels import lines, span, stack
-from sst_ros.report.figures import BLUE, GREY, LINES
-from sst_ros.report.rows import Integers
-from sst_ros.report.signals import Signals
+from sst_ros.plot.paper_figures import BLUE, GREY, LINES
+from sst_ros.recording.signals import Signals
+from sst_ros.recording.time_series import Integers
 from sst_ros.report.states import body_rates
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 
 def power(run: Signals, _: Scene | None) -> Figure:

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.panels import lines, span, stack, three
-from sst_ros.report.figures import BLUE, GREEN, LINES, VERMILION
-from sst_ros.report.signals import Signals
-from sst_ros.scene import Scene
+from sst_ros.plot.paper_figures import BLUE, GREEN, LINES, VERMILION
+from sst_ros.recording.signals import Signals
+from sst_ros.scene.scene import Scene
 
 KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.report.figures import LINES
+from sst_ros.plot.paper_figures import LINES
 
 SUBSCRIPTS = "₁₂₃"
 

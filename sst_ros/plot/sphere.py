@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.report.figures import BLUE, GREEN, VERMILION, rotations
-from sst_ros.report.signals import Signals
-from sst_ros.report.workspace_figure import View, frame
-from sst_ros.scene import Scene
+from sst_ros.plot.paper_figures import BLUE, GREEN, VERMILION, rotations
+from sst_ros.plot.workspace import View, frame
+from sst_ros.recording.signals import Signals
+from sst_ros.scene.scene import Scene
 
 LEVELS = (5, 10, 20, 30)
 _DIVISIONS, _TURNS = 40, 72

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_ros.dynamics import kernel
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kernel, kinematics, virtual_work
+from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array
+from sst_ros.recording.recording import Recording
 from sst_ros.report import states
-from sst_ros.report.recording import Recording
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 
 STATES = 20
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.report.recording import Recording
-from sst_ros.report.rows import NANOSECONDS, Integers
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import NANOSECONDS, Integers
 
 
 class Latency(NamedTuple):

@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.report.figures import BLUE, GREEN, GREY, LINES, STYLE, VERMILION
-from sst_ros.report.jitter import Timing
-from sst_ros.report.recording import Recording
+from sst_ros.plot.downsampling import extremes, floor
+from sst_ros.plot.paper_figures import BLUE, GREEN, GREY, LINES, STYLE, VERMILION
+from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.table import made_line, table
-from sst_ros.report.thinning import extremes, floor
+from sst_ros.report.timing import Timing
 
 SMALLEST = 1e-17
 

@@ -21,10 +21,10 @@ import numpy as np
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.report import states
-from sst_ros.report.motion import COMPILED_FROM, Course, Motion, held
-from sst_ros.report.recording import Recording
-from sst_ros.report.rows import NANOSECONDS, Integers, places
+from sst_ros.report.fixed_step_motion import COMPILED_FROM, Course, Motion, held
 from sst_ros.report.states import Vector
 
 LONGEST_STEP_NS, LONGEST_IDEAL_STEP_NS = 500_000, 1_000_000

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 
-from sst_ros.folder import writing
-from sst_ros.report import figures, formulation, jitter, page, recording, reference, summary
-from sst_ros.report.jitter import Timing
-from sst_ros.report.recording import Recording
+from sst_ros.output_folder import writing
+from sst_ros.plot import paper_figures
+from sst_ros.plot.downsampling import thinned
+from sst_ros.recording import recording
+from sst_ros.recording.recording import Recording
+from sst_ros.report import formulation, page, reference, summary, timing
 from sst_ros.report.reference import Comparison
-from sst_ros.report.thinning import thinned
+from sst_ros.report.timing import Timing
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
@@ -36,13 +38,13 @@ def judge(run: Recording) -> Judged:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    told = jitter.timing(run)
+    told = timing.timing(run)
     # Compiled loops let go of the interpreter: the two comparisons run beside each other.
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
     result = summary.summarise(run, integration, ideal, formulation.check(run))
-    return Judged(told, integration, ideal, result | jitter.numbers(told))
+    return Judged(told, integration, ideal, result | timing.numbers(told))
 
 
 def report(bag: Path, out: Path) -> dict[str, Any]:
@@ -61,7 +63,7 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
         told, integration, ideal, result = judge(run)
         # Long jagged curves in one piece take hundreds of megabytes to draw.
         with mpl.rc_context({"agg.path.chunksize": 1000}):
-            pictures = figures.draw(*thinned(run, integration, ideal), out)
+            pictures = paper_figures.draw(*thinned(run, integration, ideal), out)
             page.draw(run, integration, told, result, out / PAGE)
         result["pictures"] = [path.name for path in pictures]
         result["page"] = [PAGE, HTML]

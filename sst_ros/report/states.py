@@ -7,14 +7,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.start import initial_state
-from sst_ros.mechanism.trace import Program
-from sst_ros.report.recording import Recording
-from sst_ros.report.rows import Integers
-from sst_ros.scene import Scene
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import Integers
+from sst_ros.scene.scene import Scene
 
 Vector = tuple[float, ...]
 Places: TypeAlias = "slice | list[int] | Integers"

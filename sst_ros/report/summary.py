@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.integration.backend import numba_version
+from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.geometry import Array
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import NANOSECONDS
 from sst_ros.report.formulation import Formulation
-from sst_ros.report.recording import Recording
 from sst_ros.report.reference import Comparison, Deviation
-from sst_ros.report.rows import NANOSECONDS
 from sst_ros.report.states import begins, lags
 
 QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}

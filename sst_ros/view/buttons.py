@@ -8,7 +8,7 @@ from typing import Any
 
 from viser import GuiSliderHandle, Icon, ViserServer
 
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.view.source import Controls, Health, Reel, Sample
 
 _LARGEST = 5.0

@@ -13,8 +13,8 @@ from sst_ros.description.shapes import LEG_COLOURS, STAR_COLOUR, end_point, shap
 from sst_ros.description.tree import STAR, rotations, tree
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene import Scene
-from sst_ros.terms import JOINTS
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import Scene
 from sst_ros.view.meshes import meshes
 from sst_ros.view.source import Sample
 

@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sst_ros import child
+from sst_ros import child_process
 
 PUBLISH_RATE = 100
 """Samples a second [Hz]: more than a screen shows."""
@@ -19,7 +19,7 @@ _END_S = 10.0
 def simulator(scene: str, speed: float = 1.0) -> Iterator[None]:
     """Run a simulator of a scene; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": PUBLISH_RATE, "real_time_factor": speed}
-    process = child.start("simulator", given, stdout=subprocess.DEVNULL)
+    process = child_process.start("simulator", given, stdout=subprocess.DEVNULL)
     try:
         yield
     finally:

@@ -17,7 +17,7 @@ from viser import ViserServer
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.view.buttons import ReelButtons, RunButtons, buttons
 from sst_ros.view.drawing import Drawing
 from sst_ros.view.panel import Panel

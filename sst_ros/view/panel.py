@@ -11,7 +11,7 @@ import numpy as np
 from viser import GuiUplotHandle, ViserServer, uplot
 
 from sst_ros.description.shapes import LEG_COLOURS
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.view.source import Health, Sample
 
 WINDOW_S = 10.0

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.report import recording
-from sst_ros.scene import Scene
+from sst_ros.recording import recording
+from sst_ros.scene.scene import Scene
 from sst_ros.view.source import Health, Sample
 
 

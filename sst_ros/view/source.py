@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation import Triple
 
 

@@ -9,8 +9,8 @@ import pytest
 from benchmark import c_batch, c_floor
 from benchmark.batch import FLAGS, METHODS
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.blocks import LANES
-from sst_ros.scene import load
+from sst_ros.integration.batch_source import LANES
+from sst_ros.scene.scene import load
 
 needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
 

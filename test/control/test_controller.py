@@ -8,16 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sst_ros import scene
-from sst_ros.control.control_settings import ControlSettings
+from sst_ros.control.actuator_space import Coordinates
 from sst_ros.control.controller import MODES, Controller, ControlStopped, Measured
-from sst_ros.control.coordinates import Coordinates
-from sst_ros.control.observer import OrientationObserver
+from sst_ros.control.controller_settings import ControlSettings
+from sst_ros.control.orientation_observer import OrientationObserver
 from sst_ros.control.star_motions import Turn
 from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Actuators, Initial, Moment
+from sst_ros.scene.scene import Actuators, Initial, Moment
 from sst_ros.simulation import Simulation
 from test.models import seeded_samples
 

@@ -16,15 +16,16 @@ from mechanism.test_terms_truth import laden
 from models import FAST, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.inverse import InverseDynamics
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.mechanism import kernel, singularities, virtual_work, workspace
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.dynamics import Dynamics as PaperDynamics
+from sst_ros.mechanism import singularities, virtual_work, workspace
+from sst_ros.mechanism.equation_of_motion import Dynamics as PaperDynamics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import load
-from sst_ros.terms import Moment
+from sst_ros.scene.loads import Moment
+from sst_ros.scene.scene import load
 
 FEW = settings(FAST, max_examples=25)  # each traces programs of its own
 EPS = np.finfo(float).eps

@@ -11,17 +11,9 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.motions import Samples, motion_of, recorded, waypoints
+from sst_ros.control.reference_motions import Samples, motion_of, recorded, waypoints
 from sst_ros.control.star_motions import product
-from sst_ros.desired_motions import (
-    DesiredMotion,
-    Recorded,
-    Spiral,
-    Sweep,
-    ToAngles,
-    ToOrientation,
-    Waypoint,
-)
+from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import (
     continuation,
@@ -33,8 +25,16 @@ from sst_ros.mechanism import (
 )
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.start import initial_state
-from sst_ros.scene import Initial, Scene, load
+from sst_ros.scene.motions import (
+    DesiredMotion,
+    Recorded,
+    Spiral,
+    Sweep,
+    ToAngles,
+    ToOrientation,
+    Waypoint,
+)
+from sst_ros.scene.scene import Initial, Scene, load
 from sst_ros.simulation import Simulation
 
 START = (0.75, 0.7, 0.75)

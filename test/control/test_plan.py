@@ -18,18 +18,18 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from sst_ros import __main__ as cli
-from sst_ros.control.extremes import largest, least
-from sst_ros.control.motions import motion_of
+from sst_ros.control.peaks import largest, least
 from sst_ros.control.plan import check, examine
-from sst_ros.control.speed import speed
+from sst_ros.control.reference_motions import motion_of
 from sst_ros.control.star_motions import Turn
-from sst_ros.control.torque import table
-from sst_ros.desired_motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
+from sst_ros.control.time_scaling import speed
+from sst_ros.control.torque_profiles import table
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import (
+from sst_ros.scene.motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
+from sst_ros.scene.scene import (
     Actuators,
     Friction,
     Initial,

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST
 
-from sst_ros.control.torque import sine, table
+from sst_ros.control.torque_profiles import sine, table
 from sst_ros.errors import InputError
-from sst_ros.scene import SineTorque, load
+from sst_ros.scene.scene import SineTorque, load
 
 HEADER = "time,tau_1,tau_2,tau_3\n"
 

@@ -14,11 +14,11 @@ from models import seeded_samples
 from sst_ros.__main__ import main
 from sst_ros.description.tree import LEGS, STAR, STARS, actuated, intermediate
 from sst_ros.description.urdf import roll_pitch_yaw, urdf
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import kinematics, rates, virtual_work
-from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Actuators, load, names
+from sst_ros.scene.scene import Actuators, load, names
 
 EXACT = 2e-14  # a product of nine rotations, each rounded
 LINKS = {STAR, *map(actuated, LEGS), *map(intermediate, LEGS)}

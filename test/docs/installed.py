@@ -8,9 +8,9 @@ from functools import cache
 import yaml
 from docs.blocks import ROOT
 
-from sst_ros.nodes.documentation import NODES
-from sst_ros.nodes.endpoints import PUBLISHES, SERVES, SUBSCRIBES
-from sst_ros.schema import specs
+from sst_ros.nodes.topics import PUBLISHES, SERVES, SUBSCRIBES
+from sst_ros.scene.schema import specs
+from tools.node_tables import NODES
 
 STANDARD = {"use_sim_time"}
 SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")

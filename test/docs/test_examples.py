@@ -9,10 +9,10 @@ import pytest
 from docs.blocks import ROOT
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque import sine
-from sst_ros.document import read
+from sst_ros.control.torque_profiles import sine
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import read
 
 EXAMPLES = ROOT / "examples"
 

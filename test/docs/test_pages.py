@@ -92,11 +92,11 @@ def test_every_page_is_in_the_site():
 
 
 def test_the_generated_pages_are_those_of_the_declarations():
-    from sst_ros.commands.documentation import PAGES as generated
+    from tools.command_tables import PAGES as generated
 
     for name, write in generated.items():
         page = (ROOT / "docs" / name).read_text(encoding="utf-8")
-        assert write() == page, "run python -m sst_ros.commands.documentation"
+        assert write() == page, "run python -m tools.command_tables"
 
 
 def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path):

@@ -118,7 +118,7 @@ def test_a_pointer_points_at_a_test(pointer):
 
 
 def test_the_assumed_inertias_are_those_of_the_scenes():
-    from sst_ros.scene import load
+    from sst_ros.scene.scene import load
 
     star, thin = load("example2").star.inertia, load("example2_thin").star.inertia
     assert f"diag({thin.xx:g}, {thin.yy:g}, {thin.zz:g})" in PAGE

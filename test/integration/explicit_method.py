@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.integration.tableaux import Tableau
+from sst_ros.integration.methods import Tableau
 
 Vector = tuple[float, ...]
 Derivative = Callable[[float, Vector], Sequence[float]]

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation import Simulation
 
 NOISE = 1e-13

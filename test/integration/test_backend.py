@@ -11,18 +11,18 @@ import warnings
 import pytest
 from loaded_scenes import REST
 
-from sst_ros.integration import backend
-from sst_ros.scene import load
+from sst_ros.integration import codegen
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000
 SOURCE = """\
-from sst_ros.scene import load
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 simulation = Simulation(load("example1"), "rk4", compiled=True)
 print(simulation.step((1.0, 2.0, 3.0), 1_000_000).quaternion, simulation.compiled)
 """
-needs_numba = pytest.mark.skipif(backend.numba_version() is None, reason="numba is missing")
+needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
 
 
 def started(cache, **more):
@@ -109,7 +109,7 @@ def test_without_numba_plain_python_runs_and_says_so(monkeypatch, truth):
 
 def test_a_numba_that_cannot_be_imported_is_none(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    assert backend.numba_version() is None
+    assert codegen.numba_version() is None
     with pytest.warns(RuntimeWarning, match="no numba"):
         assert not Simulation(load("example1"), compiled=True).compiled
 

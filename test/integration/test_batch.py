@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.blocks import LANES
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.scene import Actuators, Initial, Moment
+from sst_ros.integration.batch_source import LANES
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
+from sst_ros.integration.ode import System
+from sst_ros.scene.scene import Actuators, Initial, Moment
 
 EXAMPLE2 = load_scene("example2")
 N = 100

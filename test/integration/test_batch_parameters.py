@@ -9,21 +9,21 @@ from loaded_scenes import IGNORE, REST, loaded
 from models import seeded_samples
 
 from sst_ros import Simulation, load_scene
+from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
 from sst_ros.errors import AssemblyError, InputError, RunStopped
-from sst_ros.integration import blocks
+from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.starts import NO_RATE
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DORMAND_PRINCE, RK4
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.initial_states import NO_RATE
+from sst_ros.integration.methods import DORMAND_PRINCE, RK4
+from sst_ros.integration.ode import System
 from sst_ros.mechanism import singularities, workspace
-from sst_ros.mechanism.compiled import Dynamics, compiled
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Actuators, Initial, Link, Spring
+from sst_ros.scene.scene import Actuators, Initial, Link, Spring
 
 EXAMPLE2 = load_scene("example2")
 HOME = np.pi / 4
-N = blocks.LANES + 5
+N = batch_source.LANES + 5
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 
@@ -233,7 +233,7 @@ def test_what_is_the_same_in_all_rows_costs_nothing():
 def test_other_values_are_the_same_code():
     def text(low, high):
         batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [low, high]})
-        return blocks.batch_source(batch.program, batch.margins, RK4, len(batch.state))
+        return batch_source.batch_source(batch.program, batch.margins, RK4, len(batch.state))
 
     assert text(0.2, 0.3) == text(0.25, 0.4)
 

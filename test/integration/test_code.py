@@ -8,34 +8,34 @@ from dataclasses import replace
 
 import pytest
 
-from sst_ros.integration import backend, code
-from sst_ros.scene import Initial, load
+from sst_ros.integration import code_cache, codegen
+from sst_ros.scene.scene import Initial, load
 
-pytestmark = pytest.mark.skipif(backend.numba_version() is None, reason="numba is missing")
+pytestmark = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
 EXAMPLE1 = load("example1")
 
 
 def test_code_is_made_once_and_found(tmp_path, monkeypatch):
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path / "cache"))
-    assert not code.is_there(EXAMPLE1, "rk4")
-    assert list(code.make(EXAMPLE1, "rk4")) == ["rk4"]
-    assert code.is_there(EXAMPLE1, "rk4")
-    assert not code.is_there(EXAMPLE1, "auto")
+    assert not code_cache.is_there(EXAMPLE1, "rk4")
+    assert list(code_cache.make(EXAMPLE1, "rk4")) == ["rk4"]
+    assert code_cache.is_there(EXAMPLE1, "rk4")
+    assert not code_cache.is_there(EXAMPLE1, "auto")
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb[ic]")}
-    assert list(code.make(EXAMPLE1, "rk4")) == ["rk4"]
+    assert list(code_cache.make(EXAMPLE1, "rk4")) == ["rk4"]
     assert files == {path: path.stat().st_mtime_ns for path in files}
     elsewhere = replace(EXAMPLE1, initial=Initial(gamma=(0.7, 0.8, 0.9)))
-    assert code.is_there(elsewhere, "rk4")  # where a run starts is not part of its code
+    assert code_cache.is_there(elsewhere, "rk4")  # where a run starts is not part of its code
 
 
 def test_one_process_makes_code_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
     with (tmp_path / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert list(code.make(EXAMPLE1, "rk4")) == []
-    assert not code.is_there(EXAMPLE1, "rk4")
+        assert list(code_cache.make(EXAMPLE1, "rk4")) == []
+    assert not code_cache.is_there(EXAMPLE1, "rk4")
 
 
 def test_without_numba_there_is_no_code(monkeypatch):
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
-    assert not code.is_there(EXAMPLE1, "rk4")
+    assert not code_cache.is_there(EXAMPLE1, "rk4")

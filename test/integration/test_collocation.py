@@ -11,14 +11,14 @@ import pytest
 from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.integration.collocation import Collocation, tables
-from sst_ros.integration.sines import flat_sin
-from sst_ros.integration.system import System
-from sst_ros.mechanism import kernel
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.scene import load
+from sst_ros.integration.gauss import Collocation, tables
+from sst_ros.integration.ode import System
+from sst_ros.integration.sine_source import flat_sin
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 EXAMPLE2 = load("example2")
@@ -132,8 +132,8 @@ def test_the_flat_sine_is_the_sine(scale):
 
 def test_every_term_lag_and_a_drive_are_carried_along():
     """Against many steps of a method that is tested by itself."""
-    from sst_ros.integration.machine import Machine
-    from sst_ros.integration.tableaux import DOP853
+    from sst_ros.integration.compiled_method import Machine
+    from sst_ros.integration.methods import DOP853
 
     scene = loaded()
     system = System(Dynamics.of(scene), work=True)

@@ -14,8 +14,8 @@ from dataclasses import replace
 import pytest
 from loaded_scenes import REST, apart, run
 
-from sst_ros.control.torque import sine
-from sst_ros.scene import load
+from sst_ros.control.torque_profiles import sine
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 ROUNDING = 1e-12

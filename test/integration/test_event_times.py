@@ -17,14 +17,14 @@ from integration.paper_form import PaperForm
 from loaded_scenes import REST, apart
 from models import inertia_of
 
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
-from sst_ros.integration.journey import Journey
-from sst_ros.limits import SINGULAR_MU
+from sst_ros.integration.propagator import Journey
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
+from sst_ros.scene.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
 EXAMPLE2 = load("example2")

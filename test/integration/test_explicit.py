@@ -15,10 +15,10 @@ import pytest
 from integration.explicit_method import ExplicitMethod
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque import sine
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
-from sst_ros.mechanism import kernel
-from sst_ros.scene import load
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 CONDITION = 1e-13

@@ -12,14 +12,14 @@ import pytest
 from loaded_scenes import IGNORE, loaded, viscous
 from models import seeded_samples
 
-from sst_ros.integration import backend
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.kernel import derivative
-from sst_ros.mechanism.trace import trace, with_jacobian
-from sst_ros.scene import load
+from sst_ros.dynamics.expression import trace, with_jacobian
+from sst_ros.dynamics.kernel import derivative
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration import codegen
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
+from sst_ros.integration.ode import System
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 DRIVE = (3.0, -2.0, 1.0)
@@ -51,7 +51,7 @@ def both(scene, method, cache, monkeypatch):
     return results
 
 
-needs_numba = pytest.mark.skipif(backend.numba_version() is None, reason="numba is missing")
+needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
 
 
 @needs_numba

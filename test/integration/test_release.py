@@ -16,9 +16,9 @@ import pytest
 from integration.paper_form import PaperForm
 from loaded_scenes import apart
 
-from sst_ros.integration import journey
-from sst_ros.integration.journey import Journey
-from sst_ros.scene import Friction, Initial, JointFriction, Stroke, Workspace, load
+from sst_ros.integration import propagator
+from sst_ros.integration.propagator import Journey
+from sst_ros.scene.scene import Friction, Initial, JointFriction, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000
@@ -256,7 +256,7 @@ def test_an_impact_tears_off_what_rests_where_it_makes_it_move_inwards(met):
 
 
 def test_release_and_impact_without_end_are_refused(monkeypatch):
-    monkeypatch.setattr(journey, "_ENDS_PER_PERIOD", 3)
+    monkeypatch.setattr(propagator, "_ENDS_PER_PERIOD", 3)
     simulation = Simulation(PRESSED)
     before = simulation.state
     with pytest.raises(Exception, match="ends are met or left 3 times in one period"):

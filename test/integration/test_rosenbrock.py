@@ -15,8 +15,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from sst_ros.integration import loops
-from sst_ros.integration.tableaux import RODAS4
+from sst_ros.integration import step_loops
+from sst_ros.integration.methods import RODAS4
 
 GAMMA = 0.25
 CONDITION = 1e-12
@@ -56,7 +56,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
 
     names |= {"linearise": linearise, "evaluate": evaluate}
     for part in ("factorise", "substitute", "attempt_linearly_implicit"):
-        names[part] = FunctionType(getattr(loops, part).__code__, names)
+        names[part] = FunctionType(getattr(step_loops, part).__code__, names)
     attempt = names["attempt_linearly_implicit"]
     y, new, error = [y0], [0.0], [0.0]
     for k in range(count):

@@ -11,12 +11,12 @@ import pytest
 from loaded_scenes import IGNORE, REST, run, viscous
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
 from sst_ros.errors import Diverged, StrokeExceeded, WorkspaceLeft
-from sst_ros.integration import walk
-from sst_ros.integration.machine import Machine
-from sst_ros.mechanism import kernel
-from sst_ros.scene import Initial, Stroke, Workspace, load
+from sst_ros.integration import adaptive_stepper
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.scene.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
 EXAMPLE2 = load("example2")
@@ -104,7 +104,7 @@ def test_a_refused_step_leaves_no_trace_in_what_follows():
 
 
 def test_a_budget_of_steps_ends_what_would_not_end(monkeypatch):
-    monkeypatch.setattr(walk, "STEP_BUDGET", 50)
+    monkeypatch.setattr(adaptive_stepper, "STEP_BUDGET", 50)
     simulation = Simulation(viscous(1e5), "dopri5")
     with pytest.raises(Diverged, match="50 steps do not reach the end of the period") as caught:
         simulation.step(REST, 1_000_000_000)

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.mechanism.elementary import sqrt
-from sst_ros.mechanism.trace import Program, trace
+from sst_ros.dynamics.expression import Program, trace
+from sst_ros.dynamics.math_functions import sqrt
 
 INPUTS = ("x", "y", "z", "w", "wx", "wy", "wz", "t1", "t2", "t3")
 

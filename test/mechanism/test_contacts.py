@@ -9,14 +9,14 @@ import pytest
 from models import seeded_samples
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics.contacts import RigidEnds
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import ImpactsAccumulate
-from sst_ros.integration import journey
+from sst_ros.integration import propagator
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.mechanism.contacts import RigidEnds
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.terms import Friction, Initial, JointFriction, Stroke, Workspace
+from sst_ros.scene.loads import Friction, Initial, JointFriction, Stroke, Workspace
 
 MILLISECOND = 1_000_000
 
@@ -152,7 +152,7 @@ def test_pressed_against_an_end_it_rests_there_and_leaves_when_pulled():
 
 
 def test_impacts_without_end_are_refused_with_the_last_valid_state(monkeypatch):
-    monkeypatch.setattr(journey, "_IMPACTS_PER_PERIOD", 50)
+    monkeypatch.setattr(propagator, "_IMPACTS_PER_PERIOD", 50)
     simulation = Simulation(near_the_end(restitution=0.9))
     before = simulation.state
     with pytest.raises(ImpactsAccumulate, match="gamma_1"):

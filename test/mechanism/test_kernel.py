@@ -18,9 +18,10 @@ from lagrange import OUTER, Lagrange, columns, times
 from models import FAST, inertia_of, samples, seeded_samples
 from mpmath import mp, mpf
 
-from sst_ros.mechanism import energy, kernel, kinematics, virtual_work
-from sst_ros.mechanism.triples import rotation_rows
-from sst_ros.scene import Link
+from sst_ros.dynamics import energy, kernel
+from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism.vec3 import rotation_rows
+from sst_ros.scene.scene import Link
 
 TOLERANCE = 1e-12
 TINY = 1e-30

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST, samples, seeded_samples
 
-from sst_ros.bodies import Inertia, Link, Payload
-from sst_ros.mechanism import energy, kernel, loads, virtual_work
-from sst_ros.mechanism.compiled import Dynamics
-from sst_ros.terms import (
+from sst_ros.dynamics import energy, kernel, loads
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.mechanism import virtual_work
+from sst_ros.scene.bodies import Inertia, Link, Payload
+from sst_ros.scene.loads import (
     Actuators,
     Friction,
     Gravity,

@@ -16,13 +16,13 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 from sst_ros import Simulation, load_scene
-from sst_ros.bodies import Link
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.compiled import Dynamics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.terms import (
+from sst_ros.scene.bodies import Link
+from sst_ros.scene.loads import (
     Actuators,
     Friction,
     Gravity,

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sst_ros.mechanism.compiled import compiled
-from sst_ros.mechanism.elementary import atan2, exp, positive, sqrt, tanh
-from sst_ros.mechanism.trace import trace, with_jacobian
+from sst_ros.dynamics.expression import trace, with_jacobian
+from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
+from sst_ros.dynamics.traced_dynamics import compiled
 
 FINITE = st.floats(-10.0, 10.0)
 

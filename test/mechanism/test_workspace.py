@@ -146,7 +146,7 @@ def test_the_bar_is_for_terminals_only(terminal, monkeypatch):
 
 def test_the_picture(tmp_path, isotropic, folding):
     pytest.importorskip("matplotlib")
-    from sst_ros.report.workspace_figure import draw
+    from sst_ros.plot.workspace import draw
 
     _, faces = workspace.triangle_directions(ISOTROPIC, 16)
     figure = draw([isotropic, folding], [faces, faces], ["isotropic", "general"])

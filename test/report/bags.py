@@ -10,10 +10,10 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sst_ros import document
-from sst_ros.control.torque import sine
+from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.scene import yaml_document
 from sst_ros.simulation import Simulation
 
 STORE = get_typestore(Stores.ROS2_KILTED)
@@ -129,7 +129,7 @@ def simulated(scene, seconds: float) -> list[Entry]:
     """Messages of a run with the scene's sines held over each tick, as the nodes send them."""
     simulation, profile = Simulation(scene), sine(scene.torque)
     begun = START_NS - 300_000_000
-    text = make("std_msgs/String", data=document.dump(scene))
+    text = make("std_msgs/String", data=yaml_document.dump(scene))
     entries = [Entry(SCENE, begun, text)]
     for preview in range(3):
         entries += state_entries(simulation.state, 0, begun + preview * 100_000_000, -1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sst_ros import scene
-from sst_ros.mechanism import compiled, kernel
+from sst_ros.dynamics import kernel, traced_dynamics
 
 # bags.py is loaded by its path: as `report.bags` it would need a package test/report.
 _SPEC = importlib.util.spec_from_file_location(
@@ -47,7 +47,7 @@ def wrong_kernel(monkeypatch):
 
     def put(wrong):
         monkeypatch.setattr(kernel, "derivative", lambda *given: wrong(right(*given)))
-        compiled.recent.cache_clear()
+        traced_dynamics.recent.cache_clear()
 
     yield put
-    compiled.recent.cache_clear()
+    traced_dynamics.recent.cache_clear()

@@ -12,15 +12,15 @@ import pytest
 from matplotlib import image
 
 from sst_ros import scene
-from sst_ros.bodies import Inertia
 from sst_ros.errors import InputError
-from sst_ros.report.accuracy import ABOVE_REFERENCE, study
-from sst_ros.report.accuracy_figure import draw
-from sst_ros.report.accuracy_run import page
-from sst_ros.report.accuracy_table import COLUMNS, advice, as_csv, as_json, text
-from sst_ros.report.precise import EXTENDED, MPMATH, Precise
-from sst_ros.report.trial import Trial
-from sst_ros.report.ways import FIXED, TOLERANCE
+from sst_ros.plot.accuracy import draw
+from sst_ros.scene.bodies import Inertia
+from sst_ros.studies.accuracy import ABOVE_REFERENCE, study
+from sst_ros.studies.accuracy_report import page
+from sst_ros.studies.accuracy_table import COLUMNS, advice, as_csv, as_json, text
+from sst_ros.studies.high_precision import EXTENDED, MPMATH, Precise
+from sst_ros.studies.solver_grid import FIXED, TOLERANCE
+from sst_ros.studies.work_precision import Trial
 
 SHORT = dataclasses.replace(scene.load("example2"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)

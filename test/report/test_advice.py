@@ -5,14 +5,14 @@ import re
 
 import pytest
 
-from sst_ros.integration.machine import Machine
-from sst_ros.integration.system import System
-from sst_ros.integration.tableaux import DORMAND_PRINCE
-from sst_ros.mechanism.compiled import Dynamics
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.methods import DORMAND_PRINCE
+from sst_ros.integration.ode import System
 from sst_ros.report import states
-from sst_ros.report.advice import advise
-from sst_ros.scene import load
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
+from sst_ros.studies.step_advice import advise
 
 
 def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from sst_ros.report import columns, mcap, messages, recording
-from sst_ros.report.bag import Bag
+from sst_ros.recording import cdr_fields, collector, mcap_blocks, recording
+from sst_ros.recording.bag_reader import Bag
 
 GENERATOR = np.random.default_rng(3)
 
@@ -37,7 +37,9 @@ def _rows(raws):
 def test_fields_are_those_of_rosbags(bags, little, count):
     sent = [_joint_state(bags, ["a", "bcd", ""][:count], count) for _ in range(5)]
     rows = _rows([_raw(bags, message, little) for message in sent])
-    ((received, (stamp, names, fields)),) = columns.read(np.arange(5), rows, messages.joint_state)
+    ((received, (stamp, names, fields)),) = cdr_fields.read(
+        np.arange(5), rows, collector.joint_state
+    )
     assert received.tolist() == list(range(5)) and names == ("a", "bcd", "")[:count]
     for k, message in enumerate(sent):
         told = message.header.stamp
@@ -56,7 +58,7 @@ def test_messages_of_one_length_and_different_layout_are_told_apart(bags):
     length = max(map(len, raws))
     rows = _rows([raw for raw in raws if len(raw) == length])
     same = [message for message, raw in zip(sent, raws, strict=True) if len(raw) == length]
-    found = list(columns.read(np.arange(len(same)), rows, messages.joint_state))
+    found = list(cdr_fields.read(np.arange(len(same)), rows, collector.joint_state))
     assert len(found) > 1 and sum(len(received) for received, _ in found) == len(same)
     for received, (_, names, fields) in found:
         for row, k in enumerate(received):
@@ -68,8 +70,8 @@ def test_bytes_that_are_no_message_are_refused(bags):
     whole = _raw(bags, _joint_state(bags, ["a"], 1))
     huge = whole[:16] + struct.pack("<I", 2**31) + whole[20:]
     for wrong in (b"", b"\0\1", b"\7" + whole[1:], whole[:-8], whole + b"\0" * 8, huge):
-        with pytest.raises(columns.Malformed):
-            list(columns.read(np.zeros(1, np.int64), _rows([wrong]), messages.joint_state))
+        with pytest.raises(cdr_fields.Malformed):
+            list(cdr_fields.read(np.zeros(1, np.int64), _rows([wrong]), collector.joint_state))
 
 
 def _compressed(path, entries, bags, mode=None, compressor=None):
@@ -97,7 +99,7 @@ def _without_chunks(path, plain):
     (file,) = plain.glob("*.mcap")
     whole = file.read_bytes()
     head = whole[: 8 + 9 + struct.unpack_from("<Q", whole, 9)[0]]
-    records = b"".join(mcap._pieces(file))
+    records = b"".join(mcap_blocks._pieces(file))
     end = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0)
     shutil.copytree(plain, path)
     (path / file.name).write_bytes(head + records + end + whole[:8])
@@ -143,7 +145,7 @@ def test_only_few_messages_are_taken_singly(tmp_path, bags, example2, monkeypatc
 def test_a_chunk_whose_bytes_have_changed_is_refused(tmp_path, bags, example2):
     path = bags.write(tmp_path / "bag", example2)
     (file,) = Path(path).glob("*.mcap")
-    (records, *_) = [piece for piece in mcap._pieces(file) if piece]
+    (records, *_) = [piece for piece in mcap_blocks._pieces(file) if piece]
     content = struct.pack("<QQQI", 0, 1, len(records), 1) + struct.pack("<IQ", 0, len(records))
-    with pytest.raises(mcap.Damaged, match="not what was written"):
-        mcap._unpacked(content + records)
+    with pytest.raises(mcap_blocks.Damaged, match="not what was written"):
+        mcap_blocks._unpacked(content + records)

@@ -11,7 +11,7 @@ from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.plot import compare
 from sst_ros.plot.compare import PICTURES, differences, draw
-from sst_ros.report import signals
+from sst_ros.recording import signals
 
 
 def shifted(bags, entries, by_ns, turn=0.0, keep=lambda sample: True):

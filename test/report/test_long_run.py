@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.report import bag, balance, motion, recording, reference
+from sst_ros.recording import bag_reader, recording
+from sst_ros.report import energy_balance, fixed_step_motion, reference
 from sst_ros.report.run import report
 
 ROOT = str(Path(__file__).parents[2])
@@ -42,13 +43,13 @@ def test_a_long_run_is_read_in_blocks_and_marched_through_compiled(written, monk
 
     run = recording.read(written)
     assert len(run.time_ns) == 10_001 and len(run.ticks.start_ns) == 20_000
-    store = type(bag.get_typestore(bag.Stores.ROS2_KILTED))
+    store = type(bag_reader.get_typestore(bag_reader.Stores.ROS2_KILTED))
     counted(store, "deserialize_cdr", "typed")
-    counted(bag.Bag, "content", "blocks")
-    counted(motion.Motion, "follow", "rides")
+    counted(bag_reader.Bag, "content", "blocks")
+    counted(fixed_step_motion.Motion, "follow", "rides")
     found = recording.read(written)
     integration, ideal = reference.integration(found), reference.ideal(found)
-    energy = balance.residual(found, [])
+    energy = energy_balance.residual(found, [])
     assert calls == {"typed": 1, "blocks": 1, "rides": 4}  # the scene; two ways each, in one ride
     assert integration.compared == 10_001 and integration.error.gamma.max() < 1e-12
     assert integration.own.gamma.max() < 1e-13 and ideal.error.gamma.max() < 1e-2
@@ -57,12 +58,12 @@ def test_a_long_run_is_read_in_blocks_and_marched_through_compiled(written, monk
 
 def test_compiled_and_plain_tell_the_same(written, monkeypatch):
     run = recording.read(written)
-    compiled = reference.integration(run), balance.residual(run, [])
+    compiled = reference.integration(run), energy_balance.residual(run, [])
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
     monkeypatch.setattr(reference, "PLAIN_TICKS", 400)
-    monkeypatch.setattr(balance, "PLAIN_TICKS", 400)
+    monkeypatch.setattr(energy_balance, "PLAIN_TICKS", 400)
     missing = []
-    plain = reference.integration(run), balance.residual(run, missing)
+    plain = reference.integration(run), energy_balance.residual(run, missing)
     assert plain[0].compared == 201
     assert plain[0].reasons == ("only the first 0.4 s are compared: there is no numba for more",)
     assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201

@@ -10,8 +10,9 @@ import pytest
 from matplotlib import image
 
 from sst_ros import scene
-from sst_ros.control.torque import sine
-from sst_ros.report import jitter, recording, reference
+from sst_ros.control.torque_profiles import sine
+from sst_ros.recording import recording
+from sst_ros.report import reference, timing
 from sst_ros.report.run import judge, report
 from sst_ros.report.table import table
 
@@ -40,12 +41,12 @@ def lively(bags, example2):
 
 
 def _timing(bags, folder, entries):
-    return jitter.timing(recording.read(bags.write(folder / "bag", entries)))
+    return timing.timing(recording.read(bags.write(folder / "bag", entries)))
 
 
 def test_periods_and_latency_are_what_they_were_made(tmp_path, bags, lively):
     found = _timing(bags, tmp_path, lively)
-    numbers = jitter.numbers(found)
+    numbers = timing.numbers(found)
     assert found.nominal_us == 2000.0 and len(found.period_us) == 150
     assert numbers["period_min_us"] == 1970.0 and numbers["period_max_us"] == 2030.0
     assert numbers["period_mean_us"] == pytest.approx(2000.0, abs=0.5)
@@ -66,7 +67,7 @@ def test_lost_samples_and_dropped_ticks_have_their_times(tmp_path, bags, lively)
     assert found.lost_s == pytest.approx([0.040, 0.042, 0.120])
     assert found.gaps_s == pytest.approx([0.038, 0.118])
     assert len(found.period_us) == 145
-    assert jitter.numbers(found)["energy_residual_max_J"] < 1e-12
+    assert timing.numbers(found)["energy_residual_max_J"] < 1e-12
 
 
 def test_a_dropped_tick_shows(tmp_path, bags, example2):
@@ -77,7 +78,7 @@ def test_a_dropped_tick_shows(tmp_path, bags, example2):
 
     entries = bags.edited(example2, bags.APPLIED, 75, shortened)
     run = recording.read(bags.write(tmp_path / "bag", entries))
-    assert jitter.timing(run).gaps_s == pytest.approx([0.149])
+    assert timing.timing(run).gaps_s == pytest.approx([0.149])
     assert reference.integration(run).restarts_ns == (150_000_000,)
 
 
@@ -93,7 +94,7 @@ def test_an_altered_effort_shows_when_it_was(tmp_path, bags, example2):
     run = recording.read(bags.write(tmp_path / "bag", entries))
     error = reference.integration(run).error.gamma_dot
     assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
-    energy = np.abs(jitter.timing(run).energy)
+    energy = np.abs(timing.timing(run).energy)
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
@@ -116,7 +117,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
 
 def test_what_is_missing_is_said(tmp_path, bags, example2):
     kept = bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)
-    numbers = jitter.numbers(_timing(bags, tmp_path, kept))
+    numbers = timing.numbers(_timing(bags, tmp_path, kept))
     assert numbers["command_latency_mean_us"] is None and numbers["commands_followed"] == 0
     assert any("no commands are recorded" in words for words in numbers["not_told"])
     assert any("no diagnostics" in words for words in numbers["not_told"])
@@ -124,7 +125,7 @@ def test_what_is_missing_is_said(tmp_path, bags, example2):
 
 def test_stamps_of_another_clock_do_not_matter(tmp_path, bags, lively):
     entries = [dataclasses.replace(e, received_ns=e.received_ns - 10**15) for e in lively]
-    numbers = jitter.numbers(_timing(bags, tmp_path, entries))
+    numbers = timing.numbers(_timing(bags, tmp_path, entries))
     assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
     assert numbers["period_max_us"] == 2030.0
 
@@ -144,7 +145,7 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(tmp_path,
         received = bags.START_NS + tick * bags.TICK_NS
         entries.append(bags.Entry(bags.STAMPED, received, command))
     found = _timing(bags, tmp_path, sorted(entries, key=lambda entry: entry.received_ns))
-    numbers = jitter.numbers(found)
+    numbers = timing.numbers(found)
     assert numbers["commands_followed"] == 149
     for word in ("min", "mean", "max"):
         assert numbers[f"command_stamp_to_tick_{word}_us"] == 2000.0

@@ -12,7 +12,8 @@ from sst_ros import __main__ as cli
 from sst_ros import scene
 from sst_ros.plot import catalogue, energy
 from sst_ros.plot.catalogue import PICTURES, draw
-from sst_ros.report import balance, recording, signals
+from sst_ros.recording import recording, signals
+from sst_ros.report import energy_balance
 from sst_ros.simulation import Simulation
 
 GAMMA = math.pi / 4
@@ -129,7 +130,7 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
     assert np.flatnonzero(np.isnan(energy.energies(*whole(bag))[0])).tolist() == [60]
-    left = balance.residual(recording.read(bag), [])
+    left = energy_balance.residual(recording.read(bag), [])
     assert np.flatnonzero(np.isnan(left)).tolist() == [60]
     assert np.nanmax(np.abs(left)) < 1e-9
 

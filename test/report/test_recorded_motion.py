@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from sst_ros import __main__ as cli
-from sst_ros import document, scene
-from sst_ros.control.motions import motion_of
 from sst_ros.control.plan import examine
-from sst_ros.control.torque import sine
-from sst_ros.desired_motions import DesiredMotion, Recorded
+from sst_ros.control.reference_motions import motion_of
+from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import InputError
-from sst_ros.report.recorded_motion import samples
-from sst_ros.report.recording import read
+from sst_ros.recording.recorded_motion import samples
+from sst_ros.recording.recording import read
+from sst_ros.scene import scene, yaml_document
+from sst_ros.scene.motions import DesiredMotion, Recorded
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag)
 
 def test_the_command_reads_the_bag(bag, tmp_path, capsys):
     path = tmp_path / "again.yaml"
-    path.write_text(document.dump(following(bag)), encoding="utf-8")
+    path.write_text(yaml_document.dump(following(bag)), encoding="utf-8")
     assert cli.main(["plan", "check", str(path)]) == 0
     assert "At any speed: the scene has no limit" in capsys.readouterr().out
 

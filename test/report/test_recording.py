@@ -8,7 +8,7 @@ import pytest
 
 from sst_ros import scene
 from sst_ros.errors import InputError
-from sst_ros.report import recording
+from sst_ros.recording import recording
 
 
 def test_a_run_comes_back_as_it_was_written(written, bags, example2):

@@ -8,11 +8,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sst_ros import scene
-from sst_ros.control.torque import sine
-from sst_ros.mechanism import kernel
+from sst_ros.control.torque_profiles import sine
+from sst_ros.dynamics import kernel
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report import formulation, recording, reference, states
+from sst_ros.recording import recording
+from sst_ros.report import formulation, reference, states
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sst_ros import document, scene
-from sst_ros.report import formulation, recording, reference, summary
-from sst_ros.terms import Actuators, Friction, Gravity, Initial, JointFriction, Moment, Spring
+from sst_ros.recording import recording
+from sst_ros.report import formulation, reference, summary
+from sst_ros.scene import scene, yaml_document
+from sst_ros.scene.loads import Actuators, Friction, Gravity, Initial, JointFriction, Moment, Spring
 
 EXAMPLE2 = scene.load("example2")
 
@@ -94,8 +95,8 @@ def moved(bags, value, named=True):
         for entry in entries:
             content = entry.content
             if entry.topic == bags.SCENE:
-                one = document.read(scene.Scene, content.data, "bag")
-                text = document.dump(replace(one, moment=Moment(topic=True)))
+                one = yaml_document.read(scene.Scene, content.data, "bag")
+                text = yaml_document.dump(replace(one, moment=Moment(topic=True)))
                 content = dataclasses.replace(content, data=text)
             elif entry.topic == bags.APPLIED and named:
                 points = [

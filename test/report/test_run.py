@@ -11,7 +11,7 @@ from matplotlib import image
 
 from sst_ros import scene
 from sst_ros.errors import InputError
-from sst_ros.report import recording
+from sst_ros.recording import recording
 from sst_ros.report.run import judge, report
 from sst_ros.report.table import table
 

@@ -8,9 +8,10 @@ import pytest
 from matplotlib import image
 
 from sst_ros import scene
-from sst_ros.integration.tableaux import METHODS
-from sst_ros.report import catalogue
-from sst_ros.report.stability import (
+from sst_ros.integration.methods import METHODS
+from sst_ros.plot.stability import draw
+from sst_ros.studies import extreme_cases
+from sst_ros.studies.stability import (
     LONGEST_S,
     Stable,
     bisected,
@@ -18,11 +19,10 @@ from sst_ros.report.stability import (
     largest_step,
     viscous,
 )
-from sst_ros.report.stability_figure import draw
-from sst_ros.report.stability_run import lines
-from sst_ros.report.trial import Trial
+from sst_ros.studies.stability_report import lines
+from sst_ros.studies.work_precision import Trial
 
-CASES = list(catalogue.cases())
+CASES = list(extreme_cases.cases())
 
 
 def test_a_bound_is_found_to_one_per_cent():

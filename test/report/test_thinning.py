@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from sst_ros.report import thinning
+from sst_ros.plot import downsampling
 
 COUNT = 300_000
 
@@ -13,10 +13,10 @@ def test_few_points_stay_and_every_spike_is_among_them():
     curves = generator.normal(size=(3, COUNT))
     spikes = generator.choice(COUNT, 40, replace=False)
     curves[np.arange(40) % 3, spikes] = 20.0 * (-1.0) ** np.arange(40)
-    rows = thinning.extremes(curves, COUNT)
-    assert len(rows) < 3 * 2 * thinning.STRETCHES + 10 and np.all(np.diff(rows) > 0)
+    rows = downsampling.extremes(curves, COUNT)
+    assert len(rows) < 3 * 2 * downsampling.STRETCHES + 10 and np.all(np.diff(rows) > 0)
     assert set(spikes) <= set(rows) and {0, COUNT - 1} <= set(rows)
-    size = -(-COUNT // thinning.STRETCHES)
+    size = -(-COUNT // downsampling.STRETCHES)
     for curve in curves:  # the envelope is that of the whole curve
         for begin in range(0, COUNT, 50 * size):
             stretch = slice(begin, begin + size)
@@ -28,11 +28,11 @@ def test_a_gap_stays_a_gap():
     curve = np.sin(np.arange(COUNT) / 1e4)
     curve[123_456] = np.nan
     curve[200_000:220_000] = np.nan
-    few = curve[thinning.extremes([curve], COUNT)]
+    few = curve[downsampling.extremes([curve], COUNT)]
     assert np.isnan(few).sum() > 10
-    rows = thinning.extremes([curve], COUNT)
+    rows = downsampling.extremes([curve], COUNT)
     assert 123_456 in rows
 
 
 def test_short_curves_are_left_alone():
-    assert np.array_equal(thinning.extremes([np.zeros(1000)], 1000), np.arange(1000))
+    assert np.array_equal(downsampling.extremes([np.zeros(1000)], 1000), np.arange(1000))

@@ -9,7 +9,8 @@ import pytest
 from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.report import recording, tracking_bag, tracking_run
+from sst_ros.recording import recording
+from sst_ros.report import tracking, tracking_report
 from test.report import bags
 
 HOME = np.array(scene.load("example2").initial.gamma)
@@ -29,7 +30,7 @@ def bag(entries, tmp_path_factory):
 
 
 def test_the_track_is_what_was_written(bag):
-    followed = tracking_bag.read(bag)
+    followed = tracking.read(bag)
     run, track = recording.read(bag), followed.track
     assert len(track.time) == 51 and track.time[-1] == pytest.approx(0.1)
     assert track.gamma == pytest.approx(np.tile(HOME + OFF, (51, 1)))
@@ -39,13 +40,13 @@ def test_the_track_is_what_was_written(bag):
     assert np.array_equal(track.torque[:-1], run.ticks.torque[begins])
     assert not track.torque[-1].any()
     largest = np.abs(HOME + OFF - run.gamma).max(axis=0)
-    assert tracking_bag.judged(followed).largest == pytest.approx(largest)
+    assert tracking.judged(followed).largest == pytest.approx(largest)
 
 
 def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entries, tmp_path):
     plain = bags.without(entries, bags.DESIRED, bags.ERROR)
     bag = bags.write(tmp_path / "bag", bags.tracked(plain, lambda _: (HOME, STILL)))
-    followed = tracking_bag.read(bag)
+    followed = tracking.read(bag)
     q = followed.recording.quaternion
     assert followed.orientation_error.max() > 1e-3
     assert followed.orientation_error == pytest.approx(angle_between(q, q[0]), abs=1e-12)
@@ -55,11 +56,11 @@ def test_the_companions_last_word_says_how_often_a_torque_was_limited(entries, t
     said = bags.diagnostics_entry(entries[-1].received_ns + 1, samples_limited=7)
     said.content.status[0].name = "/sst_inverse_dynamics: control"
     bag = bags.write(tmp_path / "bag", [*entries, said])
-    assert tracking_bag.read(bag).limited == 7
+    assert tracking.read(bag).limited == 7
 
 
 def test_the_report_writes_a_table_and_a_picture(bag, tmp_path):
-    told = tracking_run.report(bag, tmp_path)
+    told = tracking_report.report(bag, tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
     assert "error, largest" in told and "nan" not in told
     assert (tmp_path / "tracking.png").stat().st_size > 10_000
@@ -68,7 +69,7 @@ def test_the_report_writes_a_table_and_a_picture(bag, tmp_path):
 def test_a_recording_without_a_reference_is_refused(entries, tmp_path):
     bag = bags.write(tmp_path / "bag", bags.without(entries, bags.DESIRED))
     with pytest.raises(InputError, match="reference"):
-        tracking_run.report(bag, tmp_path)
+        tracking_report.report(bag, tmp_path)
 
 
 def test_messages_of_other_joints_are_refused(entries, tmp_path):
@@ -78,4 +79,4 @@ def test_messages_of_other_joints_are_refused(entries, tmp_path):
     bad = bags.edited(entries, bags.ERROR, 3, renamed)
     bag = bags.write(tmp_path / "bag", bad)
     with pytest.raises(InputError, match="tracking_error"):
-        tracking_bag.read(bag)
+        tracking.read(bag)

@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
-from sst_ros import child  # noqa: E402
+from sst_ros import child_process  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
 
 DOMAINS = itertools.cycle(range(1, 101))
@@ -81,7 +81,7 @@ class Nodes:
         return process
 
     def run(self, command, **given):
-        return self.start(command, "--ros-args", *child.words(given))
+        return self.start(command, "--ros-args", *child_process.words(given))
 
     def line(self, process, timeout=20):
         assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"

@@ -67,7 +67,7 @@ def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes
     status, _, err = nodes.stop(process)
     assert status == 0, err
     found = subprocess.run(
-        [sys.executable, "-c", "from sst_ros.scene import share_directory as s; print(s())"],
+        [sys.executable, "-c", "from sst_ros.scene.scene import share_directory as s; print(s())"],
         env={**os.environ, **overlay},
         cwd=prefix,
         capture_output=True,

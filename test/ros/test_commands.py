@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.nodes.commands import ZERO, CommandBoard, Refused, named
-from sst_ros.nodes.settings import SimulatorParameters
-from sst_ros.scene import Actuators
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import ZERO, CommandBoard, Refused, named
+from sst_ros.scene.scene import Actuators
 from sst_ros.simulation import Simulation
 
 

@@ -9,11 +9,11 @@ import pytest
 from sst_ros import scene
 from sst_ros.control.controller import ControlStopped, Measured
 from sst_ros.control.tracking import BAND
-from sst_ros.desired_motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.errors import InputError, SstError
-from sst_ros.nodes.companion_pursuit import Pursuit, Stage
-from sst_ros.nodes.companion_settings import CompanionParameters
-from sst_ros.scene import Actuators, Initial
+from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.trajectory_following import Pursuit, Stage
+from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
+from sst_ros.scene.scene import Actuators, Initial
 from sst_ros.simulation import Simulation
 
 PERIOD_NS = 2_000_000

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.control import torque
+from sst_ros.control import torque_profiles
 from sst_ros.demo import demo
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.report.recording import read
+from sst_ros.recording.recording import read
 from sst_ros.simulation import Simulation
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
@@ -50,7 +50,7 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
 def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
     recording = read(out / "bag")
     played = load_scene("example2")
-    profile = torque.sine(played.torque)
+    profile = torque_profiles.sine(played.torque)
     simulation = Simulation(played)
     expected = [simulation.state.joints.gamma]
     for sample in range(500):

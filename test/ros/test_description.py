@@ -9,13 +9,13 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sst_ros import document
 from sst_ros.description.urdf import urdf
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.nodes.description import Markers
-from sst_ros.scene import Markers as Wanted
-from sst_ros.scene import load
+from sst_ros.nodes.robot_description import Markers
+from sst_ros.scene import yaml_document
+from sst_ros.scene.scene import Markers as Wanted
+from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
 pytestmark = pytest.mark.ros
@@ -44,7 +44,7 @@ def test_nothing_is_shown_that_was_not_asked_for(nodes, observer):
 
 def test_markers_of_a_scene_move(nodes, observer, tmp_path):
     path = tmp_path / "marked.yaml"
-    path.write_text(document.dump(dataclasses.replace(marked(), **moving())), encoding="utf-8")
+    path.write_text(yaml_document.dump(dataclasses.replace(marked(), **moving())), encoding="utf-8")
     nodes.run("simulator", scene=path)
     heard = observer.listen(MarkerArray, "/sst_simulator/markers")
     observer.until(lambda: len(heard) > 4, "markers")

@@ -6,8 +6,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from sst_ros.nodes import documentation, health
-from sst_ros.nodes.documentation import NODES, SIMULATION_INTERFACES, policy
+from sst_ros.runtime import diagnostics
+from tools import node_tables
+from tools.node_tables import NODES, SIMULATION_INTERFACES, policy
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
@@ -24,7 +25,7 @@ WITHOUT_REASON = {
 
 def test_the_docs_are_those_of_the_declarations():
     page = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
-    assert documentation.filled(page) == page, "run python -m sst_ros.nodes.documentation"
+    assert node_tables.filled(page) == page, "run python -m tools.node_tables"
 
 
 @pytest.mark.parametrize("node", NODES, ids=IDS)
@@ -106,4 +107,4 @@ def test_the_diagnostics_say_what_the_docs_say(nodes, observer):
     nodes.run("simulator")
     said = observer.told("phase", "running")
     said = observer.told("error_estimate", lambda value: True)
-    assert list(said)[:-2] == list(health.KEYS)
+    assert list(said)[:-2] == list(diagnostics.KEYS)

@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
-from sst_ros.document import dump
+from sst_ros.scene.yaml_document import dump
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_simulator"

@@ -11,10 +11,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros import demo, document, scene
-from sst_ros.desired_motions import DesiredMotion, Spiral, ToAngles
-from sst_ros.report import recording, tracking_bag
-from sst_ros.scene import Actuators, Stroke, Workspace
+from sst_ros import demo
+from sst_ros.recording import recording
+from sst_ros.report import tracking
+from sst_ros.scene import scene, yaml_document
+from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
+from sst_ros.scene.scene import Actuators, Stroke, Workspace
 
 pytestmark = pytest.mark.ros
 NAMES = ["gamma_1", "gamma_2", "gamma_3"]
@@ -26,7 +28,7 @@ def written(folder, name="example2", **changed):
     """A scene with another motion, as a file."""
     changed = {"motion": MOVE, "torque": None, "provenance": (), **changed}
     path = folder / "scene.yaml"
-    path.write_text(document.dump(dataclasses.replace(scene.load(name), **changed)))
+    path.write_text(yaml_document.dump(dataclasses.replace(scene.load(name), **changed)))
     return path
 
 
@@ -45,8 +47,8 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
 
     What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
     """
-    run = tracking_bag.read(twice[0] / "bag")
-    judged = tracking_bag.judged(run)
+    run = tracking.read(twice[0] / "bag")
+    judged = tracking.judged(run)
     travel = np.ptp(run.track.gamma, axis=0).max()
     assert travel > 0.2
     assert judged.samples == 301 and judged.largest.max() < 1e-3 * travel
@@ -65,7 +67,7 @@ def test_a_run_in_lockstep_is_repeated_exactly(twice):
     first, second = (recording.read(folder / "bag") for folder in twice)
     for name in ("time_ns", "gamma", "gamma_dot", "quaternion", "effort"):
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
-    tracks = [tracking_bag.read(folder / "bag").track for folder in twice]
+    tracks = [tracking.read(folder / "bag").track for folder in twice]
     for field in dataclasses.fields(tracks[0]):
         assert np.array_equal(*(getattr(track, field.name) for track in tracks)), field.name
 
@@ -204,7 +206,7 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
     run = recording.read(bag)
     assert not run.effort[-1].any() and run.effort[:100].any()  # let go
-    judged = tracking_bag.judged(tracking_bag.read(bag))
+    judged = tracking.judged(tracking.read(bag))
     assert judged.samples > 50 and judged.largest.max() < 1e-3
 
 

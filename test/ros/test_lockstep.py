@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from sst_ros.report import recording
+from sst_ros.recording import recording
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_simulator"

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 from sst_ros import load_scene
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.nodes.messages import JOINTS, NotFinite, StateMessages, TorqueLog, zyz_of
-from sst_ros.nodes.template import Template
+from sst_ros.nodes.raw_messages import Template
 from sst_ros.simulation import Simulation
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -3,7 +3,7 @@
 
 import pytest
 
-from sst_ros.nodes.pacing import Pacer
+from sst_ros.runtime.pacing import Pacer
 
 MS = 1_000_000
 

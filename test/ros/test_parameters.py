@@ -8,8 +8,8 @@ import pytest
 import yaml
 from rcl_interfaces.srv import DescribeParameters
 
-from sst_ros.nodes.settings import SimulatorParameters
-from sst_ros.schema import specs
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.scene.schema import specs
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,7 @@ from rosbags.rosbag2 import Reader
 from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import InputError
-from sst_ros.nodes import recovery
-from sst_ros.report import recording
+from sst_ros.recording import recording, recovery
 
 pytestmark = pytest.mark.ros
 

@@ -12,12 +12,12 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.errors import RunStopped
-from sst_ros.nodes.commands import ZERO, CommandBoard
-from sst_ros.nodes.interfaces import SimulationInterfaces
-from sst_ros.nodes.pacing import Pacer, SteadyTime
-from sst_ros.nodes.run_loop import RunLoop
-from sst_ros.nodes.run_parts import Phase
-from sst_ros.nodes.settings import SimulatorParameters
+from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
+from sst_ros.runtime.pacing import Pacer, SteadyTime
+from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.run_types import Phase
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import ZERO, CommandBoard
 from sst_ros.simulation import Simulation
 
 

@@ -10,8 +10,8 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
-from sst_ros.document import read
-from sst_ros.scene import Scene
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import read
 from sst_ros.simulation import Simulation
 
 pytestmark = pytest.mark.ros

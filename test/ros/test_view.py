@@ -16,7 +16,7 @@ pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
 from PIL import Image
 
-from sst_ros.view.browser import browse, chromium
+from tools.browser import browse, chromium
 
 pytestmark = [
     pytest.mark.ros,

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
-from sst_ros.view.browser import browse, chromium
+from tools.browser import browse, chromium
 
 pytestmark = [
     pytest.mark.ros,

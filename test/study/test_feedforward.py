@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.control.control_settings import MODES, ControlSettings
-from sst_ros.control.motions import motion_of
+from sst_ros.control.controller_settings import MODES, ControlSettings
+from sst_ros.control.reference_motions import motion_of
 from sst_ros.errors import InputError
-from sst_ros.scene import load
-from sst_ros.study import limits
-from sst_ros.study.channel import Channel
-from sst_ros.study.feedforward import RESTLESS, Plan, study
-from sst_ros.study.feedforward_figure import draw
-from sst_ros.study.feedforward_run import page
-from sst_ros.study.feedforward_table import COLUMNS, as_csv, as_json, of_instant, order, text
-from sst_ros.study.limits import ideal, limit, stable
-from sst_ros.study.loop import Loop, follow
-from sst_ros.study.model_errors import SHARE, model_errors
-from sst_ros.study.sampled import ORDERS, largest
+from sst_ros.plot.feedforward import draw
+from sst_ros.scene.scene import load
+from sst_ros.studies import bandwidth
+from sst_ros.studies.bandwidth import ideal, limit, stable
+from sst_ros.studies.channel import Channel
+from sst_ros.studies.control_loop import Loop, follow
+from sst_ros.studies.feedforward import RESTLESS, Plan, study
+from sst_ros.studies.feedforward_report import page
+from sst_ros.studies.feedforward_table import COLUMNS, as_csv, as_json, of_instant, order, text
+from sst_ros.studies.model_errors import SHARE, model_errors
+from sst_ros.studies.sampled_data import ORDERS, largest
 
 REACH = load("reach")
 SPIRAL = dataclasses.replace(REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4)
@@ -179,7 +179,7 @@ def test_a_scene_without_a_motion_is_refused():
 
 
 def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
-    rest = limits.Rest(motion_of(SHORT), 0.1)
+    rest = bandwidth.Rest(motion_of(SHORT), 0.1)
     assert rest.at(0.05) == rest.at(0.0) and rest.at(0.0).gamma == motion_of(SHORT).at(0.0).gamma
 
 

@@ -6,11 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sst_ros.control.inverse import InverseDynamics
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.start import initial_state
-from sst_ros.scene import Actuators, load
-from sst_ros.study.model_errors import heavier, model_errors, without_friction
+from sst_ros.scene.scene import Actuators, load
+from sst_ros.studies.model_errors import heavier, model_errors, without_friction
 
 REACH, EXAMPLE2 = load("reach"), load("example2")
 RATE, ACCELERATION = (0.4, -0.7, 0.9), (3.0, 2.0, -5.0)

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sst_ros.study.pool import answers
+from sst_ros.studies.pool import answers
 
 ASKING = "from study.test_pool import waiting; waiting()"
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from sst_ros.study.sampled import first_lost, largest, pole, slope
+from sst_ros.studies.sampled_data import first_lost, largest, pole, slope
 
 
 def matrix(product, damping, delay):

@@ -7,7 +7,7 @@ import pytest
 from sst_ros.description.shapes import STEP, Ball, Box, Tube, arc, end_point, shapes
 from sst_ros.description.tree import STAR
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene import load, names
+from sst_ros.scene.scene import load, names
 from sst_ros.view.meshes import ROUND, meshes
 
 RED = (1.0, 0.0, 0.0)

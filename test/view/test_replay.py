@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from report import bags
 
-from sst_ros.report.recording import read
-from sst_ros.scene import load
+from sst_ros.recording.recording import read
+from sst_ros.scene.scene import load
 
 pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
 from sst_ros.view import replay
-from sst_ros.view.browser import browse, chromium
+from tools.browser import browse, chromium
 
 PICTURES = Path(__file__).parents[2] / "view_out"
 RIGHT, HOME = "\ue014", "\ue011"

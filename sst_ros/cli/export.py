@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`export`: a recorded run as CSV or Parquet."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sst_ros.cli import Commands
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    export = commands.add_parser("export", help="a recorded run as CSV or Parquet")
+    export.add_argument("bag", type=Path, metavar="BAG", help="folder of the bag")
+    export.add_argument(
+        "--format", choices=("csv", "parquet"), default="csv", help="default: csv", dest="form"
+    )
+    export.add_argument("--out", type=Path, help="folder of the tables; default: beside the bag")
+    export.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from sst_ros.recording.export import export
+
+    out = options.out or options.bag.parent / "export"
+    for path in export(options.bag, out, options.form):
+        print(path)

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`plan`: what a desired motion asks of the actuators."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sst_ros import scene
+from sst_ros.cli import Commands, group
+from sst_ros.errors import InputError, Problem
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    kinds = group(commands.add_parser("plan", help="what a desired motion asks of the actuators"))
+    check = kinds.add_parser(
+        "check", help="can the actuators do it, and how fast; exit status 0 if they can"
+    )
+    check.add_argument("scene", metavar="FILE", help="scene with a motion: name, or .yaml file")
+    check.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    check.add_argument("--csv", type=Path, metavar="OUT", help="write the torques to play")
+    check.add_argument(
+        "--period", type=float, default=1e-3, help="length of a row of --csv [s]; default 0.001"
+    )
+    check.set_defaults(run=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from sst_ros.control.plan import examine
+    from sst_ros.control.plan_table import as_json, table, write_torques
+    from sst_ros.control.reference_motions import motion_of
+    from sst_ros.control.time_scaling import speed
+    from sst_ros.recording.recorded_motion import samples
+
+    if not 1e-9 <= options.period < float("inf"):
+        problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
+        raise InputError("plan check", [problem])
+    held = scene.load(options.scene)
+    plan = examine(motion_of(held, samples), held)
+    write = as_json if options.json else table
+    print(write(plan, speed(plan)).rstrip())
+    if options.csv is not None:
+        write_torques(plan, options.csv, options.period)
+    return 1 if plan.problems else 0

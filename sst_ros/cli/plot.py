@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`plot`: pictures of a recorded run, or of several."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sst_ros.cli import Commands
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    plot = commands.add_parser("plot", help="pictures of recorded runs, as PDF and PNG")
+    plot.add_argument("bags", type=Path, nargs="*", metavar="BAG", help="folder of the bag")
+    plot.add_argument("--out", type=Path, help="folder of the pictures; default: beside the bag")
+    plot.add_argument("--only", nargs="+", default=[], metavar="NAME", help="draw only these")
+    plot.add_argument("--list", action="store_true", help="list the pictures, and draw none")
+    plot.add_argument(
+        "--compare", nargs="+", type=Path, default=[], metavar="BAG",
+        help="lay runs on each other, and tell how far they are from the first",
+    )  # fmt: skip
+    plot.set_defaults(run=_plot, parser=plot)
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from sst_ros.plot import catalogue, compare
+    from sst_ros.recording import signals
+
+    if options.list:
+        for name, picture in catalogue.PICTURES.items():
+            print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
+        print(f"{'with --compare':<18}{', '.join(compare.PICTURES)}")
+        return 0
+    bags = [*options.bags, *options.compare]
+    if not bags or (len(bags) > 1 and not options.compare):
+        options.parser.error("name one BAG, or several with --compare")
+    out = options.out or bags[0].parent / "plots"
+    runs = [signals.read(bag) for bag in bags]
+    if options.compare:
+        print(compare.table(runs))
+        paths, missing = compare.draw(runs, out, options.only)
+    else:
+        paths, missing = catalogue.draw(runs[0], out, options.only)
+    for path in paths:
+        print(path)
+    for name, why in missing.items():
+        print(f"{name}: {why}")
+    return 0 if paths else 1

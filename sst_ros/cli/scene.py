@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`scene`: look at scenes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from sst_ros import scene
+from sst_ros.cli import Commands, group
+from sst_ros.errors import SstError
+from sst_ros.scene.json_schema import json_schema
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    kinds = group(commands.add_parser("scene", help="look at scenes"))
+    kinds.add_parser("list", help="the scenes that come with sst_ros").set_defaults(run=_list)
+    show = kinds.add_parser("show", help="what a scene is made of and what it costs")
+    show.add_argument("scene", help="name, or path of a .yaml file")
+    show.set_defaults(run=_show)
+    check = kinds.add_parser("check", help="tell every fault of scene files")
+    check.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    check.set_defaults(run=_check)
+    kinds.add_parser("schema", help="JSON schema for editors").set_defaults(run=_schema)
+    keys = kinds.add_parser("keys", help="reference of all keys, as Markdown")
+    keys.set_defaults(run=_keys)
+
+
+def _list(_: argparse.Namespace) -> None:
+    for name in scene.names():
+        print(f"{name:<18}{scene.load(name).description}")
+
+
+def _show(options: argparse.Namespace) -> None:
+    from sst_ros.studies.scene_summary import sheet
+
+    print(sheet(scene.load(options.scene)), end="")
+
+
+def _check(options: argparse.Namespace) -> int:
+    from sst_ros.cli.scene_check import check
+
+    failed = 0
+    for path in options.files:
+        try:
+            check(path)
+            print(f"{path}: valid")
+        except SstError as error:
+            failed = 1
+            print(error)
+    return failed
+
+
+def _schema(_: argparse.Namespace) -> None:
+    print(json.dumps(json_schema(scene.Scene, "sst_ros scene"), indent=2))
+
+
+def _keys(_: argparse.Namespace) -> None:
+    from tools.scene_keys import keys
+
+    print(keys(), end="")

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`study`: try what cannot be tried on a machine."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sst_ros import scene
+from sst_ros.cli import Commands, group
+from sst_ros.errors import InputError, Problem
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    kinds = group(commands.add_parser("study", help="controllers against what they have wrong"))
+    feedforward = kinds.add_parser(
+        "feedforward",
+        help="every mode of control against every error of its model",
+        description="Every mode of control against every error of its model, delay, encoders and "
+        "noise; the order of the hold; the largest stable bandwidth. On all cores; the same bits "
+        "on any number of them.",
+    )
+    feedforward.add_argument(
+        "--scene", default="reach", help="name, or path of a .yaml file, with a motion: %(default)s"
+    )
+    feedforward.add_argument(
+        "--period", type=float, default=1e-3, help="control period [s]: %(default)s"
+    )
+    feedforward.add_argument(
+        "--bandwidths", type=float, nargs="+", default=[20.0, 60.0, 180.0], metavar="W",
+        help="of the feedback [rad/s]: 20 60 180",
+    )  # fmt: skip
+    feedforward.add_argument(
+        "--damping-ratio", type=float, default=1.0, help="of the feedback: %(default)s"
+    )
+    feedforward.add_argument("--seed", type=int, default=8, help="of the noise: %(default)s")
+    feedforward.add_argument("--workers", type=int, help="processes; default: one a core")
+    feedforward.add_argument(
+        "--out", type=Path, default=Path("feedforward_out"),
+        help="folder of feedforward.csv, .json, .md and .png: %(default)s",
+    )  # fmt: skip
+    feedforward.set_defaults(run=_feedforward)
+
+
+def _feedforward(options: argparse.Namespace) -> None:
+    from sst_ros.studies.feedforward import Plan
+    from sst_ros.studies.feedforward_report import report
+
+    problems = []
+    if not 1e-6 <= options.period <= 1.0:
+        problems.append(Problem("--period", options.period, "must be from 1e-6 to 1 s"))
+    if options.seed < 0:
+        problems.append(Problem("--seed", options.seed, "must be >= 0"))
+    if options.workers is not None and options.workers < 1:
+        problems.append(Problem("--workers", options.workers, "must be >= 1"))
+    if problems:
+        raise InputError("study", problems)
+    plan = Plan(
+        scene.load(options.scene),
+        period_ns=round(options.period * 1e9),
+        bandwidths=tuple(dict.fromkeys(options.bandwidths)),
+        damping_ratio=options.damping_ratio,
+        seed=options.seed,
+    )
+    report(plan, options.out, workers=options.workers)

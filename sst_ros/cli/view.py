@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`view`: the manipulator in a browser, live or from a bag."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import threading
+from pathlib import Path
+
+from sst_ros import child_process, scene
+from sst_ros.cli import Commands
+from sst_ros.errors import InputError, Problem
+
+
+def add(commands: Commands) -> None:
+    """Add the command to the command line."""
+    view = commands.add_parser(
+        "view",
+        help="show the manipulator in a browser, live or from a bag",
+        description="Show a running simulator, one that is started for it (--scene), or a bag.",
+    )
+    view.add_argument("bag", nargs="?", type=Path, help="folder of a bag to play")
+    view.add_argument("--scene", metavar="S", help="start a simulator of this scene to look at")
+    view.add_argument(
+        "--simulator", default="sst_simulator", metavar="NAME", help="node of the simulator"
+    )
+    view.add_argument("--namespace", default="/", metavar="NS", help="namespace of its nodes")
+    view.add_argument("--host", default="127.0.0.1", help="address to serve at (this machine only)")
+    view.add_argument("--port", type=int, default=8080, help="port; the next free one is taken")
+    view.add_argument("--open", action="store_true", help="open it, where there is a desktop")
+    view.set_defaults(run=_view)
+
+
+def _view(options: argparse.Namespace) -> int:
+    if options.bag is not None and options.scene is not None:
+        allowed = "give a bag or a scene, not both"
+        raise InputError("view", [Problem("--scene", options.scene, allowed)])
+    _needed("viser", "view")
+    if options.bag is not None:
+        return _replay(options)
+    _needed("rclpy", "ros")
+    if options.scene is None:
+        return _live(options)
+    scene.load(options.scene)
+    from sst_ros.view.live import simulator
+
+    with simulator(options.scene):
+        return _live(options)
+
+
+def _live(options: argparse.Namespace) -> int:
+    from sst_ros.nodes import viewer
+
+    given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
+    space = f"__ns:={options.namespace}"
+    return viewer.main(["viewer", "--ros-args", "-r", space, *child_process.words(given)])
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from sst_ros.view.page import Page
+    from sst_ros.view.replay import Replay
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    page = Page(Replay(options.bag), options.host, options.port)
+    page.announce(opened=options.open)
+    while not stop.wait(1.0):  # a wait without end could not be interrupted
+        pass
+    page.close()
+    return 0
+
+
+def _needed(module: str, extra: str) -> None:
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        allowed = f"is not installed: pip install 'sst_ros[{extra}]'"
+        raise InputError("view", [Problem(module, None, allowed)]) from None

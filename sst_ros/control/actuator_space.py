@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the star to the actuators and back: positions, rates and accelerations, to rounding.
+
+One equation serves both ways: gamma_dot_k = g_k.W and, differentiated, gamma_ddot_k = g_k.W_dot +
+(what there is at W_dot = 0), which is Eq. 40 solved for gamma_ddot. Orientations of given actuator
+angles come from Newton's method, started so near that it cannot leave the assembly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from sst_ros.control.reference import Desired, Quadruple, Triple
+from sst_ros.dynamics import kernel, loads
+from sst_ros.dynamics.expression import trace
+from sst_ros.dynamics.kernel import Leg
+from sst_ros.dynamics.math_functions import sqrt
+from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE, compiled
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.vec3 import ZERO, cross, dot, rotation_rows, scaled, turned_back
+
+ROUNDING = 4e-16
+"""Residual abs(r_k . t_k) that needs no further step."""
+
+_STEPS = 20
+_ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
+_CARRIAGES = tuple(f"r{k}{axis}" for k in range(3) for axis in "xyz")
+
+
+class Coordinates:
+    """Traced kinematics of one geometry."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
+        self._legs = [
+            Leg(tuple(w), tuple(v), cross(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
+            for w, v, e in rows
+        ]
+        self._actuators = compiled(trace(self._of_star, (*QUATERNION, *RATE, *BODY_ACCELERATION)))
+        self._star = compiled(trace(self._of_actuators, (*QUATERNION, *_ACTUATORS)))
+        self._posture = compiled(trace(self._of_posture, QUATERNION))
+        self._newton = compiled(trace(self._improved, (*QUATERNION, *_CARRIAGES)))
+
+    def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Desired:
+        """Add gamma, in (-pi, pi], and its derivatives to a motion of the star.
+
+        Raises:
+            ArithmeticError: serial singularity.
+
+        """
+        g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
+        return Desired(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
+
+    def posture(self, q: Quadruple) -> tuple[float, ...]:
+        """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation.
+
+        Raises:
+            ArithmeticError: serial singularity.
+
+        """
+        return self._posture(*q)
+
+    def of_actuators(
+        self, near: Quadruple, gamma: Triple, gamma_dot: Triple, gamma_ddot: Triple
+    ) -> Desired:
+        """Add the orientation that is next to `near`, and its derivatives, to the actuators'.
+
+        Raises:
+            ArithmeticError: singularity.
+
+        """
+        q = self.orientation(near, gamma)
+        x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
+        return Desired(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
+
+    def orientation(self, near: Quadruple, gamma: Triple) -> Quadruple:
+        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma that is next to `near`.
+
+        Raises:
+            ArithmeticError: parallel singularity.
+
+        """
+        carriages: list[float] = []
+        for angle, leg in zip(gamma, self._legs, strict=True):
+            c, s = math.cos(angle), math.sin(angle)
+            carriages += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
+        best, least, q = near, math.inf, near
+        for _ in range(_STEPS):
+            *moved, first, second, third = self._newton(*q, *carriages)
+            worst = max(abs(first), abs(second), abs(third))
+            if worst < least:
+                best, least = q, worst
+            if not worst > ROUNDING:
+                break
+            q = (moved[0], moved[1], moved[2], moved[3])
+        return best
+
+    def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
+        rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        legs = [(leg, kernel.leg_motion(leg, rows, rate)) for leg in self._legs]
+        return (
+            *(loads.angle(at, 0, leg.across, leg.v) for leg, at in legs),
+            *(at.gamma_dot for _, at in legs),
+            *(dot(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
+        )
+
+    def _of_posture(self, *q: Any) -> tuple[Any, ...]:
+        rows = rotation_rows((q[0], q[1], q[2], q[3]))
+        legs = [(leg, kernel.leg_motion(leg, rows, ZERO)) for leg in self._legs]
+        sines = [sqrt(at.u) for _, at in legs]
+        # Rows t_k x r_k of J2; p = r sin(mu).
+        j2 = [
+            scaled(1.0 / sine, cross(at.along, at.p))
+            for sine, (_, at) in zip(sines, legs, strict=True)
+        ]
+        beta = (loads.angle(at, 2, leg.across, leg.v) for leg, at in legs)
+        return (*sines, *beta, dot(j2[0], cross(j2[1], j2[2])))
+
+    def _of_actuators(self, *inputs: Any) -> tuple[Any, ...]:
+        rows, gamma_dot, gamma_ddot = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
+        rate = _solved(reach, gamma_dot)
+        moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
+        rest = [kernel.rest_accelerations(at, rate)[1] for at in moving]
+        missing = [asked - has for asked, has in zip(gamma_ddot, rest, strict=True)]
+        return (*rate, *_solved(reach, missing))
+
+    def _improved(self, *inputs: Any) -> tuple[Any, ...]:
+        """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
+        q = inputs[:4]
+        rows = rotation_rows(q)
+        arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
+        local = [turned_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
+        residual = [dot(r, e) for r, e in zip(local, arcs, strict=True)]
+        # R exp(turn): the residual changes by turn . (e x r).
+        slope = [cross(e, r) for r, e in zip(local, arcs, strict=True)]
+        tx, ty, tz = (-0.5 * part for part in _solved(slope, residual))
+        x, y, z, w = q
+        moved = (
+            x + w * tx + y * tz - z * ty,
+            y + w * ty + z * tx - x * tz,
+            z + w * tz + x * ty - y * tx,
+            w - x * tx - y * ty - z * tz,
+        )
+        length = sqrt(sum(part * part for part in moved))
+        return (*(part / length for part in moved), *residual)
+
+
+def _solved(rows: list[Any], right: Any) -> tuple[Any, ...]:
+    """Solve rows . x = right by Cramer's rule."""
+    others = (cross(rows[1], rows[2]), cross(rows[2], rows[0]), cross(rows[0], rows[1]))
+    determinant = dot(rows[0], others[0])
+    total = [
+        sum(number * other[i] for number, other in zip(right, others, strict=True))
+        for i in range(3)
+    ]
+    return tuple(part / determinant for part in total)

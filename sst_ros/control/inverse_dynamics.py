@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inverse dynamics: the torques that make the manipulator accelerate as it should."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sst_ros.control.reference import Quadruple, Triple
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
+
+SINGULAR = 1e-10
+"""sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""
+
+REST: Triple = (0.0, 0.0, 0.0)
+
+
+class InverseDynamics:
+    """Torques at the joints of a scene, all its terms included.
+
+    It is the model that the simulation integrates, solved for the torques. What stands between a
+    command and a torque (limit, lag) is no part of it.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        dynamics = Dynamics.of(scene)
+        self._moved = dynamics.moved
+        self._program = dynamics.inverse
+
+    def torque(
+        self,
+        quaternion: Quadruple,
+        body_rate: Triple,
+        body_acceleration: Triple,
+        moment: Triple = REST,
+    ) -> Triple:
+        """Torques [N m] that give W_dot in a state.
+
+        Args:
+            quaternion: of {E} in {B}, (x, y, z, w), of any length > 0.
+            body_rate: W in {E} [rad/s].
+            body_acceleration: W_dot in {E} [rad/s^2].
+            moment: external moment on the star in {B} [N m], used where the scene takes it from
+                a topic.
+
+        Raises:
+            SingularConfiguration: serial (sin(mu_k) = 0) or parallel (det J2 = 0); no torques
+                control the star there.
+            InputError: an argument is not finite, or the quaternion has no direction.
+
+        """
+        given = (*quaternion, *body_rate, *body_acceleration, *(moment if self._moved else ()))
+        try:
+            first, second, third, determinant, *squares = self._program(*given)
+        except (ArithmeticError, ValueError):
+            raise self._refusal(quaternion, given) from None
+        least = min(squares)
+        det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
+        # Comparisons with NaN are false: what is not finite is refused, too.
+        sound = math.isfinite(first + second + third)
+        if not (sound and least > SINGULAR * SINGULAR and det_j2 > SINGULAR):
+            raise self._refusal(quaternion, given)
+        return first, second, third
+
+    def gravity_torque(self, quaternion: Quadruple) -> Triple:
+        """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
+
+        Raises:
+            SingularConfiguration, InputError: as `torque`.
+
+        """
+        return self.torque(quaternion, REST, REST)
+
+    def _refusal(self, quaternion: Quadruple, given: Sequence[float]) -> Exception:
+        problems = list(_problems(quaternion, given))
+        if problems:
+            return InputError("inverse dynamics", problems)
+        geometry = Geometry.of(self.scene)
+        # t_k x w_k is r_k times sin(mu_k); J2 has the rows t_k x r_k.
+        t = geometry.e @ rotation_matrix(quaternion).T
+        across = np.cross(t, geometry.w)
+        sines = np.linalg.norm(across, axis=1)
+        least = float(sines.min())
+        if least <= SINGULAR:
+            return SingularConfiguration("serial singularity, sin(mu)", least)
+        j2 = np.cross(t, across / sines[:, None])
+        said = "no finite torque gives this acceleration: det J2"
+        determinant = float(np.linalg.det(j2))
+        if abs(determinant) <= 2.0 * SINGULAR:
+            said = "parallel singularity, det J2"
+        return SingularConfiguration(said, determinant)
+
+
+def _problems(quaternion: Quadruple, given: Sequence[float]) -> Iterator[Problem]:
+    if not all(map(math.isfinite, given)):
+        yield Problem("state", tuple(given), "must be finite numbers")
+    elif math.hypot(*quaternion) < 1e-100:
+        yield Problem("quaternion", quaternion, "must have a length > 0")

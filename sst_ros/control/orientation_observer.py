@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The orientation that encoders cannot see: it follows from gamma, by continuity from the last.
+
+The steps are those that `continuation` proves not to leave the branch. It needs sigma, the least
+singular value of J2. The rows of J2 are unit vectors, so its squared singular values sum to 3, the
+product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most steps, and
+cheap. Where a step is too long for that, `continuation` goes it in parts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.reference import Quadruple, Triple
+from sst_ros.mechanism import continuation
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.vec3 import axpy, cross, dot, rotation_rows
+
+CLOSED = 1e-14
+"""Largest abs(r_k . t_k) of an orientation that is told to be one."""
+
+
+class OrientationObserver:
+    """Follows one assembly, however far apart the angles are that it is shown.
+
+    Args:
+        geometry: base triangle and star.
+        quaternion: orientation (x, y, z, w) in which it begins.
+        gamma: actuator angles there [rad].
+
+    """
+
+    def __init__(self, geometry: Geometry, quaternion: Quadruple, gamma: Triple) -> None:
+        self.coordinates = Coordinates(geometry)
+        self._begin = quaternion, gamma
+        across = np.cross(geometry.w, geometry.v)
+        legs = (geometry.v.tolist(), across.tolist(), geometry.e.tolist())
+        self._legs = list(zip(*legs, strict=True))
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to where it began."""
+        self._quaternion, self._gamma = self._begin
+        self._sigma, _ = self._measures(self._quaternion, self._gamma)
+
+    def see(self, gamma: Triple) -> Quadruple:
+        """Return the quaternion (x, y, z, w) at the next angles [rad].
+
+        Raises:
+            BranchEnds: a parallel singularity lies in the way, as of angles that no assembly has.
+
+        """
+        found = self._stepped(gamma)
+        if found is None:
+            found = self._followed(gamma)
+        self._quaternion, self._gamma = found, gamma
+        return found
+
+    def _stepped(self, gamma: Triple) -> Quadruple | None:
+        """Go there in one step; None where it might lead to another assembly."""
+        step, sigma = math.dist(gamma, self._gamma), self._sigma
+        if step > continuation.SAFE * sigma * sigma:
+            return None
+        try:
+            found = self.coordinates.orientation(self._quaternion, gamma)
+        except ArithmeticError:
+            return None
+        # The theorem speaks of a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
+        half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, self._quaternion)) ** 2))
+        next_sigma, residual = self._measures(found, gamma)
+        if residual > CLOSED or half > 0.25 * (sigma - step):
+            return None
+        self._sigma = next_sigma
+        return found
+
+    def _followed(self, gamma: Triple) -> Quadruple:
+        rotation = continuation.advance(
+            self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
+        )
+        x, y, z, w = quaternion_of(rotation).tolist()
+        self._sigma, _ = self._measures((x, y, z, w), gamma)
+        return x, y, z, w
+
+    def _measures(self, quaternion: Quadruple, gamma: Triple) -> tuple[float, float]:
+        """Give a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
+        rows = rotation_rows(quaternion)
+        normals, worst = [], 0.0
+        for angle, (v, across, e) in zip(gamma, self._legs, strict=True):
+            r = axpy(math.cos(angle), v, math.sin(angle), across)
+            t = dot(rows[0], e), dot(rows[1], e), dot(rows[2], e)
+            normals.append(cross(t, r))
+            worst = max(worst, abs(dot(r, t)))
+        determinant = dot(normals[0], cross(normals[1], normals[2]))
+        return 2.0 / 3.0 * abs(determinant), worst

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dynamics that run: state (quaternion q of {E} in {B}, body angular velocity W), rational.
+
+In {E} the axis t_k of arc k is constant and the actuator axis w_k is a combination of rows of R.
+With a = cos(mu_k) = t.w, p = t x w, u = 1 - a^2 and g = (w - a t)/u a leg moves as
+
+    a_dot = p.W,    gamma_dot = g.W,
+
+both rates of true coordinates. Across t_k the intermediate link turns as the star does, so the part
+Ixx (1 - t t^T) of its inertia belongs to the star, for good; what is left of a leg is the kinetic
+energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces act on the star through p and g
+(virtual work). The loops are closed by construction, and M is positive definite wherever u > 0:
+only a serial singularity (t_k = +-w_k) has no dynamics.
+
+The inertial part uses + - * / and, for a link with products of inertia xz or yz, one square root;
+loads may need angles (`loads`). The functions run on floats, complex numbers, NumPy columns,
+mpmath numbers and expressions alike; the simulation runs what `trace` leaves of them for a scene.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sst_ros.dynamics import loads
+from sst_ros.dynamics.loads import LegMotion
+from sst_ros.dynamics.math_functions import sqrt
+from sst_ros.dynamics.model import Leg, Model, model_of
+from sst_ros.mechanism.vec3 import (
+    ZERO,
+    Rows,
+    Scalar,
+    Triple,
+    added,
+    axpy,
+    cross,
+    dot,
+    rotation_rows,
+    scaled,
+    solve_symmetric,
+    turned_back,
+)
+
+__all__ = [
+    "Balance",
+    "Joints",
+    "Leg",
+    "Model",
+    "actuator_torque",
+    "balance",
+    "body_acceleration",
+    "derivative",
+    "joints",
+    "model_of",
+]
+
+Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
+State = tuple[Scalar, ...]
+
+
+class Joints(NamedTuple):
+    """Angles [rad] and rates [rad/s] of all nine joints, by kind and leg."""
+
+    gamma: Triple
+    mu: Triple
+    beta: Triple
+    gamma_dot: Triple
+    mu_dot: Triple
+    beta_dot: Triple
+
+
+class Balance(NamedTuple):
+    """M W_dot = force in {E}, everything reduced to the star by virtual work.
+
+    Attributes:
+        inertia: M (xx, yy, zz, xy, xz, yz) [kg m^2].
+        force: moment of all that acts at W_dot = 0, velocity products included [N m].
+        reach: rows g_k; gamma_dot_k = g_k.W, and a torque at gamma_k acts as tau_k g_k.
+
+    """
+
+    inertia: tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+    force: Triple
+    reach: Rows
+
+
+def derivative(model: Model, state: State, torque: Triple, moment: Triple | None = None) -> State:
+    """Time derivative of the state, seven numbers (q, W), and with lag three torques more.
+
+    Args:
+        model: constants.
+        state: quaternion (x, y, z, w), of any length > 0, W [rad/s] in {E}, and where the
+            actuators lag the torques they give [N m].
+        torque: actuator torques [N m]; with lag the commanded ones.
+        moment: external moment on the star in {B} [N m], or None where there is none.
+
+    """
+    x, y, z, w, wx, wy, wz, *given = state
+    more: State = ()
+    if model.time_constant is not None:
+        more = tuple(
+            (asked - has) / model.time_constant for asked, has in zip(torque, given, strict=True)
+        )
+        torque = (given[0], given[1], given[2])
+    acceleration = body_acceleration(model, (x, y, z, w), (wx, wy, wz), torque, moment)
+    return (
+        0.5 * (w * wx + y * wz - z * wy),
+        0.5 * (w * wy + z * wx - x * wz),
+        0.5 * (w * wz + x * wy - y * wx),
+        -0.5 * (x * wx + y * wy + z * wz),
+        *acceleration,
+        *more,
+    )
+
+
+def body_acceleration(
+    model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
+) -> Triple:
+    """W_dot [rad/s^2] in {E} of the direct dynamics; arguments as for `derivative`."""
+    at = balance(model, q, rate, torque, moment)
+    return solve_symmetric(*at.inertia, *at.force)
+
+
+def actuator_torque(
+    model: Model, q: Quadruple, rate: Triple, acceleration: Triple, moment: Triple | None = None
+) -> tuple[Triple, Scalar]:
+    """Torques [N m] of the inverse dynamics, and the determinant of the rows g_k.
+
+    The torques do the work tau_k g_k.W on the star: M W_dot = force + sum tau_k g_k. With
+    g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel singularity.
+    """
+    at = balance(model, q, rate, ZERO, moment)
+    xx, yy, zz, xy, xz, yz = at.inertia
+    x, y, z = acceleration
+    missing = (
+        xx * x + xy * y + xz * z - at.force[0],
+        xy * x + yy * y + yz * z - at.force[1],
+        xz * x + yz * y + zz * z - at.force[2],
+    )
+    first, second, third = at.reach
+    others = (cross(second, third), cross(third, first), cross(first, second))
+    determinant = dot(first, others[0])
+    tau = tuple(dot(missing, other) / determinant for other in others)
+    return (tau[0], tau[1], tau[2]), determinant
+
+
+def balance(
+    model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
+) -> Balance:
+    """Collect all that acts on the star; arguments as for `derivative`."""
+    rows = rotation_rows(q)
+    mxx, myy, mzz, mxy, mxz, myz = model.star
+    fx, fy, fz = _on_star(model, rows, rate, moment)
+    field = field_of(model, rows)
+    reach = []
+    for leg, drive in zip(model.legs, torque, strict=True):
+        at = leg_motion(leg, rows, rate)
+        a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
+        reach.append(g)
+        a_rest, gamma_rest = rest_accelerations(at, rate)
+        # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
+        a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
+        c_inertia: Scalar = 0.0
+        c_slope: Scalar = 0.0
+        if leg.ixy or leg.ixz or leg.iyz:
+            root = sqrt(u)
+            c_inertia, c_slope = leg.ixz * a / root - leg.ixy, leg.ixz / (u * root)
+            a_inertia = a_inertia - 2.0 * leg.iyz * a * root
+            a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
+        force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
+        force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
+        force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
+        toward_a = scaled(c_inertia, g)
+        toward_gamma = axpy(a_inertia, g, c_inertia, p)
+        if leg.loads is not None:
+            at_gamma, at_mu, at_beta = loads.joint_torques(leg.loads, at, leg.across, leg.v, field)
+            force_gamma = force_gamma - at_gamma
+            # mu_dot = -a_dot / sqrt(u)
+            force_a = force_a + _quotient(at_mu, u)
+            fx, fy, fz = fx + at_beta * at.b[0], fy + at_beta * at.b[1], fz + at_beta * at.b[2]
+        fx = fx - force_a * p[0] - force_gamma * g[0]
+        fy = fy - force_a * p[1] - force_gamma * g[1]
+        fz = fz - force_a * p[2] - force_gamma * g[2]
+        mxx = mxx + toward_a[0] * p[0] + toward_gamma[0] * g[0]
+        myy = myy + toward_a[1] * p[1] + toward_gamma[1] * g[1]
+        mzz = mzz + toward_a[2] * p[2] + toward_gamma[2] * g[2]
+        mxy = mxy + toward_a[0] * p[1] + toward_gamma[0] * g[1]
+        mxz = mxz + toward_a[0] * p[2] + toward_gamma[0] * g[2]
+        myz = myz + toward_a[1] * p[2] + toward_gamma[1] * g[2]
+    return Balance((mxx, myy, mzz, mxy, mxz, myz), (fx, fy, fz), (reach[0], reach[1], reach[2]))
+
+
+def joints(model: Model, state: State) -> Joints:
+    """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
+    x, y, z, w, wx, wy, wz = state[:7]
+    rows = rotation_rows((x, y, z, w))
+    angles, rates = [], []
+    for leg in model.legs:
+        at = leg_motion(leg, rows, (wx, wy, wz))
+        angles.append([loads.angle(at, kind, leg.across, leg.v) for kind in range(3)])
+        rates.append([loads.rate(at, kind) for kind in range(3)])
+    gamma, mu, beta = zip(*angles, strict=True)
+    gamma_dot, mu_dot, beta_dot = zip(*rates, strict=True)
+    return Joints(gamma, mu, beta, gamma_dot, mu_dot, beta_dot)
+
+
+def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
+    """Vectors and rates of a leg; `rows` are the rows of R, `rate` is W."""
+    e0, e1 = leg.e0, leg.e1
+    w0, w1, w2 = leg.w
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
+    x = w0 * r00 + w1 * r10 + w2 * r20
+    y = w0 * r01 + w1 * r11 + w2 * r21
+    z = w0 * r02 + w1 * r12 + w2 * r22
+    a, across = e0 * x + e1 * y, e0 * y - e1 * x
+    p = (e1 * z, -(e0 * z), across)
+    u = across * across + z * z
+    g = ((x - a * e0) / u, (y - a * e1) / u, z / u)
+    b = ((a * x - e0) / u, (a * y - e1) / u, a * z / u)
+    outward = (dot(rows[0], p), dot(rows[1], p), dot(rows[2], p))
+    return LegMotion(
+        axis=(x, y, z),
+        along=(e0, e1, 0.0),
+        a=a,
+        p=p,
+        u=u,
+        g=g,
+        b=b,
+        outward=outward,
+        gamma_dot=dot(g, rate),
+        a_dot=dot(p, rate),
+        beta_dot=dot(b, rate),
+    )
+
+
+def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
+    """Accelerations of the coordinates a and gamma of a leg at W_dot = 0."""
+    along = dot(at.along, rate)
+    a_rest = dot(at.axis, rate) * along - at.a * dot(rate, rate)
+    return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
+
+
+def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> Triple:
+    """Moments on the star in {E}: gyroscopic, weight, external."""
+    wx, wy, wz = rate
+    xx, yy, zz, xy, xz, yz = model.star
+    spin = (
+        xx * wx + xy * wy + xz * wz,
+        xy * wx + yy * wy + yz * wz,
+        xz * wx + yz * wy + zz * wz,
+    )
+    total = cross(spin, rate)
+    if model.gravity is not None:
+        total = added(total, cross(model.weight, field_of(model, rows)))
+    for external in (model.moment, moment):
+        if external is not None:
+            total = added(total, turned_back(rows, external))
+    return total
+
+
+def field_of(model: Model, rows: Rows) -> Triple:
+    """Gravity in {E}."""
+    return ZERO if model.gravity is None else turned_back(rows, model.gravity)
+
+
+def _quotient(torque: Scalar, u: Scalar) -> Scalar:
+    return 0.0 if type(torque) is float and torque == 0.0 else torque / sqrt(u)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ends of what a scene allows, each as a distance that must not become negative."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
+
+SINGULAR_MU = 1e-6
+"""Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
+
+
+class Limit(NamedTuple):
+    """One end: sign * (angle of a joint - end) >= 0.
+
+    Attributes:
+        reason: what is said when the run stops here.
+        error: what is raised then; None where the scene answers with an impact.
+        joint: number of the joint in (gamma_1..3, mu_1..3, beta_1..3), from 0.
+        sign: +1 for a lower end, -1 for an upper one.
+        end: angle [rad].
+
+    """
+
+    reason: str
+    error: type[RunStopped] | None
+    joint: int
+    sign: float
+    end: float
+
+    @property
+    def leg(self) -> int:
+        """Leg of the joint, 0 to 2."""
+        return self.joint % 3
+
+    def margin(self, joints: Sequence[float]) -> float:
+        """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
+        return self.sign * (joints[self.joint] - self.end)
+
+    def slope(self, joints: Sequence[float]) -> float:
+        """Rate of the distance [rad/s]."""
+        return self.sign * joints[self.joint + 9]
+
+    def may_be_crossed(self, begin: Sequence[float], end: Sequence[float]) -> bool:
+        """Cheap test before a search: it ends beyond, or it went in and came back."""
+        turned = self.slope(begin) < 0.0 < self.slope(end)
+        return self.margin(end) < 0.0 or turned or self.margin(begin) <= 0.0
+
+
+def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
+    """Joint, lower and upper end of what the limits allow; infinite where there is none."""
+    found: dict[int, tuple[float, float]] = {}
+    for limit in limits:
+        low, high = found.get(limit.joint, (-math.inf, math.inf))
+        found[limit.joint] = (limit.end, high) if limit.sign > 0.0 else (low, limit.end)
+    return [(joint, low, high) for joint, (low, high) in found.items()]
+
+
+def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
+    """Yield serial singularities, and the ends that the scene neither ignores nor makes elastic."""
+    stroke: type[RunStopped] | None = StrokeExceeded if scene.stroke.at_end == "stop" else None
+    for k in range(3):
+        name = f"serial singularity, mu_{k + 1}"
+        yield Limit(f"{name} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
+        yield Limit(f"{name} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
+        if scene.stroke.at_end in ("stop", "impact"):
+            arc, name = float(geometry.arc[k]), f"gamma_{k + 1}"
+            yield Limit(f"{name} < 0", stroke, k, 1.0, 0.0)
+            yield Limit(f"{name} > {arc:.6f} rad", stroke, k, -1.0, arc)
+        if scene.workspace.at_edge == "stop":
+            most, name = geometry.beta_max, f"beta_{k + 1}"
+            yield Limit(f"{name} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
+            yield Limit(f"{name} > {most:.6f} rad", WorkspaceLeft, k + 6, -1.0, most)

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads of a scene as torques at joints: gravity, friction, springs, elastic stroke ends.
+
+Every function is for one leg and returns Python's 0.0 for what the scene does not have, which
+leaves nothing behind in a traced program (`trace`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross, dot
+from sst_ros.scene.scene import Friction, Link, Scene
+
+
+class Spring(NamedTuple):
+    """All springs of one joint as one: torque -stiffness (angle - rest)."""
+
+    stiffness: float
+    rest: float
+
+
+class Ends(NamedTuple):
+    """Elastic ends of the stroke, 0 and arc."""
+
+    arc: float
+    stiffness: float
+    damping: float
+
+
+class LegLoads(NamedTuple):
+    """Loads of one leg; None or zero where the scene has none.
+
+    Attributes:
+        friction: of the joints gamma, mu, beta.
+        springs: at the joints gamma, mu, beta.
+        drive: mass times centre of the actuated link in {1k} [kg m].
+        link: mass times centre of the intermediate link in {2k} [kg m].
+        ends: elastic ends of the stroke.
+
+    """
+
+    friction: tuple[Friction | None, Friction | None, Friction | None]
+    springs: tuple[Spring | None, Spring | None, Spring | None]
+    drive: Triple
+    link: Triple
+    ends: Ends | None
+
+
+class LegMotion(NamedTuple):
+    """One leg at one instant, vectors in {E}: see `kernel` for the letters.
+
+    Attributes:
+        axis: w_k.
+        along: t_k = (e0, e1, 0).
+        outward: p in {B}, which points along r_k.
+        b: beta_dot = b.W.
+
+    """
+
+    axis: Triple
+    along: Triple
+    a: Scalar
+    p: Triple
+    u: Scalar
+    g: Triple
+    b: Triple
+    outward: Triple
+    gamma_dot: Scalar
+    a_dot: Scalar
+    beta_dot: Scalar
+
+
+def of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
+    """Collect the loads of leg k; None where it has none."""
+    joints, springs = scene.friction, scene.springs
+    friction = (joints.gamma, joints.mu, joints.beta) if joints else (None, None, None)
+    by_joint = tuple(
+        _joined([s for s in springs if s.joint == f"{kind}_{k + 1}"])
+        for kind in ("gamma", "mu", "beta")
+    )
+    drive = link = ZERO
+    if scene.gravity is not None:
+        drive, link = _moment(scene.actuated_links[k]), _moment(scene.intermediate_links[k])
+    ends = None
+    if scene.stroke.stiffness is not None:
+        ends = Ends(float(geometry.arc[k]), scene.stroke.stiffness, scene.stroke.damping)
+    if not (any(friction) or any(by_joint) or any(drive) or any(link) or ends):
+        return None
+    return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, ends)
+
+
+def joint_torques(
+    loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
+) -> Triple:
+    """Torques [N m] at gamma, mu and beta; `field` is gravity in {E}."""
+    rubbing = tuple(
+        0.0 if friction is None else -resistance(friction, rate(leg, kind))
+        for kind, friction in enumerate(loads.friction)
+    )
+    pulling = tuple(
+        0.0 if spring is None else -spring.stiffness * (angle(leg, kind, across, v) - spring.rest)
+        for kind, spring in enumerate(loads.springs)
+    )
+    at_gamma, at_mu = _weight(loads, leg, field)
+    if loads.ends is not None:
+        at_gamma = at_gamma + _push(loads.ends, angle(leg, 0, across, v), leg.gamma_dot)
+    return (
+        rubbing[0] + pulling[0] + at_gamma,
+        rubbing[1] + pulling[1] + at_mu,
+        rubbing[2] + pulling[2],
+    )
+
+
+def potential_energy(
+    loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
+) -> Scalar:
+    """Energy [J] in springs, elastic ends and the weight of the links."""
+    total: Scalar = 0.0
+    for kind, spring in enumerate(loads.springs):
+        if spring is not None:
+            stretch = angle(leg, kind, across, v) - spring.rest
+            total = total + 0.5 * spring.stiffness * stretch * stretch
+    if loads.ends is not None:
+        gamma = angle(leg, 0, across, v)
+        for depth in (positive(-gamma), positive(gamma - loads.ends.arc)):
+            total = total + 0.5 * loads.ends.stiffness * depth * depth
+    if any(loads.drive) or any(loads.link):
+        first, second = _directions(leg)
+        total = total - dot(_combined(loads.drive, *first), field)
+        total = total - dot(_combined(loads.link, *second), field)
+    return total
+
+
+def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> Scalar:
+    """Power [W] that friction and the damping of elastic ends take out."""
+    total: Scalar = 0.0
+    for kind, friction in enumerate(loads.friction):
+        if friction is not None:
+            total = total + resistance(friction, rate(leg, kind)) * rate(leg, kind)
+    if loads.ends is not None and loads.ends.damping:
+        gamma, speed = angle(leg, 0, across, v), leg.gamma_dot
+        elastic = loads.ends._replace(damping=0.0)
+        excess = _push(elastic, gamma, speed) - _push(loads.ends, gamma, speed)
+        total = total + excess * speed
+    return total
+
+
+def resistance(friction: Friction, v: Scalar) -> Scalar:
+    """Friction torque [N m] against the rate v [rad/s]."""
+    torque = friction.viscous * v
+    if friction.coulomb or friction.static:
+        level: Scalar = friction.coulomb
+        if friction.static:
+            slow = v / friction.stribeck
+            level = level + (friction.static - friction.coulomb) * exp(-(slow * slow))
+        torque = torque + level * tanh(v / friction.smoothing)
+    return torque
+
+
+def rate(leg: LegMotion, kind: int) -> Scalar:
+    """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
+    if kind == 0:
+        return leg.gamma_dot
+    return -leg.a_dot / sqrt(leg.u) if kind == 1 else leg.beta_dot
+
+
+def angle(leg: LegMotion, kind: int, across: Triple, v: Triple) -> Scalar:
+    """Angle of gamma (0), mu (1) or beta (2) [rad]; v and across = w x v are the arc's in {B}."""
+    if kind == 0:
+        return atan2(dot(leg.outward, across), dot(leg.outward, v))
+    if kind == 1:
+        return atan2(sqrt(leg.u), leg.a)
+    # r.(t x s) and r.s with s = (0, 0, 1), both times sqrt(u).
+    return atan2(leg.p[0] * leg.along[1] - leg.p[1] * leg.along[0], leg.p[2])
+
+
+def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
+    """Torques of the links' weight at gamma and mu: moments about w_k and -r_k."""
+    if not (any(loads.drive) or any(loads.link)):
+        return 0.0, 0.0
+    first, second = _directions(leg)
+    on_link = cross(_combined(loads.link, *second), field)
+    on_both = cross(_combined(loads.drive, *first), field)
+    total = (on_link[0] + on_both[0], on_link[1] + on_both[1], on_link[2] + on_both[2])
+    return dot(total, leg.axis), -dot(on_link, first[0])
+
+
+def _directions(
+    leg: LegMotion,
+) -> tuple[tuple[Triple, Triple, Triple], tuple[Triple, Triple, Triple]]:
+    """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
+    root = sqrt(leg.u)
+    r = (leg.p[0] / root, leg.p[1] / root, leg.p[2] / root)
+    return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
+
+
+def _push(ends: Ends, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+    """Torque of the elastic ends; the damping grows from zero with the depth (Hunt-Crossley)."""
+    low, high = positive(-gamma), positive(gamma - ends.arc)
+    if not ends.damping:
+        return ends.stiffness * (low - high)
+    inward = ends.damping * gamma_dot
+    return ends.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
+
+
+def _combined(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
+    first, second, third = (c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))
+    return (first, second, third)
+
+
+def _joined(springs: list[Any]) -> Spring | None:
+    stiffness = sum(spring.stiffness for spring in springs)
+    if not springs:
+        return None
+    return Spring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
+
+
+def _moment(link: Link) -> Triple:
+    x, y, z = link.centre
+    return (link.mass * x, link.mass * y, link.mass * z)

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Source of many scenarios at once: blocks of lanes that a compiler turns into SIMD.
+
+The operations of a lane are those of a run of its own in the same order. A lane that leaves what
+its scene allows, or finite numbers, keeps its last valid state and a code; the others go on. Lanes
+do not touch each other, so threads change no bit.
+"""
+
+from __future__ import annotations
+
+from sst_ros.dynamics.expression import Program
+from sst_ros.integration.methods import Tableau
+from sst_ros.integration.runge_kutta_source import combination
+from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
+
+LANES = 32
+NOT_FINITE = 1000
+
+
+def batch_source(program: Program, margins: Program, tableau: Tableau, size: int) -> str:
+    """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
+
+    Args:
+        program: derivative; inputs t, state, drive, of which the last may be parameters.
+        margins: numbers that are positive as long as the state is valid; inputs are the state's
+            first seven, and the parameters.
+        tableau: explicit method.
+        size: numbers in the state.
+
+    """
+    drive = len(program.inputs) - 1 - size
+    stages = len(tableau.b)
+    at = Layout(
+        LANES, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
+        far=len(margins.outputs), code=1, when=1, error=1,
+    )  # fmt: skip
+    outside = at.rows("d", drive)
+    given = ["time", *at.rows("s", size), *outside]
+    valid = [*at.rows("new", 7), *outside[drive - (len(margins.inputs) - 7) :]]
+    lines = [
+        "def batch(h, first, count, begin, end, y, d, code, when, error):",
+        f"    block = vector({at.numbers})",
+        "    for b in range(begin, end):",
+        f"        lo = b * {LANES}",
+        f"        last = min({LANES}, y.shape[1] - lo) - 1",
+        # Lanes beyond the last repeat it, for all blocks to have the same length.
+        f"        for i in range({LANES}):",
+        "            n = lo + min(i, last)",
+        *(f"            {at.lane('y', j)} = y[{j}, n]" for j in range(size)),
+        *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
+        *(f"            {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")),
+        "        for step in range(first, first + count):",
+        f"            for stage in range({stages}):",
+        *indented(16, _arguments(tableau, size, at)),
+        *indented(16, ["time = step * h + NODES[stage] * h"]),
+        *indented(16, evaluated(program, given, at, "f")),
+        *indented(16, _kept(tableau, size, at)),
+        *indented(12, _results(tableau, size, at)),
+        *indented(12, evaluated(margins, valid, at, "far")),
+        *indented(12, _judged(size, len(margins.outputs), at)),
+        "        for i in range(last + 1):",
+        *(f"            y[{j}, lo + i] = {at.lane('y', j)}" for j in range(size)),
+        f"            code[lo + i] = int({at.lane('code')})",
+        f"            when[lo + i] = {at.lane('when')}",
+        f"            error[lo + i] = {at.lane('error')}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _arguments(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    """Where a stage evaluates the derivative, all numbers of the state in one loop."""
+    lines = []
+    for stage, row in enumerate(tableau.a):
+        total = combination(row, lambda m: at.lane("k", m * size, "x"))
+        value = f"{at.lane('y', 0, 'x')} + h * ({total})" if stage else at.lane("y", 0, "x")
+        lines += [
+            f"{'elif' if stage else 'if'} stage == {stage}:",
+            f"    for x in range({size * LANES}):",
+            f"        {at.lane('s', 0, 'x')} = {value}",
+        ]
+    return lines
+
+
+def _kept(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    lines = []
+    for stage in range(len(tableau.b)):
+        lines += [
+            f"{'elif' if stage else 'if'} stage == {stage}:",
+            f"    for x in range({size * LANES}):",
+            f"        {at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}",
+        ]
+    return lines
+
+
+def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
+    """Write the new state, with a quaternion of length 1, and errors of the quaternion."""
+
+    def total(weights: tuple[float, ...]) -> str:
+        return combination(weights, lambda m: at.lane("k", m * size, "x"))
+
+    lines = [
+        f"for x in range({size * LANES}):",
+        f"    {at.lane('new', 0, 'x')} = {at.lane('y', 0, 'x')} + h * ({total(tableau.b)})",
+        f"for x in range({4 * LANES}):",
+    ]
+    if tableau.damping:
+        lines += [
+            f"    fine = {total(tableau.error)}",
+            f"    coarse = {total(tableau.damping)}",
+            "    both = fine * fine + 0.01 * (coarse * coarse) + 1e-300",
+            f"    {at.lane('e', 0, 'x')} = h * fine * abs(fine) / sqrt(both)",
+        ]
+    else:
+        lines += [f"    {at.lane('e', 0, 'x')} = h * ({total(tableau.error) or '0.0'})"]
+    parts = at.rows("new", 4)
+    squares = " + ".join(f"{part} * {part}" for part in parts)
+    scaled = [f"{part} = {part} * factor" for part in parts]
+    return [*lines, *loop(at, [f"factor = 1.0 / sqrt({squares})", *scaled])]
+
+
+def _judged(size: int, margins: int, at: Layout) -> list[str]:
+    """Take over the new state where it is valid; otherwise note why and when not."""
+    inside = ["found = 0.0"]
+    for j in reversed(range(margins)):
+        inside += [f"far = {at.lane('far', j)}", f"found = {j + 1}.0 if far < 0.0 else found"]
+    inside += [
+        f"total = {' + '.join(at.lane('new', j) for j in range(size))}",
+        f"found = found if total - total == 0.0 else {NOT_FINITE}.0",
+        f"before = {at.lane('code')}",
+        f"since = {at.lane('when')}",
+        "now = before if before != 0.0 else found",
+        f"{at.lane('code')} = now",
+        f"{at.lane('when')} = since if before == now else ends",
+        f"least = {at.lane('error')}",
+        "worst = least",
+    ]
+    for j in range(4):
+        inside += [f"here = abs({at.lane('e', j)})", "worst = here if here > worst else worst"]
+    inside += [f"{at.lane('error')} = worst if now == 0.0 else least"]
+    for j in range(size):
+        inside += [
+            f"old = {at.lane('y', j)}",
+            f"new = {at.lane('new', j)}",
+            f"{at.lane('y', j)} = new if now == 0.0 else old",
+        ]
+    return ["ends = (step + 1) * h", *loop(at, inside)]

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps of one scene by one method, on plain floats or compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from operator import is_
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from sst_ros.dynamics.traced_dynamics import LAG
+from sst_ros.integration import codegen
+from sst_ros.integration.methods import Rosenbrock, Tableau
+from sst_ros.integration.ode import System
+
+Method = Tableau | Rosenbrock
+Vector = Sequence[float]
+Slope = Callable[..., tuple[float, ...]]
+Ranges = Sequence[tuple[int, float, float]]
+Stretch = tuple[list[float], list[float], tuple[float, ...]]
+"""State, companion, and the joints' nine angles and nine rates."""
+
+
+class Machine:
+    """Steps of a system by a method.
+
+    Args:
+        system: what is integrated.
+        method: how.
+        compiled: by numba; otherwise, or where there is no numba, as plain Python.
+        slope: rhs(t, state.., drive..) to use instead of the system's, plain and explicit only.
+        ranges: joints that `glide` looks at, see `limits.ranges_of`.
+
+    """
+
+    def __init__(
+        self,
+        system: System,
+        method: Method,
+        *,
+        compiled: bool,
+        slope: Slope | None = None,
+        ranges: Ranges = (),
+    ) -> None:
+        self.system = system
+        self.method = method
+        self.compiled = compiled = compiled and codegen.numba_version() is not None
+        implicit = isinstance(method, Rosenbrock)
+        if slope is not None and (implicit or compiled):
+            raise ValueError("a slope of its own needs an explicit method and plain Python")
+        texts, constants = _source(system, method)
+        self._module: ModuleType = codegen.load(texts, constants, numba=compiled)
+        if slope is not None:
+            self._module.__dict__["rhs"] = slope
+        self._vector: Callable[[Vector], Any] = np.array if compiled else list
+        self._error = self._vector([0.0] * len(system.state))
+        self.sizes: Any = self._vector([])
+        self._at: Stretch = ([], [], ())
+        self._place: list[Any] = []
+        self._ranges = np.array(ranges, dtype=float).reshape(-1, 3) if compiled else ranges
+
+    def pair(
+        self, t: float, h: float, y: Vector, z: Vector, d: Vector
+    ) -> tuple[list[float], list[float], float]:
+        """Two steps of h / 2 for y, one of h for its companion z.
+
+        Returns:
+            New y, new z, and the local error estimate of y in units of the tolerance; infinite
+            where the step has no finite result.
+
+        """
+        new_y, new_z = self._vector(y), self._vector(z)
+        try:
+            size = self._module.pair(
+                t, h, self._vector(y), self._vector(z), self._vector(d), new_y, new_z, self._error
+            )
+        except (ArithmeticError, ValueError):
+            return list(y), list(z), float("inf")
+        return self._listed(new_y), self._listed(new_z), float(size)
+
+    def glide(
+        self, h: float, count: int, tolerance: float, at: Stretch, d: Vector
+    ) -> tuple[int, Stretch]:
+        """Go on by up to `count` periods of h, each one pair of steps; stop before what asks more.
+
+        Args:
+            h: length of a period [s].
+            count: how many, at most.
+            tolerance: largest local error estimate of a period.
+            at: where it begins.
+            d: drive.
+
+        Returns:
+            How many were done, and where the last one ended. `sizes` has the local error estimate
+            of each.
+
+        """
+        if not all(map(is_, at, self._at)):  # otherwise the numbers are there already
+            self._place = [self._vector(part) for part in at]
+        if len(self.sizes) < count or not self.compiled:
+            self.sizes = self._vector([-1.0] * count)
+        y, z, joints = self._place
+        try:
+            done = self._module.glide(
+                count, h, tolerance, y, z, self._vector(d), self._ranges, joints, self.sizes
+            )
+        except (ArithmeticError, ValueError):
+            done = sum(size >= 0.0 for size in self.sizes)
+        self._at = (self._listed(y), self._listed(z), tuple(self._listed(joints)))
+        return done, self._at
+
+    def march(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
+        """Advance by `count` steps of h, errors unseen.
+
+        Raises:
+            ArithmeticError, ValueError: in plain Python, where a step has no finite result.
+
+        """
+        new = self._vector(y)
+        self._module.march(t, h, count, self._vector(y), self._vector(d), new)
+        return self._listed(new)
+
+    def _listed(self, y: Any) -> list[float]:
+        listed: list[float] = y.tolist() if self.compiled else list(y)
+        return listed
+
+
+def has_code(system: System, method: Method) -> bool:
+    """Tell whether machine code of what a run calls is there, to be loaded in no time."""
+    return codegen.has_code(*_source(system, method), ("pair", "glide"))
+
+
+@lru_cache(maxsize=64)
+def _source(system: System, method: Method) -> tuple[list[str], dict[str, Any]]:
+    """Functions of the machine's module, and its constants."""
+    implicit, size = isinstance(method, Rosenbrock), len(system.state)
+    jacobian = system.jacobian if implicit else None
+    texts = codegen.source(system.program, jacobian, system.joints, method, size, len(system.drive))
+    lag = 3 if set(LAG) <= set(system.state) else 0
+    constants: dict[str, Any] = {"SIZE": size, "LAG": lag, "SHARE": 0.5**method.error_order}
+    if isinstance(method, Rosenbrock):
+        # numba wants rows of one length.
+        padded = [
+            tuple((*row, *(0.0,) * (5 - len(row))) for row in table)
+            for table in (method.a, method.c)
+        ]
+        constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
+        constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
+    return texts, constants

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text of the loop of Gauss collocation: Picard's iteration over lanes, see `collocation`.
+
+An iteration integrates the slopes at the nodes to rates, turns the quaternion with these rates,
+and evaluates. Rows of `block` are read lane by lane before a loop, since SIMD needs that they are
+the same for all lanes in it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import NamedTuple
+
+from sst_ros.integration.ode import System
+from sst_ros.integration.simd_source import Layout, indented, loop, split
+from sst_ros.integration.sine_source import flat_sin
+
+HEAD = 3
+"""Numbers before all: count of steps, count of iterations, length of a step."""
+
+
+class Places(NamedTuple):
+    """Where in the numbers of a course is what: counts and step, time with state and drive, end."""
+
+    numbers: int
+    counts: slice
+    begin: slice
+    end: slice
+    tables: slice
+
+
+def places(system: System, nodes: int) -> Places:
+    """Lay out what `march` reads and writes."""
+    at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
+    begin, end, table = (at.first(group) for group in ("begin", "end", "node"))
+    return Places(
+        at.numbers,
+        slice(0, HEAD),
+        slice(begin, begin + inputs),
+        slice(end, end + size),
+        slice(table, table + (2 + nodes) * nodes),
+    )
+
+
+def source(system: System, nodes: int) -> list[str]:
+    """Texts of flat_sin and of `march(block)`, which returns the change of `collocation.Flight`."""
+    return [inspect.getsource(flat_sin), _march(system, nodes)]
+
+
+def _layout(system: System, nodes: int) -> Layout:
+    size, inputs = len(system.state), len(system.program.inputs)
+
+    def rows(numbers: int) -> int:
+        return -(-numbers // nodes)
+
+    return Layout(
+        nodes, head=rows(HEAD), begin=rows(inputs), end=rows(size), node=1, weight=1, a=nodes,
+        known=max(1, len(_known(system))), s=size, f=size, old=size,
+    )  # fmt: skip
+
+
+def _known(system: System) -> list[str]:
+    """Names of what is known from time alone, and is needed where the state is known too."""
+    before, after, results = split(system.program, _time_only(system))
+    needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
+    return [name for line in before if (name := line.split(" = ")[0]) in needed]
+
+
+def _time_only(system: System) -> list[bool]:
+    return [True, *(False,) * len(system.state), *(True,) * len(system.drive)]
+
+
+def _march(system: System, nodes: int) -> str:
+    at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
+    everything, quaternion, rates = range(size), range(4), range(4, size)
+    known = _known(system)
+    _, after, results = split(system.program, _time_only(system))
+    held, moving, _ = split(system.program, [False, *(True,) * (inputs - 1)])
+    _, turn, turned = split(system.program.first(4), _time_only(system))
+
+    def read(rows: range) -> list[str]:
+        return [f"g{j}_{k} = {at.lane('f', j, k)}" for j in rows for k in range(nodes)]
+
+    def integrated(j: int) -> str:
+        """State j at a node: short sums side by side take less time than a long one."""
+        terms = [f"{at.lane('a', k)} * g{j}_{k}" for k in range(nodes)]
+        sums = [f"({' + '.join(terms[k : k + 4])})" for k in range(0, nodes, 4)]
+        return " + ".join([f"y{j}", *sums])
+
+    def kept(rows: range) -> list[str]:
+        """Loop over few rows, for what it reads to find place in registers."""
+        return [*read(rows), *loop(at, [f"{at.lane('s', j)} = {integrated(j)}" for j in rows])]
+
+    def summed(j: int, text: str) -> str:
+        """Weights times a text with lanes {f} and {old}, over the nodes."""
+        return " + ".join(
+            f"{at.lane('weight', 0, k)} * "
+            + text.format(f=at.lane("f", j, k), old=at.lane("old", j, k))
+            for k in range(nodes)
+        )
+
+    first = [
+        *(f"u{1 + j} = y{j}" for j in everything),
+        *held,
+        *loop(
+            at,
+            [
+                f"u0 = begin + {at.lane('node')}",
+                *(line.replace(" = sin(", " = flat_sin(") for line in moving),
+                *(f"{at.lane('known', r)} = {name}" for r, name in enumerate(known)),
+                *(f"{at.lane('f', j)} = {result}" for j, result in enumerate(results)),
+                *(f"{at.lane('old', j)} = 0.0" for j in rates),
+            ],
+        ),
+    ]
+    turning = [
+        *kept(rates),
+        *read(quaternion),
+        *loop(
+            at,
+            [
+                *(f"u{1 + j} = {integrated(j)}" for j in quaternion),
+                *(f"u{1 + j} = {at.lane('s', j)}" for j in rates),
+                *turn,
+                *(f"{at.lane('f', j)} = {result}" for j, result in enumerate(turned)),
+            ],
+        ),
+    ]
+    evaluating = [
+        *kept(range(2)),
+        *kept(range(2, 4)),
+        *loop(
+            at,
+            [
+                *(f"u{1 + j} = {at.lane('s', j)}" for j in everything),
+                *(f"{name} = {at.lane('known', r)}" for r, name in enumerate(known)),
+                *after,
+                *(f"{at.lane('old', j)} = {at.lane('f', j)}" for j in rates),
+                *(f"{at.lane('f', j)} = {result}" for j, result in enumerate(results)),
+            ],
+        ),
+    ]
+    lines = [
+        "def march(block):",
+        "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
+        *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
+        *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
+        "    worst = 0.0",
+        "    for step in range(count):",
+        f"        begin = {at.lane('begin', 0, 0)} + step * h",
+        *indented(8, first),
+        "        for iteration in range(1, iterations):",
+        *indented(12, [*turning, *evaluating]),
+        *indented(8, turning),
+        *(f"        worst = max(worst, abs({summed(j, '({f} - {old})')}))" for j in range(4, 7)),
+        *(f"        y{j} = y{j} + {summed(j, '{f}')}" for j in everything),
+        "        factor = 1.0 / sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)",
+        *(f"        y{j} = y{j} * factor" for j in quaternion),
+        *(f"    {at.lane('end', 0, j)} = y{j}" for j in everything),
+        f"    finite = {' + '.join(f'abs(y{j})' for j in everything)} < INFINITE",
+        "    return worst if finite else INFINITE",
+    ]
+    return "\n".join(lines) + "\n"

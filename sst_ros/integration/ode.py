@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is integrated: the derivative of a scene's state by time, traced."""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import Any
+
+from sst_ros.dynamics import energy, kernel
+from sst_ros.dynamics.expression import Program, trace, with_jacobian
+from sst_ros.dynamics.math_functions import sin
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.scene.scene import SineTorque
+
+
+class System:
+    """Derivative of a scene's state, as programs with the inputs t, state, drive.
+
+    Args:
+        dynamics: the scene.
+        torque: torques over time that replace those of the drive; the drive is then what else
+            acts from outside, or nothing.
+        work: append to the state the work [J] that actuators and moments have put in, less what
+            friction has taken out.
+
+    Attributes:
+        state: names of the state's numbers: quaternion, body rate, lagged torques, work.
+        drive: names of the drive's numbers, which are constant over a step.
+
+    """
+
+    def __init__(
+        self, dynamics: Dynamics, torque: SineTorque | None = None, *, work: bool = False
+    ) -> None:
+        self._dynamics = dynamics
+        self._torque = torque
+        self._work = work
+        self.state = (*dynamics.state, *(("work",) if work else ()))
+        self.drive = dynamics.drive if torque is None else dynamics.drive[3:]
+
+    @cached_property
+    def program(self) -> Program:
+        """The derivative."""
+        return trace(self.derivative, self._inputs)
+
+    @cached_property
+    def jacobian(self) -> Program:
+        """The derivative, and its derivatives by t and by each number of the state."""
+        return with_jacobian(self.derivative, self._inputs, ("t", *self.state))
+
+    @property
+    def joints(self) -> Program:
+        """Nine angles and nine rates, of quaternion and body rate."""
+        return self._dynamics.joints_program
+
+    @property
+    def _inputs(self) -> tuple[str, ...]:
+        return ("t", *self.state, *self.drive)
+
+    def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return the derivative at the time, the state and the drive given, of any kind."""
+        size = len(self._dynamics.state)
+        state, drive = inputs[:size], inputs[len(self.state) :]
+        torque, rest = drive[:3], drive[3:]
+        if self._torque is not None:
+            rows = zip(
+                self._torque.amplitude, self._torque.frequency, self._torque.phase, strict=True
+            )
+            torque, rest = tuple(a * sin(f * time + p) for a, f, p in rows), drive
+        moment = (rest[0], rest[1], rest[2]) if rest else None
+        model = self._dynamics.model
+        slope = kernel.derivative(model, state, torque, moment)
+        if not self._work:
+            return slope
+        return (*slope, energy.power(model, state, torque, moment))
+
+
+@lru_cache(maxsize=32)
+def working(dynamics: Dynamics) -> System:
+    """Give the system that counts work: traced once for all runs of the same dynamics."""
+    return System(dynamics, work=True)

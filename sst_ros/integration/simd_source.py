@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text of loops over lanes: many evaluations of one program at once, for a compiler's SIMD.
+
+All numbers live in one flat array, a row of lanes each, at offsets that are constants in the text,
+and loops have a fixed length and no branches: so a compiler need not ask at run time what overlaps
+what, and leaves no scalar copy of a loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
+
+from sst_ros.dynamics.expression import Operand, Program
+
+
+class Layout:
+    """Where in an array `block` the rows of some groups are.
+
+    Attributes:
+        lanes: length of a row.
+        numbers: length of the array.
+
+    """
+
+    def __init__(self, lanes: int, **rows: int) -> None:
+        ends = list(accumulate(rows.values()))
+        self._first = dict(zip(rows, [0, *ends], strict=False))
+        self.lanes = lanes
+        self.numbers = ends[-1] * lanes
+
+    def first(self, group: str) -> int:
+        """Return where a group begins."""
+        return self._first[group] * self.lanes
+
+    def lane(self, group: str, row: int = 0, lane: str | int = "i") -> str:
+        """Return a lane of a row."""
+        first = (self._first[group] + row) * self.lanes
+        return f"block[{first + lane}]" if isinstance(lane, int) else f"block[{first} + {lane}]"
+
+    def rows(self, group: str, count: int) -> list[str]:
+        """Return lane i of the first rows of a group."""
+        return [self.lane(group, row) for row in range(count)]
+
+
+def split(program: Program, early: Sequence[bool]) -> tuple[list[str], list[str], list[str]]:
+    """Lines of a program that need early inputs only, the other lines, and the results.
+
+    Args:
+        program: its inputs are called u0, u1, ...; results of its lines v0, v1, ...
+        early: for each input whether it is known earlier than others.
+
+    """
+    count = len(program.inputs)
+    named = replace(program, inputs=tuple(f"u{i}" for i in range(count)))
+    text = [line.strip() for line in named.source("body").splitlines()[1:]]
+    late = {i for i, known in enumerate(early) if not known}
+    before, after = [], []
+    for number, (line, (_, operands)) in enumerate(
+        zip(text, program.steps, strict=False), start=count
+    ):
+        if any(isinstance(x, Operand) and x.number in late for x in operands):
+            late.add(number)
+            after.append(line)
+        else:
+            before.append(line)
+    return before, after, text[-1].removeprefix("return (").removesuffix(",)").split(", ")
+
+
+def evaluated(program: Program, given: Sequence[str], at: Layout, out: str) -> list[str]:
+    """Lines of a program over all lanes, its results in the rows of `out`.
+
+    What `given` names outside of `block` is the same for all lanes, and what depends on nothing
+    else comes before the loop.
+    """
+    same = [not text.startswith("block[") for text in given]
+    before, after, results = split(program, same)
+    loads = [f"u{i} = {text}" for i, text in enumerate(given)]
+    head = [line for line, early in zip(loads, same, strict=True) if early]
+    inside = [line for line, early in zip(loads, same, strict=True) if not early]
+    stores = [f"{at.lane(out, j)} = {result}" for j, result in enumerate(results)]
+    return [*head, *before, *loop(at, [*inside, *after, *stores])]
+
+
+def loop(at: Layout, body: list[str]) -> list[str]:
+    """Put a loop over all lanes i around lines."""
+    return [f"for i in range({at.lanes}):", *indented(4, body)]
+
+
+def indented(spaces: int, lines: list[str]) -> list[str]:
+    """Move lines to the right."""
+    return [" " * spaces + line for line in lines]

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of a recorded run, to be done again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sst_ros.control.reference_motions import Samples
+from sst_ros.errors import InputError, Problem
+from sst_ros.recording.recording import read
+
+
+def samples(bag: str | Path) -> Samples:
+    """Read what the actuators did in a run, from the first sample that has an orientation.
+
+    Raises:
+        InputError: it is no recording of a run, or it has fewer than two such samples.
+
+    """
+    recording = read(Path(bag))
+    whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
+    if len(whole) < 2:
+        problem = Problem("orientation", len(whole), "two samples or more must have one")
+        raise InputError(str(bag), [problem])
+    first = whole[0]
+    x, y, z, w = recording.quaternion[first].tolist()
+    return Samples(
+        recording.seconds[first:], recording.gamma[first:], recording.gamma_dot[first:],
+        (x, y, z, w),
+    )  # fmt: skip

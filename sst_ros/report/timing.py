@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How regular a recorded run was: periods, lost samples, missed ticks, pace, commands, energy.
+
+Periods are between the receptions of consecutive samples by the recorder, so that they hold the
+jitter of simulator, transport and recorder together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sst_ros.mechanism.geometry import Array
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import NANOSECONDS
+from sst_ros.report import energy_balance
+from sst_ros.report.latency import Latency, latency
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What the clocks of a recording say, and its balance of energy.
+
+    Attributes:
+        period_us: time between receptions of samples that follow each other [us], shape (p,).
+        nominal_us: what it should be [us].
+        lost_s: times of lost samples [s], shape (l,).
+        gaps_s: times at which a tick does not begin where the one before ended [s].
+        pace_s, pace: times [s] and simulated time per time on the recorder's clock.
+        late_us: how much later each sample was received than the promptest one, by its stamp
+            [us], shape (n,): it grows where the simulator falls behind.
+        missed_s, missed: times at which the simulator told how many ticks it had dropped so far
+            [s], and how many.
+        latency: of commands.
+        energy: what each sample has of energy that nobody has put in since the start [J], shape
+            (n,); nan where it is not known. None where it cannot be known.
+        missing: what could not be told, and why.
+
+    """
+
+    period_us: Array
+    nominal_us: float
+    lost_s: Array
+    gaps_s: Array
+    pace_s: Array
+    pace: Array
+    late_us: Array
+    missed_s: Array
+    missed: Array
+    latency: Latency
+    energy: Array | None
+    missing: tuple[str, ...]
+
+
+def timing(recording: Recording) -> Timing:
+    """Measure a recording."""
+    missing: list[str] = []
+    spacing, period = np.diff(recording.time_ns), recording.period_ns
+    follow = spacing == period
+    received = np.diff(recording.received_ns)[follow] / 1e3
+    if np.any(received < 0.0):
+        missing.append("receptions are not in the order of the samples: periods are as recorded")
+    lost = [
+        recording.time_ns[row] + period * np.arange(1, round(spacing[row] / period))
+        for row in np.flatnonzero(spacing > period).tolist()
+    ]
+    ticks = recording.ticks
+    gaps = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
+    pace_s, pace = _pace(recording)
+    late = recording.received_ns - recording.time_ns
+    missed_s, missed = _missed(recording)
+    if not recording.diagnostics:
+        missing.append("no diagnostics: missed ticks and samples published are not known")
+    return Timing(
+        received, period / 1e3,
+        np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
+        gaps / NANOSECONDS, pace_s, pace, (late - late.min()) / 1e3, missed_s, missed,
+        latency(recording, missing), energy_balance.residual(recording, missing),
+        tuple(missing),
+    )  # fmt: skip
+
+
+def numbers(timing: Timing) -> dict[str, Any]:
+    """Sum it up: flat, units in the names, None for what is not known."""
+    result: dict[str, Any] = {}
+    stamped = timing.latency.stamped_us
+    for name, values in (
+        ("period", timing.period_us),
+        ("command_latency", timing.latency.received_us),
+        ("command_stamp_to_tick", stamped[np.isfinite(stamped)]),
+    ):
+        known = len(values) > 0
+        for word, function in STATISTICS.items():
+            result[f"{name}_{word}_us"] = float(function(values)) if known else None
+    energy = None if timing.energy is None else np.abs(timing.energy)
+    known = energy is not None and bool(np.isfinite(energy).any())
+    return result | {
+        "commands_followed": len(timing.latency.time_s),
+        "energy_residual_max_J": float(np.nanmax(energy)) if known and energy is not None else None,
+        "not_told": list(timing.missing),
+    }
+
+
+STATISTICS: dict[str, Callable[[Array], Any]] = {
+    "min": np.min,
+    "mean": np.mean,
+    "p99": lambda values: np.percentile(values, 99.0),
+    "p99_9": lambda values: np.percentile(values, 99.9),
+    "max": np.max,
+}
+
+
+def _pace(recording: Recording) -> tuple[Array, Array]:
+    """Return times, and simulated time per received time over pieces of the run."""
+    pieces = min(60, len(recording.time_ns) - 1)
+    rows = np.unique(np.linspace(0, len(recording.time_ns) - 1, pieces + 1).round().astype(int))
+    time, received = recording.time_ns[rows], recording.received_ns[rows]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pace = np.diff(time) / np.diff(received)
+    good = np.isfinite(pace) & (pace > 0.0)
+    return (0.5 * (time[1:] + time[:-1]) / NANOSECONDS)[good], pace[good]
+
+
+def _missed(recording: Recording) -> tuple[Array, Array]:
+    """Return times [s] and numbers of dropped ticks, from the simulator's reports."""
+    told = [(at, count) for at, values in recording.reports
+            if (count := values.get("ticks_missed", "")).isdecimal()]  # fmt: skip
+    first = recording.received_ns[0]
+    since = (recording.received_ns - first).astype(float)
+    at = np.interp([at - first for at, _ in told], since, recording.seconds)
+    return at, np.array([int(count) for _, count in told], dtype=float)

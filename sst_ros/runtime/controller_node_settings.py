@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the companion node: what a controller takes, and what a node adds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sst_ros.control.controller_settings import ControlSettings
+from sst_ros.errors import Problem
+from sst_ros.scene.schema import choice, flag, integer, number, text
+from sst_ros.simulation import NANOSECONDS
+
+
+@dataclass(frozen=True)
+class CompanionParameters(ControlSettings):
+    """Parameters of sst_inverse_dynamics."""
+
+    scene: str = text(
+        "scene that the node takes the manipulator for, by name or by path", default="reach"
+    )
+    motion: str = choice(
+        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until told "
+        "to stop",
+        ("scene", "topic"),
+        default="scene",
+    )
+    hold: float = number(
+        "time for which the end of the scene's motion is held",
+        "s",
+        default=0.0,
+        least=0.0,
+        most=1e6,
+    )
+    rate: int = integer(
+        "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
+        "Hz",
+        default=500,
+        least=1,
+        most=100000,
+    )
+    start_tolerance: float = number(
+        "how far gamma may be from where the motion begins",
+        "rad",
+        default=0.05,
+        above=0.0,
+        most=1.0,
+    )
+    simulator: str = text("name of the simulator's node", default="sst_simulator")
+    stamped: bool = flag(
+        "answer on commands_stamped, as a simulator in lockstep asks", default=False
+    )
+    wait_for_subscribers: int = integer(
+        "readers of the commands to wait for", "1", default=1, least=1, most=100
+    )
+    wait_for_recorder: bool = flag(
+        "begin when ~/reference and ~/tracking_error are read, too: so a recording is whole",
+        default=False,
+    )
+    timeout: float = number(
+        "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse a rate without a whole period."""
+        yield from super().check()
+        if NANOSECONDS % self.rate:
+            yield Problem("rate", self.rate, "must divide 1e9, so that a period is whole")
+
+    @property
+    def period_s(self) -> float:
+        """Time from one command to the next [s]."""
+        return 1.0 / self.rate

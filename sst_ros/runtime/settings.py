@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the nodes, as sections: descriptors, checks and the docs' tables come from here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sst_ros.errors import Problem
+from sst_ros.scene.scene import share_directory
+from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
+from sst_ros.simulation import INTEGRATORS, NANOSECONDS
+
+
+@dataclass(frozen=True)
+class SimulatorParameters(Section):
+    """Parameters of sst_simulator."""
+
+    CHANGEABLE: ClassVar[tuple[str, ...]] = (
+        "real_time_factor",
+        "command_timeout",
+        "lockstep_timeout",
+    )
+
+    scene: str = text("scene, by name or by path of a .yaml file", default="example2")
+    rate: int = integer(
+        "steps per second of simulated time, a divisor of 1e9",
+        "Hz",
+        default=1000,
+        least=1,
+        most=100000,
+    )
+    publish_rate: int = integer(
+        "published samples per second of simulated time, a divisor of rate",
+        "Hz",
+        default=500,
+        least=1,
+        most=100000,
+    )
+    wait_for_command: bool = flag("begin the run at the first command, not at once", default=False)
+    duration: float = number(
+        "length of the run, after which the node ends; 0 for no end",
+        "s",
+        default=0.0,
+        least=0.0,
+        most=1e9,
+    )
+    real_time_factor: float = number(
+        "simulated time per time of the clock; 0 for as fast as possible",
+        "1",
+        default=1.0,
+        least=0.0,
+        most=1000.0,
+    )
+    publish_clock: bool = flag(
+        "publish the simulated time on /clock; refused where there is a clock", default=False
+    )
+    publish_description: bool = flag(
+        "publish the scene as URDF on robot_description", default=False
+    )
+    sync: str = choice(
+        "free: run by the clock; lockstep: wait for the command that answers each sample",
+        ("free", "lockstep"),
+        default="free",
+    )
+    lockstep_timeout: float = number(
+        "longest wait for an answer, then fault; 0 for no end",
+        "s",
+        default=10.0,
+        least=0.0,
+        most=1e6,
+    )
+    command_timeout: float = number(
+        "age at which a command is no longer held (steady clock); 0 for never",
+        "s",
+        default=0.5,
+        least=0.0,
+        most=1e6,
+    )
+    integrator: str = choice("method of integration", INTEGRATORS, default="auto")
+    tolerance: float = number(
+        "largest local error of a step of the integrator",
+        "rad, relative",
+        default=1e-10,
+        above=0.0,
+        most=1.0,
+    )
+    compiled: bool = flag(
+        "run machine code where numba is installed: the first run of a scene is plain Python, to "
+        "the same bits, while a process beside makes the code for the next",
+        default=True,
+    )
+    realtime_priority: int = integer(
+        "SCHED_FIFO priority of the run's thread where that is permitted, the other threads of the "
+        "node get half of it; 0 for none",
+        "1",
+        default=20,
+        least=0,
+        most=99,
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse rates that have no whole period."""
+        if NANOSECONDS % self.rate:
+            yield Problem("rate", self.rate, "must divide 1e9, so that a step is whole nanoseconds")
+        if self.rate % self.publish_rate:
+            yield Problem("publish_rate", self.publish_rate, f"must divide rate = {self.rate}")
+
+    @property
+    def period_ns(self) -> int:
+        """Length of a step [ns]."""
+        return NANOSECONDS // self.rate
+
+    @property
+    def ticks_per_sample(self) -> int:
+        """Steps between two published samples; this is the control period."""
+        return self.rate // self.publish_rate
+
+    @property
+    def waits(self) -> bool:
+        """Whether a run begins by a command."""
+        return self.wait_for_command or self.sync == "lockstep"
+
+
+@dataclass(frozen=True)
+class PlayerParameters(Section):
+    """Parameters of sst_torque_player."""
+
+    scene: str = text("scene whose torque is played, by name or by path", default="example2")
+    csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
+    simulator: str = text("name of the simulator's node", default="sst_simulator")
+    stamped: bool = flag(
+        "answer on commands_stamped, as a simulator in lockstep asks", default=False
+    )
+    wait_for_subscribers: int = integer(
+        "readers of the commands to wait for", "1", default=1, least=1, most=100
+    )
+    timeout: float = number(
+        "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6
+    )
+
+
+def default_topics() -> tuple[str, ...]:
+    """Topics in config/topics.txt, the list that `ros2 bag record` takes as well."""
+    return tuple((share_directory() / "config" / "topics.txt").read_text().split())
+
+
+@dataclass(frozen=True)
+class RecorderParameters(Section):
+    """Parameters of sst_recorder."""
+
+    output: str = text(
+        "folder of the bag, which must not exist yet; - for a dated name", default="-"
+    )
+    topics: tuple[str, ...] = texts("topics to record", default=default_topics())
+
+
+@dataclass(frozen=True)
+class ViewerParameters(Section):
+    """Parameters of sst_viewer."""
+
+    simulator: str = text("name of the simulator's node", default="sst_simulator")
+    host: str = text(
+        "address to serve the page at; another than this opens the actuators to all who reach it",
+        default="127.0.0.1",
+    )
+    port: int = integer(
+        "port of the page; the next free one is taken", "1", default=8080, least=1024, most=65535
+    )
+    open: bool = flag("open the page in a browser, where there is a desktop", default=False)

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The companion's work: which motion it follows, since when, and how well. No ROS types."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from array import array
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.controller import Command, Controller, Measured
+from sst_ros.control.plan import check
+from sst_ros.control.reference import Desired
+from sst_ros.control.reference_motions import PlannedMotion, Samples, motion_of
+from sst_ros.control.tracking import Track, Tracking, judge
+from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.vec3 import ZERO, axpy, dot
+from sst_ros.runtime import joint_trajectory
+from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.scene.scene import Actuators, Scene
+from sst_ros.simulation import NANOSECONDS
+
+_COLUMNS = 22
+"""Numbers of a sample of a `Track`."""
+
+
+class Stage(Enum):
+    """What it does now."""
+
+    WAITING = "waiting for a trajectory"
+    READY = "ready"
+    FOLLOWING = "following"
+    HOLDING = "holding the end"
+    ENDED = "ended"
+
+
+class Pursuit:
+    """Follows the scene's motion once, or one trajectory after the other.
+
+    Attributes:
+        stage: what it does now.
+        samples, irregular: samples answered, and those that came at another time than the period
+            says.
+        limited: samples of the motion in which a torque was limited.
+        largest: largest error of the motion so far [rad].
+        refused, last_refusal: trajectories that were refused, and why the last one was.
+
+    Raises:
+        InputError, AssemblyError, SingularConfiguration: the scene's motion is refused.
+
+    """
+
+    def __init__(self, model: Scene, settings: CompanionParameters) -> None:
+        self._model, self._settings = _limited(model, settings.torque_limit), settings
+        self._geometry = Geometry.of(model)
+        self._period_ns = NANOSECONDS // settings.rate
+        self._planned: PlannedMotion | None = None
+        if settings.motion == "scene":
+            self._planned = motion_of(model, _samples)
+            check(self._planned, self._model)
+        self.samples = self.irregular = self.limited = self.refused = 0
+        self.last_refusal = ""
+        self.anew()
+
+    def anew(self) -> None:
+        """Forget the run, as after a reset of the simulator, and all trajectories."""
+        self.stage, self._last_ns, self._rows = Stage.WAITING, 0, array("d")
+        self._square = self.largest = 0.0
+        self._last: Command | None = None
+        if self._planned is not None:
+            self._prepare(self._planned)
+
+    def take(self, message: Any, seen: Measured | None) -> None:
+        """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
+
+        It goes on from the reference of the last sample; before there was one, from where the
+        manipulator is, at rest. A reference that moves is replaced in lockstep only.
+
+        Raises:
+            InputError, AssemblyError, SingularConfiguration: it is refused; nothing has changed.
+
+        """
+        try:
+            if self._settings.motion != "topic":
+                allowed = "must be topic, for trajectories to be taken"
+                raise InputError("joint_trajectory", [Problem("motion", "scene", allowed)])
+            begin = self._standing(seen) if self._last is None else self._last.desired
+            moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
+            if moving and not self._settings.stamped:
+                # The check takes longer than a control period; in lockstep the plant waits.
+                allowed = "must come when the motion has ended, outside lockstep"
+                raise InputError("joint_trajectory", [Problem("points", "", allowed)])
+            motion = joint_trajectory.motion_of(message, self._geometry, begin)
+            check(motion, self._model)
+            if self._last is None:
+                self._prepare(motion)
+                return
+        except SstError as error:
+            self.refused, self.last_refusal = self.refused + 1, str(error)
+            raise
+        self._controller.follow(motion)
+        self._begin(motion, self._last_ns if moving else None)
+        self.stage = Stage.FOLLOWING
+
+    def preview(self, measured: Measured) -> Command | None:
+        """Answer a sample before the run; None as long as there is nothing to follow."""
+        if self.stage is not Stage.READY:
+            return None
+        self._refuse_elsewhere(measured)
+        command = self._controller.command(0.0, measured)
+        self._controller.reset()
+        return command
+
+    def answer(self, stamp_ns: int, measured: Measured) -> Command | None:
+        """Answer a sample of the run; None where there is nothing to answer.
+
+        The end of the scene's motion is answered with zero torque: then the work is done.
+
+        Raises:
+            InputError: the manipulator is not where the motion begins.
+            ControlStopped: see `Controller.command`.
+
+        """
+        if stamp_ns <= self._last_ns or self.stage in (Stage.WAITING, Stage.ENDED):
+            return None
+        if self.stage is Stage.READY:
+            self._refuse_elsewhere(measured)
+            self.stage = Stage.FOLLOWING
+        else:
+            self.irregular += stamp_ns - self._last_ns != self._period_ns
+        if self._start_ns is None:
+            self._start_ns = stamp_ns
+        passed_ns = stamp_ns - self._start_ns
+        time = passed_ns / NANOSECONDS
+        command = self._controller.command(time, measured)
+        judged_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
+        if time >= self._motion.duration:
+            self.stage = Stage.HOLDING
+        if passed_ns >= judged_ns and self._planned is not None:
+            self.stage = Stage.ENDED
+            command = dataclasses.replace(command, torque=ZERO)
+        if passed_ns <= judged_ns:
+            self._note(time, measured, command)
+        self.samples += 1
+        self.limited += command.saturated
+        self._last, self._last_ns = command, stamp_ns
+        return command
+
+    def judged(self) -> Tracking | None:
+        """Tell how well the motion has been followed; None before two samples of it."""
+        if len(self._rows) < 2 * _COLUMNS:
+            return None
+        rows = np.array(self._rows).reshape(-1, _COLUMNS)
+        time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
+        return judge(Track(time[:, 0], *columns), self.limited)
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of all errors of the motion so far [rad]."""
+        count = len(self._rows) // _COLUMNS
+        return math.sqrt(self._square / (3 * count)) if count else 0.0
+
+    def _prepare(self, motion: PlannedMotion) -> None:
+        period_s = self._period_ns / NANOSECONDS
+        self._controller = Controller(self._model, motion, self._settings, period_s)
+        self._begin(motion, None)
+        self.stage = Stage.READY
+
+    def _begin(self, motion: PlannedMotion, start_ns: int | None) -> None:
+        """Follow a motion from an instant on; None for the next sample."""
+        self._motion, self._start_ns = motion, start_ns
+        self._rows = array("d")
+        self._square = self.largest = 0.0
+        self.limited = 0
+
+    def _note(self, time: float, measured: Measured, command: Command) -> None:
+        desired = command.desired
+        error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
+        self._square += dot(error, error)
+        self.largest = max(self.largest, *map(abs, error))
+        self._rows.extend(
+            (
+                time,
+                *desired.gamma,
+                *desired.gamma_dot,
+                *error,
+                *axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot),
+                *command.feedforward,
+                *command.feedback,
+                *command.torque,
+            )
+        )
+
+    def _standing(self, seen: Measured | None) -> Desired:
+        """Be at rest at what was measured."""
+        if seen is None:
+            allowed = "must come first: they say where a trajectory begins"
+            raise InputError("joint_trajectory", [Problem("joint_states", None, allowed)])
+        named = self._model.initial.orientation
+        meant = None if named is None else rotation_matrix(named)
+        assembly = kinematics.admissible(self._geometry, seen.gamma, meant)
+        x, y, z, w = quaternion_of(assembly.rotation).tolist()
+        try:
+            return Coordinates(self._geometry).of_actuators((x, y, z, w), seen.gamma, ZERO, ZERO)
+        except ArithmeticError:
+            raise SingularConfiguration("the manipulator is singular, det J2", 0.0) from None
+
+    def _refuse_elsewhere(self, measured: Measured) -> None:
+        begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
+        off = axpy(1.0, begin, -1.0, measured.gamma)
+        if not max(map(abs, off)) <= tolerance:
+            said = ", ".join(f"{angle:.6f}" for angle in begin)
+            allowed = f"must be within {tolerance:g} rad of ({said}), where the motion begins"
+            raise InputError("joint_states", [Problem("position", measured.gamma, allowed)])
+
+
+def _samples(bag: str) -> Samples:
+    """Read a recorded motion; only who has one needs what reads bags."""
+    from sst_ros.recording.recorded_motion import samples
+
+    return samples(bag)
+
+
+def _limited(model: Scene, limit: float) -> Scene:
+    """Give a model's actuators a torque limit, unless theirs is smaller."""
+    if not limit:
+        return model
+    own = model.actuators or Actuators(torque_limit=limit)
+    least = min(limit, own.torque_limit or limit)
+    return dataclasses.replace(model, actuators=dataclasses.replace(own, torque_limit=least))

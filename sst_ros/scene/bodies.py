@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bodies of a scene: base triangle, star, links, payload.
+
+Bodies rotate about the fixed centre O, so every inertia here is about O but the payload's.
+Letters and frames are the paper's: base directions v_k, angles alpha_k between the arcs of the
+moving spherical star (MSS), {E} fixed in the star, {1k} in actuated link k, {2k} in intermediate
+link k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.errors import Problem
+from sst_ros.scene.schema import Section, number, section
+
+Vector = tuple[float, float, float]
+
+RELATIVE_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Inertia(Section):
+    """A symmetric inertia tensor, about O for all but the payload.
+
+    Off-diagonal entries are those of the tensor: xy = -sum(m x y), the negative product of inertia.
+    """
+
+    xx: float = number("inertia tensor, xx", "kg m^2")
+    yy: float = number("inertia tensor, yy", "kg m^2")
+    zz: float = number("inertia tensor, zz", "kg m^2")
+    xy: float = number("inertia tensor, xy", "kg m^2", default=0.0)
+    xz: float = number("inertia tensor, xz", "kg m^2", default=0.0)
+    yz: float = number("inertia tensor, yz", "kg m^2", default=0.0)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The tensor, shape (3, 3) [kg m^2]."""
+        rows = [
+            [self.xx, self.xy, self.xz],
+            [self.xy, self.yy, self.yz],
+            [self.xz, self.yz, self.zz],
+        ]
+        return np.array(rows)
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse what no rigid body has."""
+        moments = [float(moment) for moment in np.linalg.eigvalsh(self.matrix)]
+        if moments[0] <= 0.0:
+            allowed = "principal moments of inertia must be > 0 (positive definite)"
+            yield Problem("", moments, allowed)
+        elif moments[2] > (moments[0] + moments[1]) * (1.0 + RELATIVE_ROUNDING):
+            allowed = "no principal moment may exceed the sum of the other two"
+            yield Problem("", moments, allowed)
+
+
+@dataclass(frozen=True)
+class Base(Section):
+    """The fixed spherical triangle P1 P2 P3 in {B}."""
+
+    v: tuple[Vector, Vector, Vector] = number(
+        "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
+        "1",
+        shape=(3, 3),
+        least=-1e6,
+        most=1e6,
+    )
+    radius: float = number("radius of the base sphere", "m", above=0.0)
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse triangles without area and left-handed ones."""
+        v = np.array(self.v)
+        lengths = np.linalg.norm(v, axis=1)
+        if np.any(lengths < 1e-6):
+            yield Problem("v", self.v, "no direction may be zero (shorter than 1e-6)")
+            return
+        volume = float(np.linalg.det(v / lengths[:, None]))
+        if abs(volume) < RELATIVE_ROUNDING:
+            yield Problem("v", self.v, "P1, P2, P3 must not lie on one great circle (degenerate)")
+        elif volume < 0.0:
+            allowed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
+            yield Problem("v", self.v, allowed)
+
+
+@dataclass(frozen=True)
+class Star(Section):
+    """The moving spherical star."""
+
+    alpha_deg: Vector = number(
+        "angles between the planes of arcs 1-2, 2-3, 3-1", "deg", shape=(3,), above=0.0
+    )
+    radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
+    inertia: Inertia = section("inertia of the star in {E}", Inertia)
+    mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
+    centre: Vector = number("centre of mass in {E}", "m", shape=(3,), default=(0.0, 0.0, 0.0))
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
+        total = sum(self.alpha_deg)
+        if abs(total - 360.0) > 360.0 * RELATIVE_ROUNDING:
+            yield Problem("alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}")
+        yield from _mass_problems(self.mass, self.centre, self.inertia)
+
+
+@dataclass(frozen=True)
+class Link(Section):
+    """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
+
+    inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
+    mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
+    centre: Vector = number(
+        "centre of mass in the link's own frame", "m", shape=(3,), default=(0.0, 0.0, 0.0)
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse centres and inertias that contradict the mass."""
+        yield from _mass_problems(self.mass, self.centre, self.inertia)
+
+
+@dataclass(frozen=True)
+class Payload(Section):
+    """A body carried by the star; its inertia is about its own centre of mass."""
+
+    mass: float = number("mass", "kg", above=0.0)
+    centre: Vector = number("centre of mass in {E}", "m", shape=(3,))
+    inertia: Inertia | None = section(
+        "inertia about the payload's centre of mass, axes of {E}; none for a point",
+        Inertia,
+        default=None,
+    )
+
+    @property
+    def about_o(self) -> NDArray[np.float64]:
+        """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
+        own = np.zeros((3, 3)) if self.inertia is None else self.inertia.matrix
+        return own + _of_point(self.mass, self.centre)
+
+
+def _of_point(mass: float, centre: Vector) -> NDArray[np.float64]:
+    c = np.array(centre)
+    return np.asarray(mass * (c @ c * np.eye(3) - np.outer(c, c)))
+
+
+def _mass_problems(mass: float, centre: Vector, inertia: Inertia | None) -> Iterator[Problem]:
+    if mass == 0.0 and any(centre):
+        yield Problem("centre", centre, "needs mass > 0 [kg]")
+    elif mass > 0.0:
+        about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
+        own = np.linalg.eigvalsh(about_o - _of_point(mass, centre))
+        scale = max(float(np.abs(about_o).max()), mass * float(np.dot(centre, centre)))
+        if own[0] < -1e-6 * scale or own[2] > own[0] + own[1] + 1e-6 * scale:
+            allowed = f"must fit the inertia about O, which leaves {own} about this centre"
+            yield Problem("centre", centre, allowed)

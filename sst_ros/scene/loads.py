@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene may have beside its bodies: loads, joints' behaviour, limits, start, torques.
+
+A term that a scene does not name has no operation in its dynamics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sst_ros.errors import Problem
+from sst_ros.scene.bodies import Vector
+from sst_ros.scene.schema import Section, choice, flag, number, section
+
+JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
+
+SMOOTHING = 1e-2
+STRIBECK = 0.1
+
+
+@dataclass(frozen=True)
+class Gravity(Section):
+    """A uniform field."""
+
+    acceleration: Vector = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse a field that is none."""
+        if not any(self.acceleration):
+            yield Problem("acceleration", self.acceleration, "must not be zero: leave gravity out")
+
+
+@dataclass(frozen=True)
+class Moment(Section):
+    """An external moment on the star: constant, or what the topic ~/external_moment says."""
+
+    value: Vector | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
+    topic: bool = flag("take it from the topic ~/external_moment", default=False)
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse both and neither."""
+        if self.topic == (self.value is not None):
+            yield Problem("", self.value, "give either value or topic: true")
+
+
+@dataclass(frozen=True)
+class Friction(Section):
+    """Friction torque of a joint against its rate v.
+
+    viscous v + (coulomb + (static - coulomb) exp(-(v / stribeck)^2)) tanh(v / smoothing)
+    """
+
+    viscous: float = number("viscous coefficient", "N m s/rad", default=0.0, least=0.0)
+    coulomb: float = number("Coulomb torque", "N m", default=0.0, least=0.0)
+    smoothing: float = number(
+        "rate over which the Coulomb torque changes sign", "rad/s", default=SMOOTHING, above=0.0
+    )
+    static: float = number("breakaway torque (Stribeck); 0 for none", "N m", default=0.0, least=0.0)
+    stribeck: float = number(
+        "rate at which the breakaway torque has faded", "rad/s", default=STRIBECK, above=0.0
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse friction that is none and a breakaway torque below the Coulomb torque."""
+        if not (self.viscous or self.coulomb or self.static):
+            yield Problem("viscous", self.viscous, "friction without a coefficient: leave it out")
+        if self.static and self.static < self.coulomb:
+            yield Problem("static", self.static, f"must be >= coulomb = {self.coulomb:g} N m")
+        if self.smoothing != SMOOTHING and not (self.coulomb or self.static):
+            yield Problem("smoothing", self.smoothing, "acts on coulomb or static: give one")
+        if self.stribeck != STRIBECK and not self.static:
+            yield Problem("stribeck", self.stribeck, "acts on static: give it")
+
+
+@dataclass(frozen=True)
+class JointFriction(Section):
+    """Friction by kind of joint, the same in all legs."""
+
+    gamma: Friction | None = section("actuated revolute joints", Friction, default=None)
+    mu: Friction | None = section("passive revolute joints", Friction, default=None)
+    beta: Friction | None = section("passive curved prismatic joints", Friction, default=None)
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse friction in no joint."""
+        if self.gamma is self.mu is self.beta is None:
+            yield Problem("", None, "names no joint: give gamma, mu or beta, or leave it out")
+
+
+@dataclass(frozen=True)
+class Spring(Section):
+    """A torsional spring at one joint: torque -stiffness (angle - rest)."""
+
+    joint: str = choice("joint", JOINTS)
+    stiffness: float = number("stiffness", "N m/rad", above=0.0)
+    rest: float = number("angle without torque", "rad")
+
+
+@dataclass(frozen=True)
+class Actuators(Section):
+    """What stands between a command and the torque of a joint; the same in all legs.
+
+    Commands and limits are torques at the joint, behind the gear. A command is limited first, then
+    it lags.
+    """
+
+    rotor_inertia: float = number("inertia of the motor's rotor", "kg m^2", default=0.0, least=0.0)
+    gear_ratio: float = number("motor turns per joint turn", "1", default=1.0, above=0.0)
+    torque_limit: float | None = number("largest torque", "N m", default=None, above=0.0)
+    time_constant: float | None = number(
+        "time constant of a first-order lag of the torque", "s", default=None, above=0.0
+    )
+    idle_damping: float = number(
+        "torque -idle_damping gamma_dot in place of a command that is too old; 0 for no torque",
+        "N m s/rad",
+        default=0.0,
+        least=0.0,
+    )
+    velocity_limit: float | None = number(
+        "largest rate of a desired motion; a simulation does not hold it",
+        "rad/s",
+        default=None,
+        above=0.0,
+    )
+    acceleration_limit: float | None = number(
+        "largest acceleration of a desired motion; a simulation does not hold it",
+        "rad/s^2",
+        default=None,
+        above=0.0,
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse actuators that change nothing, and a gear without a rotor behind it."""
+        limits = (self.torque_limit, self.velocity_limit, self.acceleration_limit)
+        if self.gear_ratio != 1.0 and not self.rotor_inertia:
+            allowed = "acts on rotor_inertia only (torques are those at the joint): give it"
+            yield Problem("gear_ratio", self.gear_ratio, allowed)
+        elif not self.rotor_inertia and not any((*limits, self.time_constant, self.idle_damping)):
+            yield Problem("", None, "changes nothing: leave it out")
+
+
+@dataclass(frozen=True)
+class Markers(Section):
+    """What the simulator shows in RViz on ~/markers; needs no description and no transforms."""
+
+    rate: float = number("messages per second", "Hz", default=20.0, above=0.0, most=100.0)
+    trace: float = number(
+        "length of the path of E that is shown", "s", default=5.0, least=0.0, most=600.0
+    )
+    torque_scale: float = number("length of the torque arrows", "m/(N m)", default=0.04, above=0.0)
+
+
+@dataclass(frozen=True)
+class Stroke(Section):
+    """The range of the actuators, 0 < gamma_k < arc P_k P_k+1."""
+
+    at_end: str = choice(
+        "what happens at an end of the stroke",
+        ("stop", "ignore", "elastic", "impact"),
+        default="stop",
+    )
+    stiffness: float | None = number(
+        "stiffness of elastic ends", "N m/rad", default=None, above=0.0
+    )
+    damping: float = number(
+        "damping of elastic ends: torque = stiffness depth (1 + damping rate inwards)",
+        "s/rad",
+        default=0.0,
+        least=0.0,
+    )
+    restitution: float | None = number(
+        "rate after an impact / rate before", "1", default=None, least=0.0, most=1.0
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse coefficients of another kind of end, and a kind without its own."""
+        for name, kind in (("stiffness", "elastic"), ("restitution", "impact")):
+            value = getattr(self, name)
+            if (value is not None) != (self.at_end == kind):
+                yield Problem(name, value, f"is given with at_end: {kind}, and only there")
+        if self.damping and self.at_end != "elastic":
+            yield Problem("damping", self.damping, "is given with at_end: elastic, and only there")
+
+
+@dataclass(frozen=True)
+class Workspace(Section):
+    """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
+
+    beta_max_deg: float = number(
+        "largest angle between E and the intermediate link",
+        "deg",
+        default=90.0,
+        above=0.0,
+        most=180.0,
+    )
+    at_edge: str = choice(
+        "what happens at the edge of the workspace", ("stop", "ignore"), default="stop"
+    )
+
+
+@dataclass(frozen=True)
+class Initial(Section):
+    """The state at t = 0."""
+
+    gamma: Vector = number("actuator angles at t = 0", "rad", shape=(3,))
+    gamma_dot: Vector = number(
+        "actuator rates at t = 0", "rad/s", shape=(3,), default=(0.0, 0.0, 0.0)
+    )
+    orientation: tuple[float, float, float, float] | None = number(
+        "quaternion (x, y, z, w) of {E} in {B} that says which assembly is meant where gamma has "
+        "several admissible ones; within 0.1 rad",
+        "1",
+        shape=(4,),
+        default=None,
+    )
+
+
+@dataclass(frozen=True)
+class SineTorque(Section):
+    """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
+
+    amplitude: Vector = number("amplitudes", "N m", shape=(3,))
+    frequency: Vector = number("angular frequencies", "rad/s", shape=(3,), least=0.0)
+    phase: Vector = number("phases", "rad", shape=(3,), default=(0.0, 0.0, 0.0))

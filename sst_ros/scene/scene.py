@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is simulated, as one document: bodies, terms, the start, and where each value is from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star, Vector
+from sst_ros.scene.loads import (
+    Actuators,
+    Friction,
+    Gravity,
+    Initial,
+    JointFriction,
+    Markers,
+    Moment,
+    SineTorque,
+    Spring,
+    Stroke,
+    Workspace,
+)
+from sst_ros.scene.motions import DesiredMotion
+from sst_ros.scene.schema import Section, notes, number, section, sections, specs, text
+from sst_ros.scene.yaml_document import read
+
+Matrix = NDArray[np.float64]
+
+LARGEST = 1e9
+"""No number of a scene is larger; anything beyond is a slip of units."""
+
+__all__ = [
+    "Actuators",
+    "Base",
+    "DesiredMotion",
+    "Friction",
+    "Gravity",
+    "Inertia",
+    "Initial",
+    "JointFriction",
+    "Link",
+    "Markers",
+    "Moment",
+    "Payload",
+    "Scene",
+    "SineTorque",
+    "Spring",
+    "Star",
+    "Stroke",
+    "Vector",
+    "Workspace",
+    "load",
+    "names",
+    "share_directory",
+    "text_of",
+]
+
+
+@dataclass(frozen=True)
+class Scene(Section):
+    """All that is simulated."""
+
+    name: str = text("short name")
+    description: str = text("what the scene shows")
+    base: Base = section("the fixed spherical triangle", Base)
+    star: Star = section("the moving spherical star", Star)
+    actuated_links: tuple[Link, Link, Link] = sections(
+        "actuated links in {1k}; one entry stands for all three", Link, (1, 3)
+    )
+    intermediate_links: tuple[Link, Link, Link] = sections(
+        "intermediate links in {2k}; one entry stands for all three", Link, (1, 3)
+    )
+    payload: Payload | None = section("body carried by the star", Payload, default=None)
+    gravity: Gravity | None = section("gravity", Gravity, default=None)
+    moment: Moment | None = section("external moment on the star", Moment, default=None)
+    friction: JointFriction | None = section("friction in the joints", JointFriction, default=None)
+    springs: tuple[Spring, ...] = sections("springs at joints", Spring, (), default=())
+    actuators: Actuators | None = section("the actuators", Actuators, default=None)
+    stroke: Stroke = section("range of the actuators", Stroke, default=Stroke())
+    workspace: Workspace = section("where E may be", Workspace, default=Workspace())
+    initial: Initial = section("state at t = 0", Initial)
+    torque: SineTorque | None = section(
+        "torques that torque_player plays", SineTorque, default=None
+    )
+    motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
+    markers: Markers | None = section("what is shown in RViz", Markers, default=None)
+    duration: float | None = number("length of a run", "s", default=None, above=0.0)
+    provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
+
+    @property
+    def star_inertia(self) -> Matrix:
+        """Inertia of the star and its payload about O in {E}, shape (3, 3) [kg m^2]."""
+        own = self.star.inertia.matrix
+        return own if self.payload is None else own + self.payload.about_o
+
+    @property
+    def actuated_inertias(self) -> Matrix:
+        """Inertias of actuated links and rotors in {1k}, shape (3, 3, 3) [kg m^2]."""
+        inertias = np.stack([_matrix(link) for link in self.actuated_links])
+        if self.actuators is not None:
+            inertias[:, 2, 2] += self.actuators.gear_ratio**2 * self.actuators.rotor_inertia
+        return inertias
+
+    @property
+    def intermediate_inertias(self) -> Matrix:
+        """Inertias of the intermediate links in {2k}, shape (3, 3, 3) [kg m^2]."""
+        return np.stack([_matrix(link) for link in self.intermediate_links])
+
+    def checks(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
+        """Refuse what contradicts itself across sections."""
+        return (self._sizes, self._centres, self._weights, self._notes)
+
+    def _sizes(self) -> Iterator[Problem]:
+        for key, value in _numbers(self, ""):
+            if abs(value) > LARGEST:
+                allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
+                yield Problem(key, value, allowed)
+
+    def _centres(self) -> Iterator[Problem]:
+        reach = max(self.base.radius, self.star.radius)
+        for key, body in self._bodies():
+            if np.linalg.norm(body.centre) > reach:
+                yield Problem(f"{key}.centre", body.centre, f"must lie within {reach:g} m of O")
+
+    def _weights(self) -> Iterator[Problem]:
+        heavy = self.payload or any(body.mass for _, body in self._bodies())
+        if self.gravity and not heavy:
+            allowed = "acts on nothing: no body has a mass"
+            yield Problem("gravity", self.gravity.acceleration, allowed)
+
+    def _notes(self) -> Iterator[Problem]:
+        for key, said in self.provenance:
+            if not _has(type(self), key.split(".")):
+                yield Problem(f"provenance.{key}", said, "is about a key that no scene has")
+
+    def _bodies(self) -> Iterator[tuple[str, Star | Link]]:
+        yield "star", self.star
+        for key in ("actuated_links", "intermediate_links"):
+            for k, link in enumerate(getattr(self, key)):
+                yield f"{key}[{k}]", link
+
+
+def _matrix(link: Link) -> Matrix:
+    return np.zeros((3, 3)) if link.inertia is None else link.inertia.matrix
+
+
+def load(name_or_path: str | Path) -> Scene:
+    """Read a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
+
+    Raises:
+        InputError: there is no such scene, or its document is refused.
+
+    """
+    source, origin = text_of(name_or_path)
+    return read(Scene, source, origin)
+
+
+def text_of(name_or_path: str | Path) -> tuple[str, str]:
+    """Return the YAML text of a scene, found as by `load`, and the path that it is from.
+
+    Raises:
+        InputError: there is no such file, or it is no text.
+
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
+    try:
+        return path.read_text(encoding="utf-8"), str(path)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        allowed = f"must be a readable .yaml file or one of {', '.join(names())} ({error})"
+        raise InputError("scene", [Problem("scene", str(name_or_path), allowed)]) from None
+
+
+def names() -> list[str]:
+    """Names of the scenes that come with sst_ros."""
+    return sorted(path.stem for path in (share_directory() / "config" / "scenes").glob("*.yaml"))
+
+
+def share_directory() -> Path:
+    """Folder that holds config/ and launch/: the source tree, or share/sst_ros of a prefix.
+
+    Raises:
+        InputError: sst_ros was installed without its data files.
+
+    """
+    for parent in Path(__file__).resolve().parents:
+        for candidate in (parent, parent / "share" / "sst_ros"):
+            if (candidate / "config" / "scenes").is_dir():
+                return candidate
+    raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
+
+
+def _numbers(value: object, key: str) -> Iterator[tuple[str, float]]:
+    """Yield every number of a section with its key."""
+    if isinstance(value, Section):
+        for name in specs(type(value)):
+            yield from _numbers(getattr(value, name), f"{key}.{name}" if key else name)
+    elif isinstance(value, tuple):
+        for index, entry in enumerate(value):
+            inner = f"{key}[{index}]" if isinstance(entry, Section) else key
+            yield from _numbers(entry, inner)
+    elif isinstance(value, float):
+        yield key, value
+
+
+def _has(cls: type[Section], path: list[str]) -> bool:
+    spec = specs(cls).get(path[0])
+    if spec is None or len(path) == 1:
+        return spec is not None
+    return spec.section is not None and _has(spec.section, path[1:])

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""YAML text to a checked document and back; every fault is told, with its line."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import yaml
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.scene import partial
+from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
+
+S = TypeVar("S", bound=Section)
+
+DEEPEST = 20
+"""Levels of nesting in a document; PyYAML's time grows with their square."""
+
+
+def read(cls: type[S], source: str, origin: str) -> S:
+    """Build `cls` from YAML text.
+
+    Raises:
+        InputError: the text is no YAML or breaks the schema; lists every fault with its line.
+
+    """
+    problems: list[Problem] = []
+    try:
+        depth = 0
+        for event in yaml.parse(source, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent):
+                allowed = "aliases are not allowed; write the value out"
+                problem = Problem("", f"*{event.anchor}", allowed, _line(event))
+                raise InputError(origin, [problem])
+            if depth > DEEPEST:
+                allowed = f"no more than {DEEPEST} levels are allowed"
+                raise InputError(origin, [Problem("", "nested", allowed, _line(event))])
+        node = yaml.compose(source, Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = None if mark is None else mark.line + 1
+        said = getattr(error, "problem", None) or str(error)
+        raise InputError(origin, [Problem("", said, "must be YAML", line)]) from None
+    result = _build(cls, node, "", problems)
+    if problems or result is None:
+        raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
+    return result
+
+
+def dump(document: Section) -> str:
+    """Write a document as YAML that `read` turns into an equal one."""
+    return str(yaml.safe_dump(_tree(document), sort_keys=False, allow_unicode=True))
+
+
+def line_of(source: str, key: str) -> int | None:
+    """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
+    node = yaml.compose(source, Loader=yaml.SafeLoader)
+    return None if node is None else _line_at(node, key)
+
+
+def _tree(value: Any) -> Any:
+    if isinstance(value, Section):
+        pairs = ((name, spec, getattr(value, name)) for name, spec in specs(type(value)).items())
+        return {
+            name: dict(entry) if spec.kind == "notes" else _tree(entry)
+            for name, spec, entry in pairs
+            if entry is not None and entry != ()
+        }
+    return [_tree(entry) for entry in value] if isinstance(value, tuple) else value
+
+
+def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Problem]) -> S | None:
+    if not isinstance(node, yaml.MappingNode):
+        problems.append(Problem(path, _plain(node), "must be a mapping", _line(node)))
+        return None
+    known = specs(cls)
+    values: dict[str, Any] = {}
+    lines: dict[str, int | None] = {}
+    before = len(problems)
+    for key_node, value_node in node.value:
+        name = str(_plain(key_node))
+        key = f"{path}.{name}" if path else name
+        if name not in known:
+            allowed = "unknown key; allowed are " + ", ".join(known)
+            problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
+        elif name in lines:
+            allowed = f"is given twice, first on line {lines[name]}"
+            problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
+        else:
+            lines[name] = _line(key_node)
+            values[name] = _convert(known[name], value_node, key, problems)
+    for field in dataclasses.fields(cls):
+        if field.default is dataclasses.MISSING and field.name not in lines:
+            key = f"{path}.{field.name}" if path else field.name
+            allowed = "is missing; " + known[field.name].allowed()
+            problems.append(Problem(key, None, allowed, _line(node)))
+    found: Iterable[Problem]
+    if len(problems) > before:
+        found = partial.problems(cls, values)
+    else:
+        try:
+            return cls(**values)
+        except InputError as error:
+            found = error.problems
+    for problem in found:
+        key = ".".join(filter(None, [path, problem.key]))
+        line = _line_at(node, problem.key)
+        problems.append(dataclasses.replace(problem, key=key, line=line))
+    return None
+
+
+def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> Any:
+    if spec.kind == "section" and spec.section:
+        return _build(spec.section, node, key, problems)
+    if spec.kind == "sections" and spec.section and isinstance(node, yaml.SequenceNode):
+        entries = enumerate(node.value)
+        return tuple(
+            _build(spec.section, entry, f"{key}[{index}]", problems) for index, entry in entries
+        )
+    if spec.kind == "notes" and isinstance(node, yaml.MappingNode):
+        return _notes(node, key, problems)
+    value = _plain(node)
+    try:
+        return accept(spec, _typed(spec, node, value))
+    except ValueError:
+        problems.append(Problem(key, value, spec.allowed(), _line(node)))
+        return None
+
+
+def _notes(node: yaml.MappingNode, path: str, problems: list[Problem]) -> dict[str, str]:
+    result: dict[str, str] = {}
+    for key_node, value_node in node.value:
+        name, said = str(_plain(key_node)), _plain(value_node)
+        if name in result:
+            problems.append(Problem(f"{path}.{name}", said, "is given twice", _line(key_node)))
+        try:
+            result[name] = frozen_text(said)
+        except ValueError:
+            problems.append(Problem(f"{path}.{name}", said, "must be text", _line(key_node)))
+    return result
+
+
+def _plain(node: yaml.Node | None) -> Any:
+    """Give the node's value; numbers stay text, so that 1e-3 means what it says."""
+    if isinstance(node, yaml.ScalarNode):
+        return None if node.tag.endswith(":null") else node.value
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(entry) for entry in node.value]
+    if isinstance(node, yaml.MappingNode):
+        return {str(_plain(key)): _plain(value) for key, value in node.value}
+    return None
+
+
+def _typed(spec: Spec, node: yaml.Node, value: Any) -> Any:
+    """Turn the text of a plain YAML flag or whole number into what it says."""
+    if spec.kind == "flag" and node.tag.endswith(":bool"):
+        return {"true": True, "false": False}.get(value.lower(), value)
+    if spec.kind == "integer" and node.tag.endswith(":int"):
+        return int(value)
+    return value
+
+
+def _line(node: yaml.Node | yaml.Event | None) -> int | None:
+    return None if node is None or node.start_mark is None else int(node.start_mark.line) + 1
+
+
+def _line_at(node: yaml.Node, path: str) -> int | None:
+    """Line of the deepest part of a path, as in "links[0].centre", that the document has."""
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    for key_node, value_node in pairs:
+        name = str(_plain(key_node))
+        if path == name:
+            return _line(key_node)
+        if path.startswith(f"{name}."):
+            return _line_at(value_node, path[len(name) + 1 :])
+        if path.startswith(f"{name}[") and isinstance(value_node, yaml.SequenceNode):
+            index, _, rest = path[len(name) + 1 :].partition("]")
+            entries = value_node.value
+            return _line_at(entries[min(int(index), len(entries) - 1)], rest.removeprefix("."))
+    return _line(node)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One controller on one plant, in lockstep in this process, and how well it followed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.control.controller import Controller, ControlStopped, Measured
+from sst_ros.control.controller_settings import ControlSettings
+from sst_ros.control.reference import Motion
+from sst_ros.control.tracking import Track
+from sst_ros.errors import RunStopped
+from sst_ros.integration.codegen import numba_version
+from sst_ros.scene.scene import Initial, Scene
+from sst_ros.simulation import NANOSECONDS, Simulation
+from sst_ros.studies.channel import Channel, Wire
+
+WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller and a plant.
+
+    Attributes:
+        plant: what moves.
+        model: what the controller takes it for.
+        motion: what is wanted.
+        settings: mode and gains.
+        period_ns: time between samples, over which a torque is held [ns].
+        channel: what stands between them.
+        seed: of the noise.
+        rest_s: time for which the loop goes on after the motion [s].
+        offset: by how much the plant's gamma is off at the start [rad].
+        lost: error of gamma beyond which the run is given up [rad].
+
+    """
+
+    plant: Scene
+    model: Scene
+    motion: Motion
+    settings: ControlSettings
+    period_ns: int
+    channel: Channel = field(default_factory=Channel)
+    seed: int = 0
+    rest_s: float = 0.0
+    offset: float = 0.0
+    lost: float = math.inf
+
+
+def follow(loop: Loop) -> tuple[Track, NDArray[np.bool_], str]:
+    """Run a loop to its end.
+
+    Returns:
+        The track, with the errors of the true state, not of the measured one; by sample, whether
+        the controller limited a torque; why the loop ended early, empty where it did not.
+
+    """
+    period = loop.period_ns / NANOSECONDS
+    simulation = Simulation(
+        started(loop.plant, loop.motion, loop.offset), compiled=numba_version() is not None
+    )
+    controller = Controller(loop.model, loop.motion, loop.settings, period)
+    wire = Wire(loop.channel, period, loop.seed)
+    rows, limited, failure = [], [], ""
+    torque = (0.0, 0.0, 0.0)
+    for k in range(round((loop.motion.duration + loop.rest_s) / period) + 1):
+        time = k * loop.period_ns / NANOSECONDS
+        try:
+            if k > 0:
+                simulation.step(torque, loop.period_ns)
+            joints = simulation.state.joints
+            measured = Measured(*wire.measured(joints.gamma, joints.gamma_dot))
+            command = controller.command(time, measured)
+            torque = wire.acting(command.torque)
+            wanted = command.desired
+            rows.append(
+                (time, *wanted.gamma, *wanted.gamma_dot, *joints.gamma, *joints.gamma_dot,
+                 *command.feedforward, *command.feedback, *torque)
+            )  # fmt: skip
+            limited.append(command.saturated)
+            if math.dist(wanted.gamma, joints.gamma) > loop.lost:
+                raise ControlStopped(f"off by more than {loop.lost:g} rad", time)
+        except (RunStopped, ControlStopped) as error:
+            failure = str(error)
+            break
+    columns = np.split(np.array(rows).reshape(len(rows), -1), np.cumsum(WIDTHS)[:-1], axis=1)
+    time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = columns
+    track = Track(
+        time_s[:, 0], gamma, gamma_dot, gamma - at, gamma_dot - rate, feedforward, feedback, torques
+    )
+    return track, np.array(limited, dtype=bool), failure
+
+
+def started(plant: Scene, motion: Motion, offset: float = 0.0) -> Scene:
+    """Return the plant at the start of a motion, its gamma off by `offset` [rad]."""
+    start = motion.at(0.0)
+    a, b, c = (angle + offset for angle in start.gamma)
+    initial = Initial(gamma=(a, b, c), gamma_dot=start.gamma_dot, orientation=start.quaternion)
+    return dataclasses.replace(plant, initial=initial)

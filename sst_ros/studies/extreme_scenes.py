@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes and references of the catalogue of extreme cases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from sst_ros.errors import RunStopped
+from sst_ros.scene.bodies import Inertia, Link
+from sst_ros.scene.loads import Initial, Stroke, Workspace
+from sst_ros.scene.scene import Scene, load
+from sst_ros.simulation import Simulation
+
+Triple = tuple[float, float, float]
+
+REST: Triple = (0.0, 0.0, 0.0)
+FREE: dict[str, Any] = {
+    "stroke": Stroke(at_end="ignore"),
+    "workspace": Workspace(at_edge="ignore"),
+}
+PUSH: Triple = (0.4, 0.5, 0.3)
+
+
+def base() -> Scene:
+    """Return example 2."""
+    return load("example2")
+
+
+def spun(rate: float) -> Scene:
+    """Set it going from a general posture, without ends."""
+    initial = Initial(gamma=(0.7, 0.8, 0.75), gamma_dot=(rate, -0.5 * rate, 0.25 * rate))
+    return replace(base(), initial=initial, **FREE)
+
+
+def reference() -> Simulation:
+    """Run it by DOP853 at the tightest tolerance."""
+    return _ended(spun(2.0), PUSH, 20, 10_000_000)
+
+
+def turned() -> Simulation:
+    """Run it without torque."""
+    return _ended(spun(10.0), REST, 10, 4_000_000)
+
+
+def bounced() -> Simulation:
+    """Run the rigid bounce."""
+    scene = bouncing(Stroke(at_end="impact", restitution=1.0))
+    return _ended(scene, REST, 30, 10_000_000)
+
+
+def bouncing(stroke: Stroke) -> Scene:
+    """Send gamma_1 against the end of its stroke."""
+    initial = Initial(gamma=(0.1, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0))
+    return replace(base(), initial=initial, stroke=stroke, workspace=Workspace(at_edge="ignore"))
+
+
+def _ended(scene: Scene, torque: Triple, steps: int, period_ns: int) -> Simulation:
+    simulation = Simulation(scene, "dop853", tolerance=1e-14)
+    for _ in range(steps):
+        simulation.step(torque, period_ns)
+    return simulation
+
+
+def stop_time(scene: Scene, torque: Triple) -> float:
+    """Time at which a run ends [s]."""
+    try:
+        _ended(scene, torque, 10_000, 10_000_000)
+    except RunStopped as error:
+        return error.time
+    raise ValueError("the run does not end")
+
+
+def apart(one: Simulation, other: Simulation) -> float:
+    """Angle between two orientations [rad]."""
+    p, q = one.state.quaternion, other.state.quaternion
+    return 2.0 * min(math.dist(p, q), math.dist(p, [-x for x in q]))
+
+
+def energy_drift(simulation: Simulation) -> float:
+    """Energy residual relative to the energy."""
+    state, dynamics = simulation.state, simulation.dynamics
+    drive = (0.0,) * len(dynamics.drive)
+    kinetic, potential, _ = dynamics.energies(*state.quaternion, *state.body_rate, *drive)
+    return abs(simulation.energy_residual) / (kinetic + potential)
+
+
+def times(inertia: Inertia, scale: float) -> Inertia:
+    """Scale an inertia."""
+    names = ("xx", "yy", "zz", "xy", "xz", "yz")
+    return Inertia(**{name: scale * getattr(inertia, name) for name in names})
+
+
+def heavier(scale: float) -> Scene:
+    """Scale all inertias."""
+    scene = spun(2.0)
+
+    def links(old: tuple[Link, Link, Link]) -> tuple[Link, Link, Link]:
+        first, second, third = (
+            Link(inertia=times(link.inertia or Inertia(xx=0.0, yy=0.0, zz=0.0), scale))
+            for link in old
+        )
+        return (first, second, third)
+
+    return replace(
+        scene,
+        star=replace(scene.star, inertia=times(scene.star.inertia, scale)),
+        actuated_links=links(scene.actuated_links),
+        intermediate_links=links(scene.intermediate_links),
+    )
+
+
+def odd_star(scale: float) -> Scene:
+    """Scale the star's inertia beside that of the links."""
+    scene = spun(2.0)
+    return replace(scene, star=replace(scene.star, inertia=times(scene.star.inertia, scale)))
+
+
+def free() -> Scene:
+    """Return example 2 without ends."""
+    return replace(base(), **FREE)
+
+
+def from_rigid_bounce(simulation: Simulation) -> float:
+    """Energy lost, or a thousandth of the angle from the rigid bounce."""
+    return max(apart(simulation, bounced()) / 1e3, energy_drift(simulation))
