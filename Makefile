@@ -11,10 +11,10 @@ PARALLEL = --numprocesses auto --dist loadfile
 .PHONY: demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
 
 demo: $(VENV)/.demo
-	$(RUN) -m sst_ros demo
+	$(RUN) -m sst_ros demo --force
 
 demo-feedforward: $(VENV)/.demo
-	$(RUN) -m sst_ros demo feedforward
+	$(RUN) -m sst_ros demo feedforward --force
 
 docs: $(VENV)/.docs
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs site

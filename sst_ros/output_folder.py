@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder that results are written into."""
+"""Where results are written: named after the recording, and never over earlier results unasked."""
 
 from __future__ import annotations
 
@@ -9,13 +9,46 @@ from pathlib import Path
 
 from sst_ros.errors import InputError, Problem
 
+_BAG_SUFFIXES = (".mcap", ".db3")
+
+
+def results_folder(bag: Path, kind: str) -> Path:
+    """Return the default folder of the results of a recording, beside it: `BAG_kind`."""
+    path = bag.resolve() if bag.name in ("", "..") else bag
+    name = path.stem if path.suffix in _BAG_SUFFIXES else path.name
+    return path.with_name(f"{name}_{kind}")
+
+
+def require_free(out: Path, origin: str, *, force: bool = False) -> Path:
+    """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
+
+    Args:
+        out: path of a file, or of a folder.
+        origin: command that writes, for the message.
+        force: allow files of the same names to be replaced.
+
+    Raises:
+        InputError: `out` is a file, or a folder that is not empty, and `force` is not set; or it
+            cannot be read.
+
+    """
+    try:
+        taken = any(out.iterdir()) if out.is_dir() else out.exists()
+    except OSError as error:
+        allowed = f"must be a path that can be written ({error})"
+        raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
+    if taken and not force:
+        allowed = "exists already: choose another --out, or overwrite it with --force"
+        raise InputError(origin, [Problem("--out", str(out), allowed)])
+    return out
+
 
 @contextmanager
 def writing(out: Path, origin: str) -> Iterator[None]:
     """Make the folder `out` for a block that writes into it.
 
     Raises:
-        InputError: it cannot be written; `origin` says whose input it is.
+        InputError: it cannot be written; `origin` names the command.
 
     """
     try:
@@ -23,4 +56,4 @@ def writing(out: Path, origin: str) -> Iterator[None]:
         yield
     except OSError as error:
         allowed = f"must be a folder that can be written ({error})"
-        raise InputError(origin, [Problem("out", str(out), allowed)]) from None
+        raise InputError(origin, [Problem("--out", str(out), allowed)]) from None

@@ -6,8 +6,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands
+from sst_ros.cli import Commands, add_out
 from sst_ros.control.controller_settings import MODES
+from sst_ros.errors import InputError, Problem
+from sst_ros.output_folder import require_free
 
 
 def add(commands: Commands) -> None:
@@ -20,17 +22,22 @@ def add(commands: Commands) -> None:
         default="examples",
         help="the paper's examples, or the companion that follows a scene's motion",
     )
-    demo.add_argument("--out", type=Path, help="folder of the results; default: demo_out")
+    add_out(demo, "folder of the results", "demo_out, or demo_out/feedforward")
     demo.add_argument("--scene", help="with feedforward: name, or path of a .yaml file")
     demo.add_argument("--mode", nargs="+", choices=MODES, help="with feedforward: controllers")
     demo.set_defaults(run=_demo)
 
 
 def _demo(options: argparse.Namespace) -> int:
+    if options.kind == "examples":
+        given = {"--scene": options.scene, "--mode": options.mode}
+        allowed = "is an option of `demo feedforward`; `demo` runs example1 and example2"
+        if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
+            raise InputError("demo", wrong)
+    default = "demo_out" if options.kind == "examples" else "demo_out/feedforward"
+    out = require_free(options.out or Path(default), "demo", force=options.force)
     from sst_ros import demo
 
-    out = options.out or Path("demo_out")
     if options.kind == "examples":
         return demo.demo(out)
-    where = options.out or out / "feedforward"
-    return demo.feedforward(where, options.scene or demo.FOLLOWED, options.mode or demo.MODES)
+    return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)

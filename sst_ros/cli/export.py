@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands
+from sst_ros.cli import Commands, add_out
+from sst_ros.output_folder import require_free, results_folder
 
 
 def add(commands: Commands) -> None:
@@ -16,13 +17,14 @@ def add(commands: Commands) -> None:
     export.add_argument(
         "--format", choices=("csv", "parquet"), default="csv", help="default: csv", dest="form"
     )
-    export.add_argument("--out", type=Path, help="folder of the tables; default: beside the bag")
+    add_out(export, "folder of the tables", "BAG_tables, beside the bag")
     export.set_defaults(run=_export)
 
 
 def _export(options: argparse.Namespace) -> None:
+    out = options.out or results_folder(options.bag, "tables")
+    require_free(out, "export", force=options.force)
     from sst_ros.recording.export import export
 
-    out = options.out or options.bag.parent / "export"
     for path in export(options.bag, out, options.form):
         print(path)

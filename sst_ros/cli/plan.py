@@ -9,6 +9,7 @@ from pathlib import Path
 from sst_ros import scene
 from sst_ros.cli import Commands, group
 from sst_ros.errors import InputError, Problem
+from sst_ros.output_folder import require_free
 
 
 def add(commands: Commands) -> None:
@@ -20,6 +21,7 @@ def add(commands: Commands) -> None:
     check.add_argument("scene", metavar="FILE", help="scene with a motion: name, or .yaml file")
     check.add_argument("--json", action="store_true", help="print JSON instead of a table")
     check.add_argument("--csv", type=Path, metavar="OUT", help="write the torques to play")
+    check.add_argument("--force", action="store_true", help="overwrite the file of --csv")
     check.add_argument(
         "--period", type=float, default=1e-3, help="length of a row of --csv [s]; default 0.001"
     )
@@ -36,6 +38,8 @@ def _check(options: argparse.Namespace) -> int:
     if not 1e-9 <= options.period < float("inf"):
         problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
         raise InputError("plan check", [problem])
+    if options.csv is not None:
+        require_free(options.csv, "plan check", force=options.force)
     held = scene.load(options.scene)
     plan = examine(motion_of(held, samples), held)
     write = as_json if options.json else table

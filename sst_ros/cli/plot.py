@@ -6,14 +6,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands
+from sst_ros.cli import Commands, add_out
+from sst_ros.output_folder import require_free, results_folder
 
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
     plot = commands.add_parser("plot", help="pictures of recorded runs, as PDF and PNG")
     plot.add_argument("bags", type=Path, nargs="*", metavar="BAG", help="folder of the bag")
-    plot.add_argument("--out", type=Path, help="folder of the pictures; default: beside the bag")
+    add_out(plot, "folder of the pictures", "BAG_plots, beside the first bag")
     plot.add_argument("--only", nargs="+", default=[], metavar="NAME", help="draw only these")
     plot.add_argument("--list", action="store_true", help="list the pictures, and draw none")
     plot.add_argument(
@@ -24,10 +25,9 @@ def add(commands: Commands) -> None:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from sst_ros.plot import catalogue, compare
-    from sst_ros.recording import signals
-
     if options.list:
+        from sst_ros.plot import catalogue, compare
+
         for name, picture in catalogue.PICTURES.items():
             print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
         print(f"{'with --compare':<18}{', '.join(compare.PICTURES)}")
@@ -35,7 +35,11 @@ def _plot(options: argparse.Namespace) -> int:
     bags = [*options.bags, *options.compare]
     if not bags or (len(bags) > 1 and not options.compare):
         options.parser.error("name one BAG, or several with --compare")
-    out = options.out or bags[0].parent / "plots"
+    out = options.out or results_folder(bags[0], "plots")
+    require_free(out, "plot", force=options.force)
+    from sst_ros.plot import catalogue, compare
+    from sst_ros.recording import signals
+
     runs = [signals.read(bag) for bag in bags]
     if options.compare:
         print(compare.table(runs))

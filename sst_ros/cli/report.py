@@ -7,7 +7,8 @@ import argparse
 from pathlib import Path
 
 from sst_ros import scene
-from sst_ros.cli import Commands, group
+from sst_ros.cli import Commands, add_out, group
+from sst_ros.output_folder import require_free, results_folder
 
 
 def add(commands: Commands) -> None:
@@ -15,40 +16,40 @@ def add(commands: Commands) -> None:
     kinds = group(commands.add_parser("report", help="judge a recorded run, or the methods"))
     run = kinds.add_parser("run", help="error against run time of a bag")
     run.add_argument("bag", type=Path, help="folder of the bag")
-    run.add_argument("--out", type=Path, help="folder of the results; default: beside the bag")
+    add_out(run, "folder of the results", "BAG_report, beside the bag")
     run.set_defaults(run=_run)
     accuracy = kinds.add_parser("accuracy", help="error against cost of every method and step")
     accuracy.add_argument(
         "--scene", nargs="+", metavar="S", help="names, or paths of .yaml files; default: all"
     )
-    accuracy.add_argument(
-        "--out", type=Path, default=Path("accuracy_out"), help="folder of the results"
-    )
+    add_out(accuracy, "folder of the results", "accuracy_out")
     accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
     accuracy.set_defaults(run=_accuracy)
     stability = kinds.add_parser("stability", help="stiff and extreme cases, largest steps")
-    stability.add_argument(
-        "--out", type=Path, default=Path("stability_out"), help="folder of the results"
-    )
+    add_out(stability, "folder of the results", "stability_out")
     stability.set_defaults(run=_stability)
 
 
 def _run(options: argparse.Namespace) -> None:
+    out = options.out or results_folder(options.bag, "report")
+    require_free(out, "report", force=options.force)
     from sst_ros.report.run import report
     from sst_ros.report.table import table
 
-    print(table(report(options.bag, options.out or options.bag.parent / "report")))
+    print(table(report(options.bag, out)))
 
 
 def _accuracy(options: argparse.Namespace) -> None:
+    out = require_free(options.out or Path("accuracy_out"), "report", force=options.force)
     from sst_ros.studies.accuracy_report import report
     from sst_ros.studies.high_precision import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
-    report(options.scene or scene.names(), options.out, kind=kind)
+    report(options.scene or scene.names(), out, kind=kind)
 
 
 def _stability(options: argparse.Namespace) -> int:
+    out = require_free(options.out or Path("stability_out"), "report", force=options.force)
     from sst_ros.studies.stability_report import report
 
-    return 0 if report(options.out) else 1
+    return 0 if report(out) else 1

@@ -7,8 +7,9 @@ import argparse
 from pathlib import Path
 
 from sst_ros import scene
-from sst_ros.cli import Commands, group
+from sst_ros.cli import Commands, add_out, group
 from sst_ros.errors import InputError, Problem
+from sst_ros.output_folder import require_free
 
 
 def add(commands: Commands) -> None:
@@ -36,17 +37,11 @@ def add(commands: Commands) -> None:
     )
     feedforward.add_argument("--seed", type=int, default=8, help="of the noise: %(default)s")
     feedforward.add_argument("--workers", type=int, help="processes; default: one a core")
-    feedforward.add_argument(
-        "--out", type=Path, default=Path("feedforward_out"),
-        help="folder of feedforward.csv, .json, .md and .png: %(default)s",
-    )  # fmt: skip
+    add_out(feedforward, "folder of feedforward.csv, .json, .md and .png", "feedforward_out")
     feedforward.set_defaults(run=_feedforward)
 
 
 def _feedforward(options: argparse.Namespace) -> None:
-    from sst_ros.studies.feedforward import Plan
-    from sst_ros.studies.feedforward_report import report
-
     problems = []
     if not 1e-6 <= options.period <= 1.0:
         problems.append(Problem("--period", options.period, "must be from 1e-6 to 1 s"))
@@ -56,6 +51,10 @@ def _feedforward(options: argparse.Namespace) -> None:
         problems.append(Problem("--workers", options.workers, "must be >= 1"))
     if problems:
         raise InputError("study", problems)
+    out = require_free(options.out or Path("feedforward_out"), "study", force=options.force)
+    from sst_ros.studies.feedforward import Plan
+    from sst_ros.studies.feedforward_report import report
+
     plan = Plan(
         scene.load(options.scene),
         period_ns=round(options.period * 1e9),
@@ -63,4 +62,4 @@ def _feedforward(options: argparse.Namespace) -> None:
         damping_ratio=options.damping_ratio,
         seed=options.seed,
     )
-    report(plan, options.out, workers=options.workers)
+    report(plan, out, workers=options.workers)
