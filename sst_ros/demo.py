@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sst_ros import child_process, scene
-from sst_ros.control.reference_motions import motion_of
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.report import tracking_report
 from sst_ros.report.run import report
@@ -54,7 +54,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
         SstError: the scene's motion is refused, or a node failed; says which.
 
     """
-    seconds = motion_of(scene.load(name)).duration + HOLD_S
+    seconds = reference_motion(scene.load(name)).duration + HOLD_S
     for mode in modes:
         bag = _room(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)

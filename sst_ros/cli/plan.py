@@ -31,8 +31,8 @@ def add(commands: Commands) -> None:
 def _check(options: argparse.Namespace) -> int:
     from sst_ros.control.plan import examine
     from sst_ros.control.plan_table import as_json, table, write_torques
-    from sst_ros.control.reference_motions import motion_of
-    from sst_ros.control.time_scaling import speed
+    from sst_ros.control.reference_motions import reference_motion
+    from sst_ros.control.time_scaling import time_scaling
     from sst_ros.recording.recorded_motion import samples
 
     if not 1e-9 <= options.period < float("inf"):
@@ -41,9 +41,9 @@ def _check(options: argparse.Namespace) -> int:
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force)
     held = scene.load(options.scene)
-    plan = examine(motion_of(held, samples), held)
+    plan = examine(reference_motion(held, samples), held)
     write = as_json if options.json else table
-    print(write(plan, speed(plan)).rstrip())
+    print(write(plan, time_scaling(plan)).rstrip())
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0

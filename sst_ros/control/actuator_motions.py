@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions that are given as motions of the actuators; the star follows by direct kinematics."""
+"""Reference motions of the actuators: point to point, and sine sweeps; the star follows."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.control.actuator_space import Coordinates
-from sst_ros.control.reference import Desired, Quadruple, Triple
-from sst_ros.control.rest_to_rest import PlannedMotion
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.quintic import minimum_jerk
+from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
+from sst_ros.control.star_motions import PIECES, timed
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.motions import Sweep, ToAngles
 
 Path = Callable[[float], tuple[Triple, Triple, Triple]]
 """Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
@@ -30,7 +32,7 @@ LONGEST = 100.0
 _SAMPLES = 16
 
 
-class ActuatorMotion(PlannedMotion):
+class ActuatorMotion(ReferenceMotion):
     """A path of the actuators and the assembly that is carried along.
 
     Orientations are followed once, by `continuation`, in steps that cannot leave the assembly, and
@@ -40,7 +42,7 @@ class ActuatorMotion(PlannedMotion):
     Args:
         geometry: base triangle and star.
         path: what the actuators do between 0 and the duration.
-        pieces: see `PlannedMotion`.
+        pieces: see `ReferenceMotion`.
         start: quaternion (x, y, z, w) of {E} in {B} at time 0.
 
     Raises:
@@ -55,7 +57,7 @@ class ActuatorMotion(PlannedMotion):
     ) -> None:
         super().__init__(pieces[-1], pieces)
         self._path, self._geometry = path, geometry
-        self._coordinates = Coordinates(geometry)
+        self._coordinates = ActuatorSpaceMap(geometry)
         self._times = list(_spaced(path, pieces))
         self._gammas = [path(time)[0] for time in self._times]
         try:
@@ -68,7 +70,7 @@ class ActuatorMotion(PlannedMotion):
         self._rotations = branch.rotation
         self._quaternions = list(_alike(quaternion_of(branch.rotation).tolist(), start))
 
-    def _inside(self, time: float) -> Desired:
+    def _inside(self, time: float) -> Reference:
         gamma, gamma_dot, gamma_ddot = self._path(time)
         index = max(bisect_right(self._times, time) - 1, 0)
         near = self._quaternions[index]
@@ -110,3 +112,53 @@ def _alike(quaternions: list[list[float]], before: Quadruple) -> Iterator[Quadru
         same = x * before[0] + y * before[1] + z * before[2] + w * before[3] >= 0.0
         before = (x, y, z, w) if same else (-x, -y, -z, -w)
         yield before
+
+
+def straight_path(start: Triple, goal: ToAngles) -> Path:
+    """From one gamma straight to another, with minimum jerk."""
+    way = [b - a for a, b in zip(start, goal.gamma, strict=True)]
+
+    def path(time: float) -> tuple[Triple, Triple, Triple]:
+        s, rate, acceleration = timed(time, goal.duration)
+        (p1, p2, p3), (w1, w2, w3) = start, way
+        return (
+            (p1 + s * w1, p2 + s * w2, p3 + s * w3),
+            (rate * w1, rate * w2, rate * w3),
+            (acceleration * w1, acceleration * w2, acceleration * w3),
+        )
+
+    return path
+
+
+def sweep_path(sweep: Sweep, centre: Triple) -> tuple[Path, tuple[float, ...]]:
+    """Sines that fade in and out, and pieces of a quarter of a period or less."""
+    last = sweep.last_frequency or sweep.frequency
+    slopes = [(b - a) / sweep.duration for a, b in zip(sweep.frequency, last, strict=True)]
+    rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
+
+    def path(time: float) -> tuple[Triple, Triple, Triple]:
+        e, e1, e2 = _fading(time, sweep.fade, sweep.duration)
+        p, v, a = [], [], []
+        for middle, amplitude, first, slope in rows:
+            angle, frequency = time * (first + 0.5 * slope * time), first + slope * time
+            s, c = math.sin(angle), math.cos(angle)
+            # The sine and its derivatives by time, times the fading and its own.
+            s1, s2 = frequency * c, slope * c - frequency * frequency * s
+            p.append(middle + amplitude * e * s)
+            v.append(amplitude * (e1 * s + e * s1))
+            a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
+        return (p[0], p[1], p[2]), (v[0], v[1], v[2]), (a[0], a[1], a[2])
+
+    fastest = max(map(abs, (*sweep.frequency, *last)))
+    quarters = math.ceil(fastest * sweep.duration / (0.5 * math.pi))
+    fades = (sweep.fade, sweep.duration - sweep.fade)
+    pieces = {*equal_pieces(sweep.duration, max(quarters, 2 * PIECES)), *fades}
+    return path, tuple(sorted(pieces))
+
+
+def _fading(time: float, fade: float, duration: float) -> tuple[float, float, float]:
+    """Fading in and out, between 0 and 1, with its derivatives by time."""
+    if fade <= time <= duration - fade:
+        return 1.0, 0.0, 0.0
+    e, e1, e2 = minimum_jerk(min(time, duration - time) / fade)
+    return e, (e1 if time < fade else -e1) / fade, e2 / (fade * fade)

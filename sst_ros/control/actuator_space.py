@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sst_ros.control.reference import Desired, Quadruple, Triple
+from sst_ros.control.reference import Quadruple, Reference, Triple
 from sst_ros.dynamics import kernel, loads
 from sst_ros.dynamics.expression import trace
 from sst_ros.dynamics.kernel import Leg
@@ -28,7 +28,7 @@ _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
 _CARRIAGES = tuple(f"r{k}{axis}" for k in range(3) for axis in "xyz")
 
 
-class Coordinates:
+class ActuatorSpaceMap:
     """Traced kinematics of one geometry."""
 
     def __init__(self, geometry: Geometry) -> None:
@@ -43,7 +43,7 @@ class Coordinates:
         self._posture = compiled(trace(self._of_posture, QUATERNION))
         self._newton = compiled(trace(self._improved, (*QUATERNION, *_CARRIAGES)))
 
-    def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Desired:
+    def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Reference:
         """Add gamma, in (-pi, pi], and its derivatives to a motion of the star.
 
         Raises:
@@ -51,7 +51,7 @@ class Coordinates:
 
         """
         g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
-        return Desired(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
+        return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
 
     def posture(self, q: Quadruple) -> tuple[float, ...]:
         """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation.
@@ -64,7 +64,7 @@ class Coordinates:
 
     def of_actuators(
         self, near: Quadruple, gamma: Triple, gamma_dot: Triple, gamma_ddot: Triple
-    ) -> Desired:
+    ) -> Reference:
         """Add the orientation that is next to `near`, and its derivatives, to the actuators'.
 
         Raises:
@@ -73,7 +73,7 @@ class Coordinates:
         """
         q = self.orientation(near, gamma)
         x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
-        return Desired(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
+        return Reference(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
 
     def orientation(self, near: Quadruple, gamma: Triple) -> Quadruple:
         """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma that is next to `near`.

@@ -27,10 +27,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.control import orientation_error
-from sst_ros.control.controller_settings import MODES, ControlSettings
+from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.orientation_observer import OrientationObserver
-from sst_ros.control.reference import Desired, Motion, Triple
+from sst_ros.control.reference import Reference, ReferenceMotion, Triple
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
@@ -38,7 +38,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.scene.scene import Scene
 
-__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measured"]
+__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
 
 class ControlStopped(SstError):
@@ -55,7 +55,7 @@ class ControlStopped(SstError):
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """What the encoders give: angles [rad] and rates [rad/s] of the actuators."""
 
     gamma: Triple
@@ -78,7 +78,7 @@ class Command:
     torque: Triple
     feedforward: Triple
     feedback: Triple
-    desired: Desired
+    desired: Reference
     saturated: bool
 
 
@@ -98,7 +98,7 @@ class Controller:
     """
 
     def __init__(
-        self, model: Scene, motion: Motion, settings: ControlSettings, period_s: float
+        self, model: Scene, motion: ReferenceMotion, settings: ControllerSettings, period_s: float
     ) -> None:
         self._motion, self._settings, self._period_s = motion, settings, period_s
         geometry, start = Geometry.of(model), motion.at(0.0)
@@ -124,11 +124,11 @@ class Controller:
         self._sum: Triple = ZERO
         self._failure: ControlStopped | None = None
 
-    def follow(self, motion: Motion) -> None:
+    def follow(self, motion: ReferenceMotion) -> None:
         """Take another motion, which must begin where the present one is; gains and sum stay."""
         self._motion = motion
 
-    def command(self, time: float, measured: Measured) -> Command:
+    def command(self, time: float, measured: Measurement) -> Command:
         """Give the torques from `time` [s] of the motion on, to be held for a period.
 
         Raises:
@@ -144,7 +144,7 @@ class Controller:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
 
-    def _command(self, time: float, measured: Measured) -> Command:
+    def _command(self, time: float, measured: Measurement) -> Command:
         _refuse_what_is_not_finite((*measured.gamma, *measured.gamma_dot), "measured")
         mode, desired = self._settings.mode, self._motion.at(time)
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
@@ -166,7 +166,12 @@ class Controller:
         return self._limited(feedforward, feedback, desired, error, summed)
 
     def _limited(
-        self, feedforward: Triple, feedback: Triple, desired: Desired, error: Triple, summed: Triple
+        self,
+        feedforward: Triple,
+        feedback: Triple,
+        desired: Reference,
+        error: Triple,
+        summed: Triple,
     ) -> Command:
         asked = added(feedforward, feedback)
         _refuse_what_is_not_finite(asked, "torque")
@@ -176,11 +181,11 @@ class Controller:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
         return Command(torque, feedforward, feedback, desired, torque != asked)
 
-    def _at_desired(self, at: Desired) -> Triple:
+    def _at_desired(self, at: Reference) -> Triple:
         return self._inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
 
     def _computed(
-        self, desired: Desired, measured: Measured, error: Triple
+        self, desired: Reference, measured: Measurement, error: Triple
     ) -> tuple[Triple, Triple]:
         """Torques of computed_torque, and the error to sum."""
         quaternion = self._observer.see(measured.gamma)
@@ -194,7 +199,7 @@ class Controller:
             acceleration, summed = self._on_so3(desired, now)
         return self._inverse.torque(now.quaternion, now.body_rate, acceleration), summed
 
-    def _on_so3(self, desired: Desired, now: Desired) -> tuple[Triple, Triple]:
+    def _on_so3(self, desired: Reference, now: Reference) -> tuple[Triple, Triple]:
         """W_dot in {E}, and the rotation vector of the error."""
         between = orientation_error.between(now.quaternion, desired.quaternion)
         turn = rotation_rows(between)

@@ -16,7 +16,7 @@ INSTANTS = ("start", "middle")
 
 
 @dataclass(frozen=True)
-class ControlSettings(Section):
+class ControllerSettings(Section):
     """Mode and gains.
 
     Gains are of a joint, tau_k = stiffness_k e_k + damping_k e_dot_k with e = desired - measured.

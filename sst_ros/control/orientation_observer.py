@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.reference import Quadruple, Triple
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -35,7 +35,7 @@ class OrientationObserver:
     """
 
     def __init__(self, geometry: Geometry, quaternion: Quadruple, gamma: Triple) -> None:
-        self.coordinates = Coordinates(geometry)
+        self.coordinates = ActuatorSpaceMap(geometry)
         self._begin = quaternion, gamma
         across = np.cross(geometry.w, geometry.v)
         legs = (geometry.v.tolist(), across.tolist(), geometry.e.tolist())

@@ -15,16 +15,16 @@ from sst_ros.mechanism.geometry import Array
 _ROUNDING = 1e-13
 
 
-class Extreme(NamedTuple):
+class Peak(NamedTuple):
     """A value and the time at which it is taken [s]."""
 
     value: float
     time: float
 
 
-def largest(
+def maximum(
     function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
-) -> Extreme:
+) -> Peak:
     """Return the maximum of a function of which samples are known.
 
     Every sample that no neighbour exceeds is a summit. The function is searched about it, between
@@ -39,7 +39,7 @@ def largest(
 
     """
     top = int(np.argmax(values))
-    best = Extreme(float(values[top]), float(times[top]))
+    best = Peak(float(values[top]), float(times[top]))
     left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
     below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
     high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
@@ -52,17 +52,17 @@ def largest(
             options={"xatol": 1e-8 * width},
         )  # fmt: skip
         if -found.fun > best.value + _ROUNDING * abs(best.value):
-            best = Extreme(float(-found.fun), float(found.x))
+            best = Peak(float(-found.fun), float(found.x))
     return best
 
 
-def least(function: Callable[[float], float], times: Array, values: Array) -> Extreme:
-    """Return the minimum; see `largest`."""
-    found = largest(lambda time: -function(time), times, -values)
-    return Extreme(-found.value, found.time)
+def minimum(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the minimum; see `maximum`."""
+    found = maximum(lambda time: -function(time), times, -values)
+    return Peak(-found.value, found.time)
 
 
-def widest(function: Callable[[float], float], times: Array, values: Array) -> Extreme:
-    """Return the value of the largest size, with its sign; see `largest`."""
-    high, low = largest(function, times, values), least(function, times, values)
+def peak_magnitude(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the value of the largest size, with its sign; see `maximum`."""
+    high, low = maximum(function, times, values), minimum(function, times, values)
     return high if high.value >= -low.value else low

@@ -12,11 +12,10 @@ import numpy as np
 from scipy.integrate import simpson
 from scipy.optimize import brentq
 
-from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.peaks import Extreme, largest, least, widest
-from sst_ros.control.reference import Desired, Triple
-from sst_ros.control.rest_to_rest import PlannedMotion
+from sst_ros.control.peaks import Peak, maximum, minimum, peak_magnitude
+from sst_ros.control.reference import Reference, ReferenceMotion, Triple
 from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -30,7 +29,7 @@ SINGULAR_J2 = 1e-6
 
 
 @dataclass(frozen=True)
-class Demand:
+class ActuatorDemand:
     """What a motion asks of one actuator; values of the largest size, with their signs.
 
     Attributes:
@@ -41,15 +40,15 @@ class Demand:
 
     """
 
-    torque: Extreme
+    torque: Peak
     torque_rms: float
-    power: Extreme
-    velocity: Extreme
-    acceleration: Extreme
+    power: Peak
+    velocity: Peak
+    acceleration: Peak
 
 
 @dataclass(frozen=True)
-class Distance:
+class LimitMargin:
     """How near a motion comes to an end of what is allowed.
 
     Attributes:
@@ -66,17 +65,17 @@ class Distance:
     end: float
     sign: float
     unit: str
-    reached: Extreme
+    reached: Peak
     refused: bool
 
     @property
-    def least(self) -> float:
-        """The smallest distance, negative beyond the end."""
+    def margin(self) -> float:
+        """The smallest distance to the limit, negative beyond it."""
         return self.sign * (self.reached.value - self.end)
 
 
 @dataclass(frozen=True)
-class Plan:
+class MotionPlan:
     """A motion as it was checked.
 
     Attributes:
@@ -91,17 +90,17 @@ class Plan:
 
     """
 
-    motion: PlannedMotion
+    motion: ReferenceMotion
     scene: Scene
     times: Array
-    desired: tuple[Desired, ...]
+    desired: tuple[Reference, ...]
     torques: Array
-    demands: tuple[Demand, Demand, Demand]
-    distances: tuple[Distance, ...]
+    demands: tuple[ActuatorDemand, ActuatorDemand, ActuatorDemand]
+    distances: tuple[LimitMargin, ...]
     problems: tuple[Problem, ...]
 
 
-def check(motion: PlannedMotion, scene: Scene) -> Plan:
+def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     """Examine a motion and refuse it if it cannot be.
 
     Raises:
@@ -116,7 +115,7 @@ def check(motion: PlannedMotion, scene: Scene) -> Plan:
     return plan
 
 
-def examine(motion: PlannedMotion, scene: Scene) -> Plan:
+def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     """Find out what a motion asks for, everywhere and not only at samples.
 
     An external moment from a topic counts as zero; what the lag of actuators costs is not counted.
@@ -140,13 +139,13 @@ def examine(motion: PlannedMotion, scene: Scene) -> Plan:
     )
     demands = [_demand(motion, torque, leg, times, desired, torques) for leg in range(3)]
     problems = [*_beyond(distances), *_too_much(demands, scene.actuators)]
-    return Plan(
+    return MotionPlan(
         motion, scene, times, desired, torques, (demands[0], demands[1], demands[2]), distances,
         tuple(problems),
     )  # fmt: skip
 
 
-def sample_times(motion: PlannedMotion) -> Array:
+def sample_times(motion: ReferenceMotion) -> Array:
     """Return the ends of SAMPLES equal parts of every piece [s]."""
     inner = [
         np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
@@ -155,13 +154,13 @@ def sample_times(motion: PlannedMotion) -> Array:
 
 
 def _demand(
-    motion: PlannedMotion,
+    motion: ReferenceMotion,
     torque: Callable[[float], Triple],
     leg: int,
     times: Array,
-    desired: tuple[Desired, ...],
+    desired: tuple[Reference, ...],
     torques: Array,
-) -> Demand:
+) -> ActuatorDemand:
     rates = np.array([at.gamma_dot[leg] for at in desired])
     accelerations = np.array([at.gamma_ddot[leg] for at in desired])
     mine = torques[:, leg]
@@ -169,25 +168,27 @@ def _demand(
         float(simpson(mine[start : start + SAMPLES + 1] ** 2, x=times[start : start + SAMPLES + 1]))
         for start in range(0, len(times) - 1, SAMPLES)
     )
-    return Demand(
-        torque=widest(lambda time: torque(time)[leg], times, mine),
+    return ActuatorDemand(
+        torque=peak_magnitude(lambda time: torque(time)[leg], times, mine),
         torque_rms=float(np.sqrt(square / motion.duration)),
-        power=widest(
+        power=peak_magnitude(
             lambda time: torque(time)[leg] * motion.at(time).gamma_dot[leg], times, mine * rates
         ),
-        velocity=widest(lambda time: motion.at(time).gamma_dot[leg], times, rates),
-        acceleration=widest(lambda time: motion.at(time).gamma_ddot[leg], times, accelerations),
+        velocity=peak_magnitude(lambda time: motion.at(time).gamma_dot[leg], times, rates),
+        acceleration=peak_magnitude(
+            lambda time: motion.at(time).gamma_ddot[leg], times, accelerations
+        ),
     )
 
 
 def _distances(
-    motion: PlannedMotion,
+    motion: ReferenceMotion,
     scene: Scene,
     geometry: Geometry,
     times: Array,
-    desired: tuple[Desired, ...],
-) -> Iterator[Distance]:
-    coordinates = Coordinates(geometry)
+    desired: tuple[Reference, ...],
+) -> Iterator[LimitMargin]:
+    coordinates = ActuatorSpaceMap(geometry)
     gammas = np.array([at.gamma for at in desired])
     postures = np.array([_posture(coordinates, at) for at in desired])
 
@@ -199,9 +200,9 @@ def _distances(
 
     def both(
         key: str, end: float, function: Callable[[float], float], values: Array, refused: bool
-    ) -> Iterator[Distance]:
-        yield Distance(key, 0.0, 1.0, "rad", least(function, times, values), refused)
-        yield Distance(key, end, -1.0, "rad", largest(function, times, values), refused)
+    ) -> Iterator[LimitMargin]:
+        yield LimitMargin(key, 0.0, 1.0, "rad", minimum(function, times, values), refused)
+        yield LimitMargin(key, end, -1.0, "rad", maximum(function, times, values), refused)
 
     held = scene.stroke.at_end != "ignore"
     for leg in range(3):
@@ -212,22 +213,22 @@ def _distances(
         most, index = geometry.beta_max, 3 + leg
         yield from both(f"beta_{leg + 1}", most, posture(index), postures[:, index], held)
     for leg in range(3):
-        low = least(posture(leg), times, postures[:, leg])
+        low = minimum(posture(leg), times, postures[:, leg])
         if low.value < SINGULAR_MU:
             said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
-        yield Distance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
+        yield LimitMargin(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
     sign = 1.0 if postures[0, 6] > 0.0 else -1.0
-    low = least(lambda time: sign * posture(6)(time), times, sign * postures[:, 6])
+    low = minimum(lambda time: sign * posture(6)(time), times, sign * postures[:, 6])
     if low.value < SINGULAR_J2:
         end = low.time if low.value > 0.0 else brentq(posture(6), 0.0, low.time)
         said = f"parallel singularity at t = {end:.9g} s, det J2"
         raise SingularConfiguration(said, posture(6)(end))
-    yield Distance("det J2", 0.0, sign, "1", Extreme(sign * low.value, low.time), True)
+    yield LimitMargin("det J2", 0.0, sign, "1", Peak(sign * low.value, low.time), True)
 
 
-def _posture(coordinates: Coordinates, at: Desired) -> tuple[float, ...]:
-    """See `Coordinates.posture`; beyond a serial singularity the leg's sine is negative."""
+def _posture(coordinates: ActuatorSpaceMap, at: Reference) -> tuple[float, ...]:
+    """See `ActuatorSpaceMap.posture`; beyond a serial singularity the leg's sine is negative."""
     found = list(coordinates.posture(at.quaternion))
     turned = coordinates.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
     for leg in range(3):
@@ -237,16 +238,16 @@ def _posture(coordinates: Coordinates, at: Desired) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _beyond(distances: tuple[Distance, ...]) -> Iterator[Problem]:
+def _beyond(distances: tuple[LimitMargin, ...]) -> Iterator[Problem]:
     for distance in distances:
-        if distance.refused and distance.least < 0.0:
+        if distance.refused and distance.margin < 0.0:
             side = "above" if distance.sign > 0.0 else "below"
             allowed = f"must stay {side} {distance.end:.9g} {distance.unit}"
             said = f"{allowed} (t = {distance.reached.time:.9g} s)"
             yield Problem(distance.key, distance.reached.value, said)
 
 
-def _too_much(demands: list[Demand], actuators: Actuators | None) -> Iterator[Problem]:
+def _too_much(demands: list[ActuatorDemand], actuators: Actuators | None) -> Iterator[Problem]:
     for name, limit, unit in limits(actuators):
         for leg, demand in enumerate(demands):
             value, time = getattr(demand, name)

@@ -11,13 +11,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.plan import Demand, Distance, Plan, limits
-from sst_ros.control.time_scaling import Speed
+from sst_ros.control.plan import ActuatorDemand, LimitMargin, MotionPlan, limits
+from sst_ros.control.time_scaling import TimeScaling
 
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 
 
-def table(plan: Plan, fastest: Speed) -> str:
+def table(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for people."""
     lines = [
         f"{plan.scene.name}: {plan.motion.duration:g} s, {len(plan.times)} samples and the "
@@ -34,7 +34,7 @@ def table(plan: Plan, fastest: Speed) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _demands(plan: Plan) -> Iterator[str]:
+def _demands(plan: MotionPlan) -> Iterator[str]:
     known = {name: limit for name, limit, _ in limits(plan.scene.actuators)}
     for name, unit in UNITS.items():
         peaks, limit = [getattr(demand, name) for demand in plan.demands], known.get(name)
@@ -51,15 +51,15 @@ def _row(name: str, cells: Sequence[str], end: str = "") -> str:
     return f"{name:<28}{''.join(f'{cell:>14}' for cell in cells)}{end:>14}".rstrip()
 
 
-def _distance(distance: Distance) -> str:
+def _distance(distance: LimitMargin) -> str:
     side = "above" if distance.sign > 0.0 else "below"
     unit = f" [{distance.unit}]" if distance.unit != "1" else ""
     name = f"{distance.key} {side} {distance.end:.6g}{unit}"
     note = "" if distance.refused else "   ignored"
-    return _row(name, [f"{distance.least:.6g}", f"{distance.reached.time:.6g}"]) + note
+    return _row(name, [f"{distance.margin:.6g}", f"{distance.reached.time:.6g}"]) + note
 
 
-def _verdict(plan: Plan, fastest: Speed) -> Iterator[str]:
+def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
     for problem in plan.problems:
         yield f"refused: {problem}"
     if plan.scene.moment is not None and plan.scene.moment.topic:
@@ -67,7 +67,7 @@ def _verdict(plan: Plan, fastest: Speed) -> Iterator[str]:
     if plan.scene.actuators is not None and plan.scene.actuators.time_constant is not None:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
-    if any(distance.refused and distance.least < 0.0 for distance in plan.distances):
+    if any(distance.refused and distance.margin < 0.0 for distance in plan.distances):
         yield "At no speed: the path itself leaves what is allowed."
     elif fastest.highest is None:
         yield "At no speed: the torque limit is too small for this path."
@@ -86,7 +86,7 @@ def _verdict(plan: Plan, fastest: Speed) -> Iterator[str]:
         )
 
 
-def as_json(plan: Plan, fastest: Speed) -> str:
+def as_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
     highest = fastest.highest
     return json.dumps(
@@ -98,7 +98,7 @@ def as_json(plan: Plan, fastest: Speed) -> str:
             "limits": {name: limit for name, limit, _ in limits(plan.scene.actuators)},
             "actuators": [_plain(demand) for demand in plan.demands],
             "distances": [
-                {**_plain(distance), "least": distance.least} for distance in plan.distances
+                {**_plain(distance), "least": distance.margin} for distance in plan.distances
             ],
             "highest_speed": None if highest is None or math.isinf(highest) else highest,
             "any_speed": highest is not None and math.isinf(highest),
@@ -109,13 +109,13 @@ def as_json(plan: Plan, fastest: Speed) -> str:
     )
 
 
-def _plain(part: Demand | Distance) -> dict[str, object]:
+def _plain(part: ActuatorDemand | LimitMargin) -> dict[str, object]:
     """Turn a part into a mapping; extremes become mappings, too."""
     values = ((field.name, getattr(part, field.name)) for field in dataclasses.fields(part))
     return {name: value._asdict() if hasattr(value, "_asdict") else value for name, value in values}
 
 
-def write_torques(plan: Plan, path: Path, period: float) -> None:
+def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
     """Write the torques for `torque_player`: each row, held for a period [s], is its middle's.
 
     The last row holds the manipulator where the motion ends.

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sst_ros.control.actuator_motions import ActuatorMotion
-from sst_ros.control.actuator_paths import straight_path, sweep_path
-from sst_ros.control.reference import Quadruple
-from sst_ros.control.rest_to_rest import PlannedMotion, parts
-from sst_ros.control.star_motions import PIECES, Spiral, Turn
-from sst_ros.control.waypoints import Samples, moved, recorded, waypoints
+from sst_ros.control.actuator_motions import ActuatorMotion, straight_path, sweep_path
+from sst_ros.control.reference import Quadruple, ReferenceMotion, equal_pieces
+from sst_ros.control.star_motions import PIECES, GeodesicMotion, SpiralMotion
+from sst_ros.control.waypoints import MotionSamples, moved, recorded, waypoints
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 
-__all__ = ["PlannedMotion", "Samples", "motion_of", "recorded", "waypoints"]
+__all__ = ["MotionSamples", "ReferenceMotion", "recorded", "reference_motion", "waypoints"]
 
 
-def motion_of(scene: Scene, samples: Callable[[str], Samples] | None = None) -> PlannedMotion:
+def reference_motion(
+    scene: Scene, samples: Callable[[str], MotionSamples] | None = None
+) -> ReferenceMotion:
     """Return the desired motion of a scene.
 
     Args:
@@ -46,10 +46,10 @@ def motion_of(scene: Scene, samples: Callable[[str], Samples] | None = None) -> 
     start = (x, y, z, w)
     if motion.to_orientation:
         end = motion.to_orientation.orientation
-        return Turn(geometry, start, end, motion.to_orientation.duration)
+        return GeodesicMotion(geometry, start, end, motion.to_orientation.duration)
     if spiral := motion.spiral:
         angles = (spiral.theta, spiral.phi, spiral.psi)
-        return Spiral(geometry, start, angles, spiral.duration)
+        return SpiralMotion(geometry, start, angles, spiral.duration)
     if motion.waypoints:
         return _through(scene, geometry, start)
     if motion.sweep:
@@ -60,11 +60,11 @@ def motion_of(scene: Scene, samples: Callable[[str], Samples] | None = None) -> 
     else:
         assert motion.to_angles is not None
         path = straight_path(gamma, motion.to_angles)
-        pieces = parts(motion.to_angles.duration, 2 * PIECES)
+        pieces = equal_pieces(motion.to_angles.duration, 2 * PIECES)
     return ActuatorMotion(geometry, path, pieces, start)
 
 
-def _through(scene: Scene, geometry: Geometry, start: Quadruple) -> PlannedMotion:
+def _through(scene: Scene, geometry: Geometry, start: Quadruple) -> ReferenceMotion:
     assert scene.motion is not None
     points = scene.motion.waypoints
     try:

@@ -8,10 +8,9 @@ from abc import abstractmethod
 
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_space import Coordinates
+from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.quintic import minimum_jerk
-from sst_ros.control.reference import Desired, Quadruple, Triple
-from sst_ros.control.rest_to_rest import PlannedMotion, parts
+from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism.geometry import Geometry
 
@@ -21,20 +20,20 @@ PIECES = 8
 StarState = tuple[Quadruple, Triple, Triple]
 
 
-class StarMotion(PlannedMotion):
+class StarMotion(ReferenceMotion):
     """A motion of the star; a subclass says which, by `star`."""
 
     def __init__(self, geometry: Geometry, duration: float, turn: float) -> None:
         """Prepare a motion that turns the star by some `turn` [rad] in all."""
         count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
-        super().__init__(duration, parts(duration, count))
-        self._coordinates = Coordinates(geometry)
+        super().__init__(duration, equal_pieces(duration, count))
+        self._coordinates = ActuatorSpaceMap(geometry)
 
     @abstractmethod
     def star(self, time: float) -> StarState:
         """Quaternion, W and W_dot at a time [s] between 0 and the duration."""
 
-    def _inside(self, time: float) -> Desired:
+    def _inside(self, time: float) -> Reference:
         try:
             return self._coordinates.of_star(*self.star(time))
         except ArithmeticError:
@@ -42,7 +41,7 @@ class StarMotion(PlannedMotion):
             raise SingularConfiguration(said, 0.0) from None
 
 
-class Turn(StarMotion):
+class GeodesicMotion(StarMotion):
     """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
 
     Quaternions (x, y, z, w) may have any length > 0; the shorter way round is taken.
@@ -72,7 +71,7 @@ class Turn(StarMotion):
         )
 
 
-class Spiral(StarMotion):
+class SpiralMotion(StarMotion):
     """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
 
     Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so the motion

@@ -15,8 +15,8 @@ from itertools import product
 import numpy as np
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.peaks import largest
-from sst_ros.control.plan import Plan
+from sst_ros.control.peaks import maximum
+from sst_ros.control.plan import MotionPlan
 from sst_ros.control.reference import Triple
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism.geometry import Array
@@ -30,7 +30,7 @@ _DOUBLINGS = 40
 
 
 @dataclass(frozen=True)
-class Speed:
+class TimeScaling:
     """Factors of speed at which the actuators can do a motion.
 
     Attributes:
@@ -47,7 +47,7 @@ class Speed:
     binding: str
 
 
-def speed(plan: Plan) -> Speed:
+def time_scaling(plan: MotionPlan) -> TimeScaling:
     """Find the highest feasible factor of speed.
 
     The factors that torques allow are found on a grid first, then to rounding by bisection; a
@@ -66,13 +66,13 @@ def speed(plan: Plan) -> Speed:
     binding = min(caps, key=lambda name: caps[name])
     cap = caps[binding]
     if actuators is None or actuators.torque_limit is None:
-        return Speed(cap, 0.0, binding if math.isfinite(cap) else "")
+        return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
     torques = _Torques(plan, actuators.torque_limit)
     top = min(cap, torques.top())
     grid = np.geomspace(SLOWEST * top, top, _GRID).tolist()
     last = _last(torques, grid, len(grid) - 1, feasible=True)
     if last is None:
-        return Speed(None, 0.0, "torque")
+        return TimeScaling(None, 0.0, "torque")
     highest = grid[last]
     if last < len(grid) - 1:
         highest, binding = _between(torques, highest, grid[last + 1]), "torque"
@@ -80,14 +80,14 @@ def speed(plan: Plan) -> Speed:
         highest, binding = math.inf, ""
     first = _last(torques, grid, last, feasible=False)
     if first is not None:
-        return Speed(highest, _between(torques, grid[first + 1], grid[first]), binding)
-    return Speed(highest, 0.0 if torques.fit(0.0) else grid[0], binding)
+        return TimeScaling(highest, _between(torques, grid[first + 1], grid[first]), binding)
+    return TimeScaling(highest, 0.0 if torques.fit(0.0) else grid[0], binding)
 
 
 class _Torques:
     """Torques of a motion at any speed against their limit."""
 
-    def __init__(self, plan: Plan, limit: float) -> None:
+    def __init__(self, plan: MotionPlan, limit: float) -> None:
         self._plan, self._limit = plan, limit
         self._model = kernel.model_of(plan.scene)
         self._inverse = InverseDynamics(plan.scene)
@@ -107,7 +107,7 @@ class _Torques:
             def torque(time: float, leg: int = leg, sign: float = sign) -> float:
                 return sign * self.at(factor, time)[leg]
 
-            peak = largest(torque, self._plan.times, sign * sampled[leg], self._limit)
+            peak = maximum(torque, self._plan.times, sign * sampled[leg], self._limit)
             if peak.value > self._limit:
                 return False
         return True

@@ -18,7 +18,7 @@ ROWS = 10
 
 
 @dataclass(frozen=True)
-class Track:
+class TrackingRecord:
     """What was wanted, what was measured and what was done about it, by sample.
 
     Attributes:
@@ -41,7 +41,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Tracking:
+class TrackingMetrics:
     """A track in numbers. Those of a joint have shape (3,).
 
     Attributes:
@@ -74,7 +74,7 @@ class Tracking:
     history: Array
 
 
-def judge(track: Track, limited: int | None = None) -> Tracking:
+def evaluate(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
     """Put a track of one sample or more in numbers; `limited` is passed on."""
     error, torque = np.abs(track.error), track.torque
     worst, square = error.max(axis=1), np.mean(error**2, axis=1)
@@ -86,7 +86,7 @@ def judge(track: Track, limited: int | None = None) -> Tracking:
         feedforward = np.mean(track.feedforward * torque, axis=0) / power
         feedback = np.mean(track.feedback * torque, axis=0) / power
     band = BAND * float(np.ptp(track.gamma, axis=0).max())
-    return Tracking(
+    return TrackingMetrics(
         samples=len(worst),
         seconds=float(track.time[-1] - track.time[0]),
         rms=np.sqrt(np.mean(error**2, axis=0)),
@@ -103,12 +103,12 @@ def judge(track: Track, limited: int | None = None) -> Tracking:
     )
 
 
-def table(found: Tracking) -> str:
+def table(found: TrackingMetrics) -> str:
     """Write the numbers as text; what is unknown is a dash."""
     return "\n".join(_lines(found)) + "\n"
 
 
-def _lines(found: Tracking) -> Iterator[str]:
+def _lines(found: TrackingMetrics) -> Iterator[str]:
     yield f"{'':24}{'gamma_1':>12}{'gamma_2':>12}{'gamma_3':>12}"
     for label, row in (
         ("error, RMS [rad]", found.rms),
@@ -131,7 +131,7 @@ def _lines(found: Tracking) -> Iterator[str]:
         yield f"{time:16.4f}{rms:20.3e}{largest:24.3e}"
 
 
-def _settling(track: Track, inside: NDArray[np.bool_]) -> float | None:
+def _settling(track: TrackingRecord, inside: NDArray[np.bool_]) -> float | None:
     moving = np.flatnonzero(np.any(track.gamma_dot != 0.0, axis=1))
     end = int(moving[-1]) + 1 if len(moving) else 0
     if end >= len(inside) or not inside[-1]:

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.control.actuator_motions import ActuatorMotion
 from sst_ros.control.quintic import Quintic
-from sst_ros.control.reference import Quadruple, Triple
-from sst_ros.control.rest_to_rest import REST, PlannedMotion
+from sst_ros.control.reference import REST, Quadruple, ReferenceMotion, Triple
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -30,7 +29,7 @@ SAMPLES_A_PIECE = 8
 
 
 @dataclass(frozen=True)
-class Samples:
+class MotionSamples:
     """A recorded motion.
 
     Attributes:
@@ -54,7 +53,7 @@ def waypoints(
     velocities: OpenPoints | None = None,
     accelerations: OpenPoints | None = None,
     begin: tuple[Triple, Triple] = (REST, REST),
-) -> PlannedMotion:
+) -> ReferenceMotion:
     """Return the motion of the actuators through points, quintic between them.
 
     The fields of trajectory_msgs/JointTrajectory, rows in the order of the legs. A first point
@@ -110,7 +109,7 @@ def waypoints(
     return _along(geometry, begun, Quintic(at, gamma, rates, seconds), tuple(at.tolist()))
 
 
-def recorded(geometry: Geometry, samples: Samples) -> PlannedMotion:
+def recorded(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
     """Return the motion of a recording, quintic between samples; it may begin and end moving.
 
     Raises:
@@ -136,7 +135,7 @@ def moved(geometry: Geometry, start: Quadruple, here: ArrayLike, there: ArrayLik
 
 def _along(
     geometry: Geometry, start: Quadruple, spline: Quintic, pieces: tuple[float, ...]
-) -> PlannedMotion:
+) -> ReferenceMotion:
     def path(time: float) -> tuple[Triple, Triple, Triple]:
         (p1, p2, p3), (v1, v2, v3), (a1, a2, a3) = spline.at(time)
         return (p1, p2, p3), (v1, v2, v3), (a1, a2, a3)

@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import scene
-from sst_ros.control.controller import Command, Measured
+from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.vec3 import ZERO, axpy
@@ -53,7 +53,7 @@ class InverseDynamics:
         self._reference = topics.REFERENCE.publisher(self.node)
         self._error = topics.TRACKING_ERROR.publisher(self.node)
         self._diagnostics = topics.DIAGNOSTICS.publisher(self.node)
-        self._seen: Measured | None = None
+        self._seen: Measurement | None = None
         self._places: tuple[list[str], list[int]] = ([], [])
         self._began = self._finished = False
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -113,7 +113,7 @@ class InverseDynamics:
         told = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in told)
 
-    def _measured(self, state: JointState) -> Measured:
+    def _measured(self, state: JointState) -> Measurement:
         """Read the actuators, which may come in any order, among others.
 
         Raises:
@@ -130,9 +130,9 @@ class InverseDynamics:
             raise SstError("joint_states must have a position and a velocity for each name")
         i, j, k = self._places[1]
         p, v = state.position, state.velocity
-        return Measured((p[i], p[j], p[k]), (v[i], v[j], v[k]))
+        return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
 
-    def _publish(self, state: JointState, seen: Measured, command: Command) -> None:
+    def _publish(self, state: JointState, seen: Measurement, command: Command) -> None:
         """Tell what was wanted and what was missing, under the stamp of the sample."""
         at = command.desired
         off = axpy(1.0, at.gamma, -1.0, seen.gamma), axpy(1.0, at.gamma_dot, -1.0, seen.gamma_dot)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.control.reference_motions import Samples
+from sst_ros.control.reference_motions import MotionSamples
 from sst_ros.errors import InputError, Problem
 from sst_ros.recording.recording import read
 
 
-def samples(bag: str | Path) -> Samples:
+def samples(bag: str | Path) -> MotionSamples:
     """Read what the actuators did in a run, from the first sample that has an orientation.
 
     Raises:
@@ -26,7 +26,7 @@ def samples(bag: str | Path) -> Samples:
         raise InputError(str(bag), [problem])
     first = whole[0]
     x, y, z, w = recording.quaternion[first].tolist()
-    return Samples(
+    return MotionSamples(
         recording.seconds[first:], recording.gamma[first:], recording.gamma_dot[first:],
         (x, y, z, w),
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.tracking import Track, Tracking, judge
+from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
@@ -42,7 +42,7 @@ class Followed:
     """
 
     recording: Recording
-    track: Track
+    track: TrackingRecord
     rows: np.ndarray[Any, np.dtype[np.intp]]
     orientation_error: Array
     limited: int | None
@@ -76,7 +76,7 @@ def read(path: Path) -> Followed:
     )
     gamma, gamma_dot, feedforward = np.split(reference, 3, axis=1)
     off, off_rate, feedback = np.split(error, 3, axis=1)
-    track = Track(
+    track = TrackingRecord(
         time=times / NANOSECONDS,
         gamma=gamma,
         gamma_dot=gamma_dot,
@@ -89,9 +89,9 @@ def read(path: Path) -> Followed:
     return Followed(run, track, rows, _orientation_error(run, rows, gamma), limited)
 
 
-def judged(followed: Followed) -> Tracking:
+def judged(followed: Followed) -> TrackingMetrics:
     """Put it in numbers."""
-    return judge(followed.track, followed.limited)
+    return evaluate(followed.track, followed.limited)
 
 
 def _row(path: Path, key: str, message: Any) -> tuple[int, Array]:

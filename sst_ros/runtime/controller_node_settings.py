@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from sst_ros.control.controller_settings import ControlSettings
+from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.scene.schema import choice, flag, integer, number, text
 from sst_ros.simulation import NANOSECONDS
 
 
 @dataclass(frozen=True)
-class CompanionParameters(ControlSettings):
+class CompanionParameters(ControllerSettings):
     """Parameters of sst_inverse_dynamics."""
 
     scene: str = text(

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from sst_ros.control.reference import Desired
-from sst_ros.control.rest_to_rest import PlannedMotion
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.waypoints import waypoints
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
@@ -15,7 +14,7 @@ from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation import NANOSECONDS
 
 
-def motion_of(message: Any, geometry: Geometry, begin: Desired) -> PlannedMotion:
+def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
     """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
 
     It begins at once and goes on from the reference, which may be moving.
@@ -58,7 +57,7 @@ def _faults(message: Any) -> Iterator[Problem]:
             yield Problem(f"points[{index}].effort", list(point.effort), allowed)
 
 
-def _jump(message: Any, begin: Desired) -> Iterator[Problem]:
+def _jump(message: Any, begin: Reference) -> Iterator[Problem]:
     moving = any(begin.gamma_dot)
     if moving and message.points and not _ns(message.points[0].time_from_start):
         allowed = "must be > 0 s while the reference is moving"

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.actuator_space import Coordinates
-from sst_ros.control.controller import Command, Controller, Measured
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.controller import Command, Controller, Measurement
 from sst_ros.control.plan import check
-from sst_ros.control.reference import Desired
-from sst_ros.control.reference_motions import PlannedMotion, Samples, motion_of
-from sst_ros.control.tracking import Track, Tracking, judge
+from sst_ros.control.reference import Reference
+from sst_ros.control.reference_motions import MotionSamples, ReferenceMotion, reference_motion
+from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -28,7 +28,7 @@ from sst_ros.scene.scene import Actuators, Scene
 from sst_ros.simulation import NANOSECONDS
 
 _COLUMNS = 22
-"""Numbers of a sample of a `Track`."""
+"""Numbers of a sample of a `TrackingRecord`."""
 
 
 class Stage(Enum):
@@ -61,9 +61,9 @@ class Pursuit:
         self._model, self._settings = _limited(model, settings.torque_limit), settings
         self._geometry = Geometry.of(model)
         self._period_ns = NANOSECONDS // settings.rate
-        self._planned: PlannedMotion | None = None
+        self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
-            self._planned = motion_of(model, _samples)
+            self._planned = reference_motion(model, _samples)
             check(self._planned, self._model)
         self.samples = self.irregular = self.limited = self.refused = 0
         self.last_refusal = ""
@@ -77,7 +77,7 @@ class Pursuit:
         if self._planned is not None:
             self._prepare(self._planned)
 
-    def take(self, message: Any, seen: Measured | None) -> None:
+    def take(self, message: Any, seen: Measurement | None) -> None:
         """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
 
         It goes on from the reference of the last sample; before there was one, from where the
@@ -109,7 +109,7 @@ class Pursuit:
         self._begin(motion, self._last_ns if moving else None)
         self.stage = Stage.FOLLOWING
 
-    def preview(self, measured: Measured) -> Command | None:
+    def preview(self, measured: Measurement) -> Command | None:
         """Answer a sample before the run; None as long as there is nothing to follow."""
         if self.stage is not Stage.READY:
             return None
@@ -118,7 +118,7 @@ class Pursuit:
         self._controller.reset()
         return command
 
-    def answer(self, stamp_ns: int, measured: Measured) -> Command | None:
+    def answer(self, stamp_ns: int, measured: Measurement) -> Command | None:
         """Answer a sample of the run; None where there is nothing to answer.
 
         The end of the scene's motion is answered with zero torque: then the work is done.
@@ -153,13 +153,13 @@ class Pursuit:
         self._last, self._last_ns = command, stamp_ns
         return command
 
-    def judged(self) -> Tracking | None:
+    def judged(self) -> TrackingMetrics | None:
         """Tell how well the motion has been followed; None before two samples of it."""
         if len(self._rows) < 2 * _COLUMNS:
             return None
         rows = np.array(self._rows).reshape(-1, _COLUMNS)
         time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
-        return judge(Track(time[:, 0], *columns), self.limited)
+        return evaluate(TrackingRecord(time[:, 0], *columns), self.limited)
 
     @property
     def rms(self) -> float:
@@ -167,20 +167,20 @@ class Pursuit:
         count = len(self._rows) // _COLUMNS
         return math.sqrt(self._square / (3 * count)) if count else 0.0
 
-    def _prepare(self, motion: PlannedMotion) -> None:
+    def _prepare(self, motion: ReferenceMotion) -> None:
         period_s = self._period_ns / NANOSECONDS
         self._controller = Controller(self._model, motion, self._settings, period_s)
         self._begin(motion, None)
         self.stage = Stage.READY
 
-    def _begin(self, motion: PlannedMotion, start_ns: int | None) -> None:
+    def _begin(self, motion: ReferenceMotion, start_ns: int | None) -> None:
         """Follow a motion from an instant on; None for the next sample."""
         self._motion, self._start_ns = motion, start_ns
         self._rows = array("d")
         self._square = self.largest = 0.0
         self.limited = 0
 
-    def _note(self, time: float, measured: Measured, command: Command) -> None:
+    def _note(self, time: float, measured: Measurement, command: Command) -> None:
         desired = command.desired
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
         self._square += dot(error, error)
@@ -198,7 +198,7 @@ class Pursuit:
             )
         )
 
-    def _standing(self, seen: Measured | None) -> Desired:
+    def _standing(self, seen: Measurement | None) -> Reference:
         """Be at rest at what was measured."""
         if seen is None:
             allowed = "must come first: they say where a trajectory begins"
@@ -208,11 +208,13 @@ class Pursuit:
         assembly = kinematics.admissible(self._geometry, seen.gamma, meant)
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
         try:
-            return Coordinates(self._geometry).of_actuators((x, y, z, w), seen.gamma, ZERO, ZERO)
+            return ActuatorSpaceMap(self._geometry).of_actuators(
+                (x, y, z, w), seen.gamma, ZERO, ZERO
+            )
         except ArithmeticError:
             raise SingularConfiguration("the manipulator is singular, det J2", 0.0) from None
 
-    def _refuse_elsewhere(self, measured: Measured) -> None:
+    def _refuse_elsewhere(self, measured: Measurement) -> None:
         begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
         off = axpy(1.0, begin, -1.0, measured.gamma)
         if not max(map(abs, off)) <= tolerance:
@@ -221,7 +223,7 @@ class Pursuit:
             raise InputError("joint_states", [Problem("position", measured.gamma, allowed)])
 
 
-def _samples(bag: str) -> Samples:
+def _samples(bag: str) -> MotionSamples:
     """Read a recorded motion; only who has one needs what reads bags."""
     from sst_ros.recording.recorded_motion import samples
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control.reference import Desired, Motion
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS
 from sst_ros.studies.control_loop import Loop, follow
@@ -38,16 +38,15 @@ class Limit:
     simulated: float
 
 
-class Rest:
+class Rest(ReferenceMotion):
     """A motion that stays where another one begins."""
 
-    def __init__(self, motion: Motion, duration: float) -> None:
-        self.duration = duration
+    def __init__(self, motion: ReferenceMotion, duration: float) -> None:
+        super().__init__(duration, (0.0, duration))
         start, zero = motion.at(0.0), (0.0, 0.0, 0.0)
-        self._pose = Desired(start.quaternion, zero, zero, start.gamma, zero, zero)
+        self._pose = Reference(start.quaternion, zero, zero, start.gamma, zero, zero)
 
-    def at(self, time: float) -> Desired:
-        """Return the pose."""
+    def _inside(self, time: float) -> Reference:
         return self._pose
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller import Controller, ControlStopped, Measured
-from sst_ros.control.controller_settings import ControlSettings
-from sst_ros.control.reference import Motion
-from sst_ros.control.tracking import Track
+from sst_ros.control.controller import Controller, ControlStopped, Measurement
+from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
@@ -43,8 +43,8 @@ class Loop:
 
     plant: Scene
     model: Scene
-    motion: Motion
-    settings: ControlSettings
+    motion: ReferenceMotion
+    settings: ControllerSettings
     period_ns: int
     channel: Channel = field(default_factory=Channel)
     seed: int = 0
@@ -53,7 +53,7 @@ class Loop:
     lost: float = math.inf
 
 
-def follow(loop: Loop) -> tuple[Track, NDArray[np.bool_], str]:
+def follow(loop: Loop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
     """Run a loop to its end.
 
     Returns:
@@ -75,7 +75,7 @@ def follow(loop: Loop) -> tuple[Track, NDArray[np.bool_], str]:
             if k > 0:
                 simulation.step(torque, loop.period_ns)
             joints = simulation.state.joints
-            measured = Measured(*wire.measured(joints.gamma, joints.gamma_dot))
+            measured = Measurement(*wire.measured(joints.gamma, joints.gamma_dot))
             command = controller.command(time, measured)
             torque = wire.acting(command.torque)
             wanted = command.desired
@@ -91,13 +91,13 @@ def follow(loop: Loop) -> tuple[Track, NDArray[np.bool_], str]:
             break
     columns = np.split(np.array(rows).reshape(len(rows), -1), np.cumsum(WIDTHS)[:-1], axis=1)
     time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = columns
-    track = Track(
+    track = TrackingRecord(
         time_s[:, 0], gamma, gamma_dot, gamma - at, gamma_dot - rate, feedforward, feedback, torques
     )
     return track, np.array(limited, dtype=bool), failure
 
 
-def started(plant: Scene, motion: Motion, offset: float = 0.0) -> Scene:
+def started(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scene:
     """Return the plant at the start of a motion, its gamma off by `offset` [rad]."""
     start = motion.at(0.0)
     a, b, c = (angle + offset for angle in start.gamma)

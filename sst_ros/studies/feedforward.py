@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller_settings import INSTANTS, MODES, ControlSettings
-from sst_ros.control.reference_motions import motion_of
-from sst_ros.control.rest_to_rest import PlannedMotion
-from sst_ros.control.tracking import Tracking, judge
+from sst_ros.control.controller_settings import INSTANTS, MODES, ControllerSettings
+from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.tracking import TrackingMetrics, evaluate
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.studies.bandwidth import Limit, ideal, limit
@@ -94,7 +94,7 @@ class Outcome:
     error: str
     mode: str
     bandwidth: float | None
-    tracking: Tracking | None
+    tracking: TrackingMetrics | None
     failure: str
 
     @property
@@ -155,7 +155,7 @@ def study(plan: Plan, *, workers: int | None = None, shown: bool = False) -> Stu
     scene, motion = plan.scene, _motion(plan.scene)
     errors = [error for error in plan.errors if error.name == "nominal" or error.changes(scene)]
     left_out = tuple(error.name for error in plan.errors if error not in errors)
-    basic = ControlSettings(damping_ratio=plan.damping_ratio)
+    basic = ControllerSettings(damping_ratio=plan.damping_ratio)
     plants = (ideal(scene), scene)
     # What takes longest comes first, so that no core waits for another at the end.
     limits = [
@@ -178,7 +178,7 @@ def study(plan: Plan, *, workers: int | None = None, shown: bool = False) -> Stu
 
 
 def _loops(
-    plan: Plan, basic: ControlSettings, errors: Sequence[ModelError]
+    plan: Plan, basic: ControllerSettings, errors: Sequence[ModelError]
 ) -> Iterator[Callable[[], Outcome]]:
     for error in errors:
         model = error.model(plan.scene)
@@ -198,7 +198,7 @@ def _outcome(
     bandwidth: float | None,
     plant: Scene,
     model: Scene,
-    settings: ControlSettings,
+    settings: ControllerSettings,
     period_ns: int,
     channel: Channel,
     seed: int,
@@ -206,7 +206,7 @@ def _outcome(
     motion = _motion(plant)
     loop = Loop(plant, model, motion, settings, period_ns, channel, seed, rest_s=REST_S)
     track, limited, failure = follow(loop)
-    found = None if failure else judge(track, int(limited.sum()))
+    found = None if failure else evaluate(track, int(limited.sum()))
     if found is not None and settings.mode != OPEN_LOOP:
         late = track.time >= motion.duration + 0.5 * REST_S
         failure = _restless(track.error[late], limited[late], found.band)
@@ -222,11 +222,11 @@ def _restless(error: Array, limited: NDArray[np.bool_], band: float) -> str:
     return f"{RESTLESS}: swings by {swing:.1g} rad{told}"
 
 
-def _limit(plant: Scene, settings: ControlSettings, period_ns: int, delay: int) -> Limit:
+def _limit(plant: Scene, settings: ControllerSettings, period_ns: int, delay: int) -> Limit:
     return limit(Loop(plant, plant, _motion(plant), settings, period_ns, Channel(delay=delay)))
 
 
-def _held(plant: Scene, settings: ControlSettings, period_ns: int) -> Hold:
+def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> Hold:
     return held(Loop(plant, plant, _motion(plant), settings, period_ns))
 
 
@@ -235,10 +235,10 @@ def _exact(plant: Scene) -> Exact:
 
 
 @lru_cache(maxsize=4)
-def _motion(scene: Scene) -> PlannedMotion:
+def _motion(scene: Scene) -> ReferenceMotion:
     from sst_ros.recording.recorded_motion import samples
 
-    return motion_of(scene, samples)
+    return reference_motion(scene, samples)
 
 
 def _asked(question: Callable[[], Any]) -> Any:

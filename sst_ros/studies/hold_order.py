@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import Motion, Triple
+from sst_ros.control.reference import ReferenceMotion, Triple
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Simulation
 from sst_ros.studies.control_loop import Loop, follow, started
@@ -58,7 +58,7 @@ def held(loop: Loop) -> Hold:
     return Hold(settings.feedforward_at, loop.period_ns / NANOSECONDS, error)
 
 
-def exact(scene: Scene, motion: Motion) -> Exact:
+def exact(scene: Scene, motion: ReferenceMotion) -> Exact:
     """Give a scene the torques of a motion as a function of time."""
     inverse = InverseDynamics(scene)
 

@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sst_ros import scene
-from sst_ros.control.actuator_space import Coordinates
-from sst_ros.control.controller import MODES, Controller, ControlStopped, Measured
-from sst_ros.control.controller_settings import ControlSettings
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.controller import MODES, Controller, ControlStopped, Measurement
+from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.control.orientation_observer import OrientationObserver
-from sst_ros.control.star_motions import Turn
+from sst_ros.control.star_motions import GeodesicMotion
 from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -42,7 +42,7 @@ def turned(model, vector, duration=0.4):
     geometry = Geometry.of(model)
     start = kinematics.admissible(geometry, model.initial.gamma).rotation
     end = quaternion_of(start @ Rotation.from_rotvec(vector).as_matrix())
-    return Turn(geometry, tuple(quaternion_of(start)), tuple(end), duration)
+    return GeodesicMotion(geometry, tuple(quaternion_of(start)), tuple(end), duration)
 
 
 def desired_near(sample, seed):
@@ -51,15 +51,15 @@ def desired_near(sample, seed):
     turn = Rotation.from_rotvec(0.1 * rng.standard_normal(3))
     q = tuple((Rotation.from_matrix(sample.rotation) * turn).as_quat().tolist())
     rate, acceleration = (tuple(rng.standard_normal(3).tolist()) for _ in range(2))
-    return Coordinates(sample.geometry).of_star(q, rate, acceleration)
+    return ActuatorSpaceMap(sample.geometry).of_star(q, rate, acceleration)
 
 
 def seen(sample):
-    return Measured(tuple(sample.gamma.tolist()), tuple(sample.gamma_dot.tolist()))
+    return Measurement(tuple(sample.gamma.tolist()), tuple(sample.gamma_dot.tolist()))
 
 
 def controller(sample, desired, **given):
-    return Controller(sample.scene, Standing(desired), ControlSettings(**given), PERIOD)
+    return Controller(sample.scene, Standing(desired), ControllerSettings(**given), PERIOD)
 
 
 def papers_torque(sample, desired):
@@ -128,14 +128,14 @@ def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says():
         here = sample.rotation
         there = here @ Rotation.from_rotvec(phi * axis).as_matrix()
         rate, acceleration = 0.7, -1.3
-        desired = Coordinates(sample.geometry).of_star(
+        desired = ActuatorSpaceMap(sample.geometry).of_star(
             tuple(quaternion_of(there).tolist()), tuple(rate * axis), tuple(acceleration * axis)
         )
         body_rate = (rate - dot) * axis
         motion = rates.of_star(sample.geometry, here, here @ body_rate)
         told = controller(
             sample, desired, mode="computed_torque", space="so3", bandwidth=w
-        ).command(0.0, Measured(tuple(sample.gamma), tuple(motion.gamma_dot)))
+        ).command(0.0, Measurement(tuple(sample.gamma), tuple(motion.gamma_dot)))
         gamma_ddot = virtual_work.direct_dynamics(
             sample.mechanism, sample.posture, motion.gamma_dot, told.torque
         )
@@ -151,11 +151,11 @@ def test_gravity_pd_holds_the_weight_where_the_manipulator_is():
     model = dataclasses.replace(model, initial=still, actuators=None)
     simulation = Simulation(model)
     gamma = simulation.state.joints.gamma
-    coordinates = Coordinates(Geometry.of(model))
+    coordinates = ActuatorSpaceMap(Geometry.of(model))
     begin = coordinates.of_actuators(simulation.state.quaternion, gamma, ZERO, ZERO)
-    settings = ControlSettings(mode="gravity_pd")
+    settings = ControllerSettings(mode="gravity_pd")
     holding = Controller(model, Standing(begin), settings, PERIOD)
-    told = holding.command(0.0, Measured(gamma, ZERO))
+    told = holding.command(0.0, Measurement(gamma, ZERO))
     assert told.feedback == ZERO
     for _ in range(20):
         state = simulation.step(told.torque, 10_000_000)
@@ -168,7 +168,7 @@ def loop(model, plant, motion, settings, seconds, period=PERIOD):
     errors = []
     for k in range(round(seconds / period) + 1):
         joints = simulation.state.joints
-        told = acting.command(k * period, Measured(joints.gamma, joints.gamma_dot))
+        told = acting.command(k * period, Measurement(joints.gamma, joints.gamma_dot))
         errors.append(np.abs(np.subtract(told.desired.gamma, joints.gamma)).max())
         simulation.step(told.torque, round(period * 1e9))
     return max(errors), errors[-1]
@@ -179,7 +179,7 @@ def test_what_a_hold_costs_the_feedforward_is_of_its_order(instant, order):
     model = scene.load("example2")
     motion = turned(model, (0.3, -0.2, 0.4))
     periods = np.array([0.008, 0.004, 0.002])
-    settings = ControlSettings(feedforward_at=instant)
+    settings = ControllerSettings(feedforward_at=instant)
     errors = [loop(model, model, motion, settings, 0.4, h)[0] for h in periods]
     slope = np.polyfit(np.log(periods), np.log(errors), 1)[0]
     assert abs(slope - order) < 0.1
@@ -191,7 +191,7 @@ def test_computed_torque_brings_the_manipulator_to_the_motion(space):
     off = dataclasses.replace(
         model, initial=Initial(gamma=tuple(np.add(model.initial.gamma, (0.2, -0.15, 0.1))))
     )
-    settings = ControlSettings(mode="computed_torque", space=space, feedforward_at="middle")
+    settings = ControllerSettings(mode="computed_torque", space=space, feedforward_at="middle")
     largest, last = loop(model, off, turned(model, (0.1, 0.1, -0.2)), settings, 0.6)
     assert largest == pytest.approx(0.2, abs=0.02)  # no overshoot: critically damped
     assert last < 1e-5
@@ -203,7 +203,7 @@ def test_the_integral_takes_out_what_the_model_does_not_know():
     motion = turned(model, (0.1, 0.1, -0.2), duration=0.2)
     for mode in ("feedforward_pd", "computed_torque"):
         without, with_it = (
-            loop(model, pushed, motion, ControlSettings(mode=mode, integral_rate=r), 1.2)[1]
+            loop(model, pushed, motion, ControllerSettings(mode=mode, integral_rate=r), 1.2)[1]
             for r in (0.0, 12.0)
         )
         assert without > 1e-4
@@ -219,7 +219,7 @@ def test_an_integral_that_would_be_unstable_is_refused(mode):
         r = share * 2.0 * zeta * w
         roots = np.roots([1.0, 2.0 * zeta * w, w * w, w * w * r])
         assert (roots.real.max() < 0.0) == sound
-        settings = ControlSettings(mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r)
+        settings = ControllerSettings(mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r)
         if sound:
             Controller(model, motion, settings, PERIOD)
         else:
@@ -236,12 +236,12 @@ def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
     away = tuple(angle - 0.1 for angle in begin.gamma)
     left = []
     for limit in (1.0, 0.0):
-        settings = ControlSettings(mode=mode, integral_rate=10.0, torque_limit=limit)
+        settings = ControllerSettings(mode=mode, integral_rate=10.0, torque_limit=limit)
         acting = Controller(model, Standing(begin), settings, PERIOD)
         for _ in range(500):
-            told = acting.command(0.0, Measured(away, ZERO))
+            told = acting.command(0.0, Measurement(away, ZERO))
         assert told.saturated == (limit > 0.0)
-        left.append(acting.command(0.0, Measured(begin.gamma, ZERO)))
+        left.append(acting.command(0.0, Measurement(begin.gamma, ZERO)))
     limited, unlimited = left
     assert np.abs(limited.torque).max() < 1e-12
     assert np.abs(unlimited.torque).max() > 1.0
@@ -250,9 +250,9 @@ def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
 def test_the_limit_of_the_models_actuators_holds_too():
     model = dataclasses.replace(scene.load("example2"), actuators=Actuators(torque_limit=0.5))
     motion = turned(model, (0.1, 0.0, 0.0))
-    away = Measured(tuple(angle - 0.2 for angle in model.initial.gamma), ZERO)
+    away = Measurement(tuple(angle - 0.2 for angle in model.initial.gamma), ZERO)
     for limit, expected in ((0.0, 0.5), (0.2, 0.2), (0.9, 0.5)):
-        settings = ControlSettings(mode="pd", torque_limit=limit)
+        settings = ControllerSettings(mode="pd", torque_limit=limit)
         told = Controller(model, motion, settings, PERIOD).command(0.0, away)
         assert told.torque == (expected,) * 3 and told.saturated
         assert min(told.feedback) > 0.5  # what was asked for is told
@@ -261,10 +261,12 @@ def test_the_limit_of_the_models_actuators_holds_too():
 @pytest.mark.parametrize("mode", MODES)
 def test_what_is_not_finite_is_refused_until_a_reset(mode):
     model = scene.load("example2")
-    acting = Controller(model, turned(model, (0.1, 0.0, 0.0)), ControlSettings(mode=mode), PERIOD)
+    acting = Controller(
+        model, turned(model, (0.1, 0.0, 0.0)), ControllerSettings(mode=mode), PERIOD
+    )
     gamma = model.initial.gamma
-    good = Measured(gamma, ZERO)
-    for bad in (Measured((np.nan, *gamma[1:]), ZERO), Measured(gamma, (0.0, np.inf, 0.0))):
+    good = Measurement(gamma, ZERO)
+    for bad in (Measurement((np.nan, *gamma[1:]), ZERO), Measurement(gamma, (0.0, np.inf, 0.0))):
         acting.command(0.0, good)
         with pytest.raises(ControlStopped, match="must be finite"):
             acting.command(0.002, bad)
@@ -284,7 +286,7 @@ def test_angles_that_no_assembly_has_end_the_control(mode):
         acting = controller(sample, desired_near(sample, seed), mode=mode)
         acting.command(0.0, seen(sample))
         with pytest.raises(ControlStopped, match="parallel singularity"):
-            acting.command(PERIOD, Measured(nowhere, ZERO))
+            acting.command(PERIOD, Measurement(nowhere, ZERO))
         ended += 1
     assert ended >= 2
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.reference_motions import Samples, motion_of, recorded, waypoints
+from sst_ros.control.reference_motions import MotionSamples, recorded, reference_motion, waypoints
 from sst_ros.control.star_motions import product
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
@@ -78,7 +78,7 @@ def within(motion, count=9):
 @every_kind
 def test_rates_and_accelerations_are_derivatives(kind):
     """The polynomial errs by some 1e-16 of the values over h, times its 14 terms."""
-    motion = motion_of(scene_of(kind))
+    motion = reference_motion(scene_of(kind))
     for time in within(motion):
         at, h = motion.at(time), 0.02
         x, y, z, w = at.quaternion
@@ -98,7 +98,7 @@ def test_rates_and_accelerations_are_derivatives(kind):
 
 @every_kind
 def test_star_and_actuators_move_as_the_paper_has_it(kind):
-    motion, geometry = motion_of(scene_of(kind)), Geometry.of(scene_of(kind))
+    motion, geometry = reference_motion(scene_of(kind)), Geometry.of(scene_of(kind))
     for time in np.linspace(0.0, motion.duration, 23).tolist():
         at = motion.at(time)
         rotation = rotation_matrix(at.quaternion)
@@ -115,7 +115,7 @@ def test_star_and_actuators_move_as_the_paper_has_it(kind):
 @every_kind
 def test_a_motion_rests_before_and_after_and_has_no_jumps(kind):
     """In steps of 1e-7 s nothing moves by more than its own derivative and rounding allow."""
-    motion, step = motion_of(scene_of(kind)), 1e-7
+    motion, step = reference_motion(scene_of(kind)), 1e-7
     for time, outside in ((0.0, -1.0), (motion.duration, motion.duration + 1.0)):
         end, beyond = motion.at(time), motion.at(outside)
         assert beyond.quaternion == end.quaternion and beyond.gamma == end.gamma
@@ -130,7 +130,7 @@ def test_a_motion_rests_before_and_after_and_has_no_jumps(kind):
 
 @every_kind
 def test_what_is_asked_before_does_not_matter(kind):
-    motion, rng = motion_of(scene_of(kind)), np.random.default_rng(0)
+    motion, rng = reference_motion(scene_of(kind)), np.random.default_rng(0)
     times = np.linspace(-0.1, motion.duration + 0.1, 40)
     first = {time: motion.at(time) for time in times.tolist()}
     for time in rng.permutation(times).tolist():
@@ -139,7 +139,7 @@ def test_what_is_asked_before_does_not_matter(kind):
 
 def test_a_turn_goes_straight_along_the_shorter_way():
     scene = scene_of("to_orientation")
-    motion, start = motion_of(scene), initial_state(scene, Geometry.of(scene))[:4]
+    motion, start = reference_motion(scene), initial_state(scene, Geometry.of(scene))[:4]
     begin, end = (Rotation.from_quat(q) for q in (start, KINDS["to_orientation"].orientation))
     whole = (begin.inv() * end).as_rotvec()
     assert motion.at(motion.duration).quaternion == pytest.approx(
@@ -153,7 +153,7 @@ def test_a_turn_goes_straight_along_the_shorter_way():
 
 def test_a_spiral_is_what_its_angles_say():
     scene, spiral = scene_of("spiral"), KINDS["spiral"]
-    motion = motion_of(scene)
+    motion = reference_motion(scene)
     begin = Rotation.from_quat(initial_state(scene, Geometry.of(scene))[:4])
     for share in (0.1, 0.5, 1.0):
         s = 10.0 * share**3 - 15.0 * share**4 + 6.0 * share**5
@@ -166,7 +166,7 @@ def test_a_spiral_is_what_its_angles_say():
 
 
 def test_a_sweep_is_a_chirp_once_it_has_grown():
-    motion, time = motion_of(scene_of("sweep")), 1.1
+    motion, time = reference_motion(scene_of("sweep")), 1.1
     for k in range(3):
         rise = (SWEEP.last_frequency[k] - SWEEP.frequency[k]) / SWEEP.duration
         angle = SWEEP.frequency[k] * time + 0.5 * rise * time**2
@@ -177,7 +177,7 @@ def test_a_sweep_is_a_chirp_once_it_has_grown():
 
 def test_a_sweep_about_another_centre_begins_there():
     centre = (0.8, 0.8, 0.8)
-    motion = motion_of(scene_of("sweep", motion=replace(SWEEP, centre=centre)))
+    motion = reference_motion(scene_of("sweep", motion=replace(SWEEP, centre=centre)))
     geometry = Geometry.of(load("general"))
     assert motion.at(0.0).gamma == centre
     expected = kinematics.admissible(geometry, centre).rotation
@@ -185,7 +185,7 @@ def test_a_sweep_about_another_centre_begins_there():
 
 
 def test_points_are_passed_at_their_times():
-    motion = motion_of(scene_of("waypoints"))
+    motion = reference_motion(scene_of("waypoints"))
     assert motion.duration == POINTS[-1][0]
     for time, gamma in ((0.0, START), *POINTS):
         assert motion.at(time).gamma == pytest.approx(gamma, abs=1e-14)
@@ -194,7 +194,7 @@ def test_points_are_passed_at_their_times():
 def test_points_with_rates_and_accelerations_are_passed_with_them():
     points = [Waypoint(time=0.5, gamma=(0.8, 0.8, 0.7), gamma_dot=(0.3, 0.1, -0.2))]
     points += [Waypoint(time=1.0, gamma=(0.9, 0.8, 0.6), gamma_ddot=(0.4, -0.3, 0.0))]
-    motion = motion_of(scene_of("waypoints", motion=tuple(points)))
+    motion = reference_motion(scene_of("waypoints", motion=tuple(points)))
     assert motion.at(0.5).gamma_dot == pytest.approx((0.3, 0.1, -0.2), abs=1e-14)
     # The coefficients of a quintic are some ten times its values, and more for accelerations.
     assert motion.at(1.0).gamma_ddot == pytest.approx((0.4, -0.3, 0.0), abs=1e-12)
@@ -245,7 +245,7 @@ def test_a_recorded_motion_is_what_was_recorded():
     simulation, period = Simulation(scene, tolerance=1e-13), 2_000_000
     torque = (0.5, -0.4, 0.3)
     states = [simulation.state, *(simulation.step(torque, period) for _ in range(100))]
-    samples = Samples(
+    samples = MotionSamples(
         np.array([state.time_ns * 1e-9 for state in states]),
         np.array([state.joints.gamma for state in states]),
         np.array([state.joints.gamma_dot for state in states]),
@@ -273,9 +273,9 @@ def test_a_recorded_motion_is_what_was_recorded():
 
 def test_a_scene_without_motion_and_a_bag_without_reader_are_refused():
     with pytest.raises(InputError, match="no desired motion"):
-        motion_of(load("example1"))
+        reference_motion(load("example1"))
     with pytest.raises(InputError, match="cannot be read here"):
-        motion_of(scene_of("recorded", motion=Recorded(bag="somewhere")))
+        reference_motion(scene_of("recorded", motion=Recorded(bag="somewhere")))
 
 
 GOOD = [[0.8, 0.8, 0.8], [0.7, 0.7, 0.7]]

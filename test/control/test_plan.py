@@ -18,11 +18,11 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from sst_ros import __main__ as cli
-from sst_ros.control.peaks import largest, least
+from sst_ros.control.peaks import maximum, minimum
 from sst_ros.control.plan import check, examine
-from sst_ros.control.reference_motions import motion_of
-from sst_ros.control.star_motions import Turn
-from sst_ros.control.time_scaling import speed
+from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.star_motions import GeodesicMotion
+from sst_ros.control.time_scaling import time_scaling
 from sst_ros.control.torque_profiles import table
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, workspace
@@ -56,7 +56,7 @@ def with_motion(scene, motion, **more):
 
 
 def planned(scene):
-    return examine(motion_of(scene), scene)
+    return examine(reference_motion(scene), scene)
 
 
 def swing(duration=TIME, **more):
@@ -122,32 +122,34 @@ def test_extremes_between_samples_are_found(phase, frequency, count):
     values = np.array([function(time) for time in times.tolist()])
     truth = np.array([function(time) for time in fine.tolist()])
     # A parabola through the best of the fine samples is lower than the truth by 1e-6 at most.
-    assert largest(function, times, values).value == pytest.approx(truth.max(), abs=2e-6)
-    assert least(function, times, values).value == pytest.approx(truth.min(), abs=2e-6)
-    assert largest(function, times, values).value >= truth.max() - 1e-12
+    assert maximum(function, times, values).value == pytest.approx(truth.max(), abs=2e-6)
+    assert minimum(function, times, values).value == pytest.approx(truth.min(), abs=2e-6)
+    assert maximum(function, times, values).value >= truth.max() - 1e-12
 
 
 def test_the_speed_of_pure_inertia_is_the_root_of_the_torques_ratio():
     limit = 2.0
     plan = planned(swing(actuators=Actuators(torque_limit=limit)))
     value, _ = summit(lambda time: swing_torque(time)[0])
-    found = speed(plan)
+    found = time_scaling(plan)
     assert found.highest == pytest.approx(math.sqrt(limit / abs(value)), rel=1e-12)
     assert (found.lowest, found.binding) == (0.0, "torque")
 
 
 def test_the_speed_under_limits_of_rate_and_acceleration_is_a_quotient_and_a_root():
     velocity, acceleration = 15.0 / 8.0 * WAY / TIME, 10.0 / math.sqrt(3.0) * WAY / TIME**2
-    found = speed(planned(swing(actuators=Actuators(velocity_limit=3.0))))
+    found = time_scaling(planned(swing(actuators=Actuators(velocity_limit=3.0))))
     assert found.highest == pytest.approx(3.0 / velocity, rel=1e-12)
     assert found.binding == "velocity"
-    found = speed(planned(swing(actuators=Actuators(velocity_limit=3.0, acceleration_limit=9.0))))
+    found = time_scaling(
+        planned(swing(actuators=Actuators(velocity_limit=3.0, acceleration_limit=9.0)))
+    )
     assert found.highest == pytest.approx(math.sqrt(9.0 / acceleration), rel=1e-12)
     assert found.binding == "acceleration"
 
 
 def test_without_limits_any_speed_will_do():
-    found = speed(planned(swing()))
+    found = time_scaling(planned(swing()))
     assert found.highest == math.inf and found.binding == ""
 
 
@@ -167,7 +169,7 @@ def rubbing(duration, limit):
 def test_the_highest_speed_is_where_the_check_turns():
     """The motion itself is squeezed in time here, not the torques of the planned one."""
     limit = 9.0
-    found = speed(planned(rubbing(1.0, limit)))
+    found = time_scaling(planned(rubbing(1.0, limit)))
     assert found.lowest == 0.0 and 1.5 < found.highest < 10.0
     for factor, fits in ((1.0 - 1e-9, True), (1.0 + 1e-9, False)):
         scene = rubbing(1.0 / (factor * found.highest), limit)
@@ -177,7 +179,7 @@ def test_the_highest_speed_is_where_the_check_turns():
 def test_a_weight_beyond_the_limit_is_infeasible_at_any_speed():
     plan = planned(rubbing(1.0, 0.5))
     assert {problem.key for problem in plan.problems} <= {f"torque_{leg}" for leg in (1, 2, 3)}
-    assert plan.problems and speed(plan).highest is None
+    assert plan.problems and time_scaling(plan).highest is None
 
 
 def resonant(factor=1.0):
@@ -191,7 +193,7 @@ def resonant(factor=1.0):
 
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
     """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points; 1.2 are there."""
-    found = speed(planned(resonant()))
+    found = time_scaling(planned(resonant()))
     assert found.highest is not None and 0.3 < found.lowest < 1.0 < found.highest
     for end, inside in ((found.lowest, 1.0 + 1e-6), (found.highest, 1.0 - 1e-6)):
         assert not planned(resonant(end * inside)).problems
@@ -203,11 +205,11 @@ def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
     free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
     scene = with_motion(EXAMPLE1, away, workspace=free["workspace"])
     with pytest.raises(MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"):
-        check(motion_of(scene), scene)
+        check(reference_motion(scene), scene)
     elastic = replace(scene, stroke=Stroke(at_end="elastic", stiffness=1e3))
     assert planned(elastic).problems
     ignoring = replace(scene, stroke=free["stroke"])
-    assert not check(motion_of(ignoring), ignoring).problems
+    assert not check(reference_motion(ignoring), ignoring).problems
 
 
 def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
@@ -223,17 +225,17 @@ def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
     for distance in plan.distances:
         if distance.key.startswith("beta"):
             mine = distance.sign * (beta[:, int(distance.key[-1]) - 1] - distance.end)
-            assert distance.least == pytest.approx(mine.min(), abs=1e-6)
-            assert distance.least <= mine.min() + 1e-12
+            assert distance.margin == pytest.approx(mine.min(), abs=1e-6)
+            assert distance.margin <= mine.min() + 1e-12
 
 
 def test_limits_are_held_between_samples_and_told_with_the_instant():
     limit = abs(summit(lambda time: swing_torque(time)[0])[0])
     fits = swing(actuators=Actuators(torque_limit=limit * (1.0 + 1e-12)))
-    assert not check(motion_of(fits), fits).problems
+    assert not check(reference_motion(fits), fits).problems
     tight = swing(actuators=Actuators(torque_limit=limit * (1.0 - 1e-9)))
     with pytest.raises(MotionRefused) as told:
-        check(motion_of(tight), tight)
+        check(reference_motion(tight), tight)
     assert [problem.key for problem in told.value.problems] == ["torque_1", "torque_2", "torque_3"]
     rates = Actuators(velocity_limit=1.1, acceleration_limit=6.9)
     keys = {problem.key.partition("_")[0] for problem in planned(swing(actuators=rates)).problems}
@@ -256,7 +258,7 @@ def test_a_turn_through_a_parallel_singularity_is_refused():
     with pytest.raises(
         SingularConfiguration, match=r"parallel singularity at t = 0\.\d+ s"
     ) as told:
-        check(Turn(geometry, first, last, 1.0), scene)
+        check(GeodesicMotion(geometry, first, last, 1.0), scene)
     assert abs(told.value.measure) < 1e-9
 
 
@@ -269,16 +271,16 @@ def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
         for off in (-0.2, 0.2)
     )
     with pytest.raises(SingularConfiguration, match="serial singularity"):
-        check(Turn(geometry, first, last, 1.0), scene)
+        check(GeodesicMotion(geometry, first, last, 1.0), scene)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_motions_are_feasible_and_end_where_they_should(name):
     scene = load(name)
-    plan = check(motion_of(scene), scene)
+    plan = check(reference_motion(scene), scene)
     assert scene.duration == plan.motion.duration
-    assert speed(plan).highest > 1.0
-    assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
+    assert time_scaling(plan).highest > 1.0
+    assert min(distance.margin for distance in plan.distances if distance.sign > 0.0) > 0.1
 
 
 def test_the_command_tells_verdict_and_status(capsys, tmp_path):
@@ -302,7 +304,7 @@ def test_json_says_what_the_table_says(capsys):
     told = json.loads(capsys.readouterr().out)
     plan = planned(load("point_to_point"))
     assert told["feasible"] is True and told["problems"] == []
-    assert told["highest_speed"] == speed(plan).highest
+    assert told["highest_speed"] == time_scaling(plan).highest
     for found, demand in zip(told["actuators"], plan.demands, strict=True):
         assert found["torque"] == {"value": demand.torque.value, "time": demand.torque.time}
         assert found["torque_rms"] == demand.torque_rms
@@ -312,7 +314,7 @@ def test_json_says_what_the_table_says(capsys):
 def test_written_torques_do_the_motion(tmp_path):
     """Held torques of the middles err with the square of the period: 16 times less at a quarter."""
     scene, errors = load("point_to_point"), []
-    goal = motion_of(scene).at(1.0).gamma
+    goal = reference_motion(scene).at(1.0).gamma
     for period_ns in (8_000_000, 2_000_000):
         path = tmp_path / f"{period_ns}.csv"
         assert cli.main(

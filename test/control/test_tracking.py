@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import BAND, Track, judge, table
+from sst_ros.control.tracking import BAND, TrackingRecord, evaluate, table
 
 TIME = np.linspace(0.0, 2.0, 2001)
 
@@ -16,11 +16,13 @@ def track(error, gamma=None, **given):
     columns |= {name: np.zeros_like(TIME) for name in ("error_rate", "feedforward", "feedback")}
     columns |= {"torque": given.get("feedforward", 0.0) + given.get("feedback", 0.0 * TIME)}
     columns |= given
-    return Track(TIME, **{name: np.outer(column, [1, 1, 1]) for name, column in columns.items()})
+    return TrackingRecord(
+        TIME, **{name: np.outer(column, [1, 1, 1]) for name, column in columns.items()}
+    )
 
 
 def test_errors_of_a_sine():
-    found = judge(track(0.3 * np.sin(2.0 * np.pi * TIME)))
+    found = evaluate(track(0.3 * np.sin(2.0 * np.pi * TIME)))
     assert found.rms == pytest.approx(0.3 / np.sqrt(2.0), rel=1e-3)
     assert found.largest == pytest.approx(0.3, rel=1e-5)
     assert found.last == pytest.approx(0.0, abs=1e-15)
@@ -28,7 +30,7 @@ def test_errors_of_a_sine():
 
 
 def test_error_against_run_time_only_grows_in_its_largest():
-    found = judge(track(TIME))
+    found = evaluate(track(TIME))
     time, rms, largest = found.history.T
     assert time[0] == 0.0 and time[-1] == 2.0
     assert largest == pytest.approx(time)
@@ -37,15 +39,15 @@ def test_error_against_run_time_only_grows_in_its_largest():
 
 def test_settling_time_of_a_decay_after_the_motion():
     error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
-    found = judge(track(error))
+    found = evaluate(track(error))
     assert found.band == pytest.approx(BAND)  # the way is 1 rad
     assert found.settling == pytest.approx(0.1 * np.log(0.5 / BAND), abs=2e-3)
 
 
 def test_settling_time_is_unknown_where_it_is_not_seen():
-    assert judge(track(np.full_like(TIME, 0.5))).settling is None  # never settles
-    assert judge(track(0.0 * TIME, gamma=TIME)).settling is None  # the motion never ends
-    assert judge(track(0.0 * TIME)).settling == 0.0
+    assert evaluate(track(np.full_like(TIME, 0.5))).settling is None  # never settles
+    assert evaluate(track(0.0 * TIME, gamma=TIME)).settling is None  # the motion never ends
+    assert evaluate(track(0.0 * TIME)).settling == 0.0
 
 
 def test_shares_are_those_of_the_torque_and_sum_to_one():
@@ -54,15 +56,15 @@ def test_shares_are_those_of_the_torque_and_sum_to_one():
     whole = track(
         0.0 * TIME, feedforward=np.append(feedforward, 0.0), feedback=np.append(feedback, 0.0)
     )
-    found = judge(whole)
+    found = evaluate(whole)
     assert found.feedforward == pytest.approx(0.9) and found.feedback == pytest.approx(0.1)
     assert found.torque_rms == pytest.approx(np.sqrt(5.0), rel=1e-3)
-    nothing = judge(track(0.0 * TIME))
+    nothing = evaluate(track(0.0 * TIME))
     assert np.isnan(nothing.feedforward).all()
 
 
 def test_the_table_says_what_it_knows():
-    lines = table(judge(track(0.0 * TIME, gamma=TIME), limited=7))
+    lines = table(evaluate(track(0.0 * TIME, gamma=TIME), limited=7))
     assert "nan" not in lines
     assert "7  (of 2001)" in lines
     assert lines.count("\n") == 10 + 2 + 11

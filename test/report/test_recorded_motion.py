@@ -10,7 +10,7 @@ import pytest
 
 from sst_ros import __main__ as cli
 from sst_ros.control.plan import examine
-from sst_ros.control.reference_motions import motion_of
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import InputError
 from sst_ros.recording.recorded_motion import samples
@@ -32,7 +32,7 @@ def following(bag):
 def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag):
     """Held for 1 ms they are a staircase; the smooth motion asks for what lies between."""
     recording, held = read(bag), following(bag)
-    plan = examine(motion_of(held, samples), held)
+    plan = examine(reference_motion(held, samples), held)
     assert plan.motion.duration == pytest.approx(recording.seconds[-1], abs=1e-12)
     for row in (0, 40, len(recording.gamma) - 1):
         at = plan.motion.at(recording.seconds[row])
@@ -57,10 +57,10 @@ def test_the_command_reads_the_bag(bag, tmp_path, capsys):
 
 def test_what_is_no_bag_is_refused(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
-        motion_of(following(tmp_path / "nowhere"), samples)
+        reference_motion(following(tmp_path / "nowhere"), samples)
 
 
 def test_the_bag_of_another_manipulator_is_refused(bag):
     other = dataclasses.replace(scene.load("general"), motion=following(bag).motion)
     with pytest.raises(Exception, match="does not close the loops"):
-        motion_of(other, samples)
+        reference_motion(other, samples)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sst_ros import scene
-from sst_ros.control.controller import ControlStopped, Measured
+from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.controller_node_settings import CompanionParameters
@@ -23,7 +23,7 @@ MODEL = dataclasses.replace(scene.load("example2"), motion=MOVE, torque=None)
 
 
 def seen(state):
-    return Measured(state.joints.gamma, state.joints.gamma_dot)
+    return Measurement(state.joints.gamma, state.joints.gamma_dot)
 
 
 def test_it_follows_holds_and_ends_with_zero_torque():
@@ -50,7 +50,7 @@ def test_it_follows_holds_and_ends_with_zero_torque():
 
 def test_samples_that_come_twice_or_late_are_told_apart():
     pursuit = Pursuit(MODEL, CompanionParameters())
-    here = Measured(MODEL.initial.gamma, (0.0, 0.0, 0.0))
+    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
         assert (pursuit.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
     assert (pursuit.samples, pursuit.irregular) == (3, 1)
@@ -58,7 +58,7 @@ def test_samples_that_come_twice_or_late_are_told_apart():
 
 def test_a_reset_of_the_simulator_begins_the_motion_anew():
     pursuit = Pursuit(MODEL, CompanionParameters(mode="pd", integral_rate=1.0))
-    here = Measured(tuple(np.add(MODEL.initial.gamma, 0.01)), (0.0, 0.0, 0.0))
+    here = Measurement(tuple(np.add(MODEL.initial.gamma, 0.01)), (0.0, 0.0, 0.0))
     told = [pursuit.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
     pursuit.anew()
     assert pursuit.stage is Stage.READY and pursuit.judged() is None
@@ -117,7 +117,7 @@ def test_it_begins_only_near_the_start_of_the_motion():
 
 def test_what_is_not_finite_is_nowhere_near():
     pursuit = Pursuit(MODEL, CompanionParameters())
-    here = Measured(MODEL.initial.gamma, (0.0, 0.0, 0.0))
+    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="where the motion begins"):
         pursuit.preview(dataclasses.replace(here, gamma=(np.nan,) * 3))
     pursuit.answer(START_NS, here)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.control.controller_settings import MODES, ControlSettings
-from sst_ros.control.reference_motions import motion_of
+from sst_ros.control.controller_settings import MODES, ControllerSettings
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.plot.feedforward import draw
 from sst_ros.scene.scene import load
@@ -38,8 +38,8 @@ def errors(*names):
 
 
 def held(scene, delay, damping=1.0):
-    settings = ControlSettings(mode="computed_torque", damping_ratio=damping)
-    return Loop(scene, scene, motion_of(scene), settings, PERIOD_NS, Channel(delay=delay))
+    settings = ControllerSettings(mode="computed_torque", damping_ratio=damping)
+    return Loop(scene, scene, reference_motion(scene), settings, PERIOD_NS, Channel(delay=delay))
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
         follow(
             dataclasses.replace(
                 held(ideal(SHORT), delay),
-                settings=ControlSettings(mode="computed_torque", bandwidth=share * bound),
+                settings=ControllerSettings(mode="computed_torque", bandwidth=share * bound),
                 lost=0.05,
             )
         )
@@ -179,8 +179,11 @@ def test_a_scene_without_a_motion_is_refused():
 
 
 def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
-    rest = bandwidth.Rest(motion_of(SHORT), 0.1)
-    assert rest.at(0.05) == rest.at(0.0) and rest.at(0.0).gamma == motion_of(SHORT).at(0.0).gamma
+    rest = bandwidth.Rest(reference_motion(SHORT), 0.1)
+    assert (
+        rest.at(0.05) == rest.at(0.0)
+        and rest.at(0.0).gamma == reference_motion(SHORT).at(0.0).gamma
+    )
 
 
 def command(*words):
