@@ -131,7 +131,7 @@ class RunLoop:
         if not self.begun and not self._course.begin():
             return Reply(False, "refused: there is no time yet on /clock")
         for _ in range(samples):
-            self._board.refresh()
+            self._course.refresh()
             try:
                 if not self._course.to_the_next_sample(paced=False):
                     return Reply(False, "not done: the node is shutting down")

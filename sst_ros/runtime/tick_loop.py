@@ -53,6 +53,7 @@ class Course:
         duration = settings.parameters.duration * settings.parameters.rate
         self._last_tick = math.ceil(duration - 1e-6) or math.inf
         self._tick = self._start_ns = self._stamp_ns = 0
+        self._awaited_since = time.monotonic()
 
     def start_anew(self, simulation: Simulation) -> None:
         """Take another simulation, or the same at its start; stamps go on."""
@@ -70,9 +71,14 @@ class Course:
         self._publish()
         return True
 
+    def refresh(self) -> None:
+        """Count the age of the command and the wait for an answer from now on."""
+        self._awaited_since = time.monotonic()
+        self._board.refresh()
+
     def resume(self) -> None:
         """Count time and deadlines from now on."""
-        self._board.refresh()
+        self.refresh()
         self.counters.resume()
         self._pacer.start()
 
@@ -136,21 +142,20 @@ class Course:
     def _answered(self, paced: bool) -> Triple | None:
         """Torques that answer the last sample; None if something else comes first."""
         timeout = self._settings.parameters.lockstep_timeout or math.inf
-        began = time.monotonic()
-        waited = 0.0
         while (answer := self._board.answer(self._stamp_ns)) is None:
             if self.stop.is_set() or (paced and self.asked.is_set()):
                 return None
+            waited = time.monotonic() - self._awaited_since
             if waited > timeout:
                 raise NoAnswer(
                     f"no command answered the sample of {self._stamp_ns} ns within {timeout:g} s"
                 )
             time.sleep(min(max(waited / 10, 2e-5), _POLL_S))
-            waited = time.monotonic() - began
         self._pacer.excuse(self._ticks_left())  # to wait for an answer is no overrun
         return answer
 
     def _publish(self) -> None:
         self._stamp_ns = self._start_ns + self._tick * self._period_ns
         self._audience.sample(self.simulation, self._stamp_ns)
+        self._awaited_since = time.monotonic()
         self.counters.published += 1

@@ -97,6 +97,28 @@ def test_without_an_answer_it_stops_with_a_fault(nodes, observer):
     assert status == 0 and "Traceback" not in err
 
 
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+@pytest.mark.parametrize("timeout", [1.5, 3.0])
+def test_the_timeout_counts_from_the_sample(nodes, observer, timeout, factor):
+    """Longer than the period of the diagnostics, which wake the run."""
+    states = observer.listen(JointState, "/joint_states")
+    nodes.run(
+        "simulator",
+        sync="lockstep",
+        lockstep_timeout=timeout,
+        real_time_factor=factor,
+        duration=0.0,
+    )
+    publisher = observer.publisher(JointState, f"{NODE}/commands_stamped")
+    observer.until(lambda: states, "preview")
+    begin = JointState(name=["gamma_1", "gamma_2", "gamma_3"], effort=[0.0] * 3)
+    begin.header.stamp = states[-1].header.stamp
+    publisher.publish(begin)
+    observer.told("phase", "running")
+    said = observer.told("phase", "fault", timeout + 3.0)
+    assert f"within {timeout:g} s" in said["fault"]
+
+
 @pytest.mark.slow
 def test_the_player_plays_in_lockstep(nodes, observer, tmp_path):
     table = tmp_path / "torque.csv"

@@ -15,7 +15,7 @@ from sst_ros.errors import RunStopped
 from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Phase
+from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ZERO, CommandBoard
 from sst_ros.simulation import Simulation
@@ -221,6 +221,35 @@ def test_lockstep_times_out_into_a_fault():
         bench.until(lambda: loop.phase is Phase.FAULT)
         assert "no command answered the sample of 1002000000 ns within 0.05 s" in loop.fault
         assert len(bench.audience.acted) == 2
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+def test_requests_do_not_put_off_the_timeout_in_lockstep(factor):
+    bench = Bench(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
+    with bench.running() as loop:
+        bench.stamped.append(answer(0))
+        bench.until(lambda: bench.audience.samples)
+        began = time.monotonic()
+
+        def asked():
+            loop.post(lambda: Reply(True, ""))  # as the diagnostics do once a second
+            time.sleep(0.05)
+            return loop.phase is Phase.FAULT
+
+        bench.until(asked, timeout=3.0)
+        assert 0.4 < time.monotonic() - began < 1.5
+
+
+def test_a_pause_does_not_count_as_waiting_for_an_answer():
+    bench = Bench(sync="lockstep", lockstep_timeout=0.3)
+    with bench.running() as loop:
+        bench.stamped.append(answer(0))
+        bench.until(lambda: bench.audience.samples)
+        loop.ask(partial(loop.pause, True))
+        time.sleep(0.4)
+        loop.ask(partial(loop.pause, False))
+        bench.stamped.append(answer(stamps(bench)[0]))
+        bench.until(lambda: len(bench.audience.samples) > 1)
 
 
 def test_requests_after_the_end_are_refused():

@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names of frames in messages: the root of the robot, and the mark of a state that is no sample."""
+
+from __future__ import annotations
+
+BASE_FRAME = "base_link"
+"""Root of the robot (REP 105): frame {B} of the paper."""
+
+IDLE_FRAME_ID = "idle"
+"""header.frame_id of joint_states that show a state before the run, in a pause or in a fault."""
+
+
+def is_idle(stamp_ns: int, frame_id: str) -> bool:
+    """Return whether a joint_states message shows a state and is not a sample of a run.
+
+    Recordings of version 0.1 mark such messages by the stamp zero.
+    """
+    return stamp_ns == 0 or frame_id == IDLE_FRAME_ID
