@@ -15,7 +15,7 @@ FLOORS = (
     {"mechanism"},
     {"dynamics"},
     {"integration"},
-    {"simulation"},
+    {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate"},
     {"control", "description"},
     {"recording"},
     {"plot", "report", "studies", "view"},

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques over time: constant, sine, table of held values, polynomial pieces, functions."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.scene.loads import SineTorque
+from sst_ros.simulation import State
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
+FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
+
+
+class TorqueProfile:
+    """Base of the torques that are known as a function of time alone."""
+
+    def values(self, t: Array) -> Array:
+        """Torques [N m] at times [s], shape (n,) -> (n, 3)."""
+        raise NotImplementedError
+
+    def breaks(self) -> Array:
+        """Return the times [s] at which the torques or their derivatives jump, ascending."""
+        return np.empty(0)
+
+    def between(self, begin: float, end: float) -> Callable[[float], Triple]:
+        """Torques [N m] on [begin, end], between which no break lies; ends belong to it."""
+        return self
+
+    def record(self) -> dict[str, Any] | None:
+        """Numbers from which `profile_from` builds the same profile; None for a function."""
+        raise NotImplementedError
+
+    def __call__(self, t: float) -> Triple:
+        """Torques [N m] at a time [s]."""
+        first, second, third = self.values(np.array([t]))[0].tolist()
+        return first, second, third
+
+
+@dataclass(frozen=True)
+class ConstantTorque(TorqueProfile):
+    """The same three torques [N m] at all times."""
+
+    torque: Triple
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        return np.tile(self.torque, (len(t), 1))
+
+    def __call__(self, t: float) -> Triple:
+        """Torques [N m] at a time [s]."""
+        return self.torque
+
+    def record(self) -> dict[str, Any]:
+        """See `TorqueProfile`."""
+        return {"kind": "constant", "torque": self.torque}
+
+
+@dataclass(frozen=True)
+class SineProfile(TorqueProfile):
+    """tau_k(t) = amplitude_k sin(frequency_k t + phase_k), from the section of a scene."""
+
+    sine: SineTorque
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        parts = (np.array(part) for part in self._parts())
+        amplitude, frequency, phase = parts
+        return np.asarray(amplitude * np.sin(np.multiply.outer(t, frequency) + phase))
+
+    def record(self) -> dict[str, Any]:
+        """See `TorqueProfile`."""
+        amplitude, frequency, phase = self._parts()
+        return {"kind": "sine", "amplitude": amplitude, "frequency": frequency, "phase": phase}
+
+    def _parts(self) -> tuple[Triple, Triple, Triple]:
+        return self.sine.amplitude, self.sine.frequency, self.sine.phase
+
+    def __call__(self, t: float) -> Triple:
+        """Torques [N m] at a time [s], by the sine of the C library."""
+        from math import sin
+
+        rows = zip(*self._parts(), strict=True)
+        first, second, third = (a * sin(f * t + p) for a, f, p in rows)
+        return first, second, third
+
+
+class TorqueTable(TorqueProfile):
+    """Held torques: each row acts from its time until the next; zero before the first.
+
+    Args:
+        times: beginnings [s], shape (n,), strictly ascending.
+        torques: torques [N m], shape (n, 3).
+
+    Raises:
+        InputError: shapes, order or numbers are not allowed.
+
+    """
+
+    def __init__(self, times: ArrayLike, torques: ArrayLike) -> None:
+        self.times = np.array(times, dtype=float)
+        self.torques = np.array(torques, dtype=float)
+        problems = []
+        if self.times.ndim != 1 or not len(self.times) or np.any(np.diff(self.times) <= 0.0):
+            problems.append(Problem("times", times, "must be ascending times [s], shape (n,)"))
+        elif self.torques.shape != (len(self.times), 3):
+            allowed = f"must have the shape ({len(self.times)}, 3) [N m]"
+            problems.append(Problem("torques", self.torques.shape, allowed))
+        if not (np.all(np.isfinite(self.times)) and np.all(np.isfinite(self.torques))):
+            problems.append(Problem("times, torques", "not finite", "must be finite numbers"))
+        if problems:
+            raise InputError("torque table", problems)
+
+    @classmethod
+    def read(cls, path: str | Path) -> TorqueTable:
+        """Read a CSV file with the header time, tau_1, tau_2, tau_3 [s, N m].
+
+        Raises:
+            InputError: the file cannot be read; lists every bad row with its line.
+
+        """
+        return cls(*_csv_table(Path(path)))
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        rows = np.vstack([np.zeros(3), self.torques])
+        return np.asarray(rows[np.searchsorted(self.times, t, side="right")])
+
+    def breaks(self) -> Array:
+        """See `TorqueProfile`."""
+        return self.times
+
+    def between(self, begin: float, end: float) -> ConstantTorque:
+        """See `TorqueProfile`."""
+        return ConstantTorque(self(0.5 * (begin + end)))
+
+    def record(self) -> dict[str, Any]:
+        """See `TorqueProfile`."""
+        return {"kind": "table", "times": self.times.tolist(), "torques": self.torques.tolist()}
+
+
+class PolynomialTorque(TorqueProfile):
+    """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`; zero outside of them.
+
+    Args:
+        coefficients: highest power first, shape (order + 1, pieces, 3).
+        breakpoints: beginnings of the pieces and the end of the last [s], shape (pieces + 1,).
+
+    Raises:
+        InputError: shapes, order or numbers are not allowed.
+
+    """
+
+    def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
+        self.c, self.x = np.array(coefficients, dtype=float), np.array(breakpoints, dtype=float)
+        if self.x.ndim != 1 or len(self.x) < 2 or np.any(np.diff(self.x) <= 0.0):
+            allowed = "must be two or more ascending times [s]"
+            raise InputError("torque", [Problem("breakpoints", breakpoints, allowed)])
+        if self.c.ndim != 3 or self.c.shape[1:] != (len(self.x) - 1, 3):
+            allowed = f"must have the shape (order + 1, {len(self.x) - 1}, 3)"
+            raise InputError("torque", [Problem("coefficients", self.c.shape, allowed)])
+        if not (np.all(np.isfinite(self.c)) and np.all(np.isfinite(self.x))):
+            raise InputError("torque", [Problem("coefficients", "not finite", "must be finite")])
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        piece = np.clip(np.searchsorted(self.x, t, side="right") - 1, 0, self.c.shape[1] - 1)
+        total = self._sum(self.c[:, piece], t - self.x[piece])
+        total[(t < self.x[0]) | (t > self.x[-1])] = 0.0
+        return total
+
+    def breaks(self) -> Array:
+        """See `TorqueProfile`."""
+        return self.x
+
+    def between(self, begin: float, end: float) -> Callable[[float], Triple]:
+        """See `TorqueProfile`."""
+        piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
+        if not 0 <= piece < self.c.shape[1]:
+            return ConstantTorque((0.0, 0.0, 0.0))
+        start = float(self.x[piece])
+        first, second, third = self.c[:, piece].T.tolist()
+
+        def value(c: list[float], t: float) -> float:
+            total = 0.0
+            for factor in c:
+                total = total * (t - start) + factor
+            return total
+
+        return lambda t: (value(first, t), value(second, t), value(third, t))
+
+    def record(self) -> dict[str, Any]:
+        """See `TorqueProfile`."""
+        return {"kind": "polynomial", "c": self.c.tolist(), "x": self.x.tolist()}
+
+    @staticmethod
+    def _sum(c: Array, t: Array) -> Array:
+        total: Array = np.zeros_like(c[0])
+        for row in c:
+            total = total * t[:, None] + row
+        return total
+
+
+class FunctionTorque(TorqueProfile):
+    """A function f(t) [s] -> three torques [N m]."""
+
+    def __init__(self, function: TorqueFunction) -> None:
+        self._function = function
+
+    def __call__(self, t: float) -> Triple:
+        """Torques [N m] at a time [s]."""
+        return three(self._function(t), f"torque({t:g})")
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        return np.array([self(float(time)) for time in t]).reshape(-1, 3)
+
+    def record(self) -> None:
+        """See `TorqueProfile`."""
+        return None
+
+
+def profile_of(torque: Any) -> TorqueProfile | FeedbackFunction:
+    """Turn what a user gives into a profile, or leave a function of time and state as it is.
+
+    Raises:
+        InputError: it is none of the kinds that `simulate` allows.
+
+    """
+    if isinstance(torque, TorqueProfile):
+        return torque
+    if isinstance(torque, SineTorque):
+        return SineProfile(torque)
+    if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
+        return PolynomialTorque(torque.c, torque.x)  # scipy.interpolate.PPoly, CubicSpline
+    if callable(torque):
+        function: FeedbackFunction = torque
+        return function if _arguments(torque) == 2 else FunctionTorque(torque)
+    return ConstantTorque(three(torque, "torque"))
+
+
+def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
+    """Build the profile that `TorqueProfile.record` has described."""
+    if record is None:
+        return None
+    more = {name: value for name, value in record.items() if name != "kind"}
+    if record["kind"] == "constant":
+        return ConstantTorque(three(more["torque"], "torque"))
+    if record["kind"] == "sine":
+        return SineProfile(SineTorque(**more))
+    if record["kind"] == "table":
+        return TorqueTable(more["times"], more["torques"])
+    return PolynomialTorque(more["c"], more["x"])
+
+
+def three(value: Any, name: str) -> Triple:
+    """Return three finite numbers as floats.
+
+    Raises:
+        InputError: `value` is something else.
+
+    """
+    try:
+        first, second, third = (float(number) for number in value)
+        if np.all(np.isfinite((first, second, third))):
+            return first, second, third
+    except (TypeError, ValueError):
+        pass
+    allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
+    raise InputError("simulate", [Problem(name, value, allowed)])
+
+
+def _arguments(function: Callable[..., Any]) -> int:
+    """Positional arguments that a function must be given, 1 or 2.
+
+    Raises:
+        InputError: it needs another number.
+
+    """
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return 1
+    places = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    needed = [p for p in places if p.default is p.empty]
+    if len(needed) > 2 or not (places or any(p.kind == p.VAR_POSITIONAL for p in parameters)):
+        allowed = "must be a function f(t) or f(t, state)"
+        raise InputError("simulate", [Problem("torque", function, allowed)])
+    return 2 if len(needed) == 2 else 1
+
+
+def _csv_table(path: Path) -> tuple[list[float], list[list[float]]]:
+    origin = str(path)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file)
+            lines = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(origin, [Problem("csv", origin, f"must be readable ({error})")]) from None
+    header = ["time", "tau_1", "tau_2", "tau_3"]
+    found = [name.strip() for name in lines[0][1]] if lines else None
+    if found != header:
+        raise InputError(origin, [Problem("header", found, "must be " + ", ".join(header), 1)])
+    rows: list[list[float]] = []
+    problems = list(_bad_rows(lines[1:], rows))
+    if not problems and not rows:
+        problems.append(Problem("rows", 0, "must be one or more"))
+    if problems:
+        raise InputError(origin, problems)
+    return [row[0] for row in rows], [row[1:] for row in rows]
+
+
+def _bad_rows(lines: list[tuple[int, list[str]]], rows: list[list[float]]) -> Iterator[Problem]:
+    """Yield the faults of a table, and append what is right to `rows`."""
+    for line, entries in lines:
+        try:
+            row = [float(entry) for entry in entries]
+        except ValueError:
+            row = []
+        if len(row) != 4 or not np.all(np.isfinite(row)):
+            yield Problem("row", entries, "must be four finite numbers", line)
+        elif rows and row[0] <= rows[-1][0]:
+            yield Problem("time", row[0], f"must be > {rows[-1][0]:g} s, the last", line)
+        else:
+            rows.append(row)

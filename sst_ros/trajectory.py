@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectory: a motion of a scene as arrays over time, simulated or recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sst_ros import trajectory_file
+from sst_ros.dynamics import energy, kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.errors import InputError, Problem
+from sst_ros.interpolation import Law, integrated
+from sst_ros.mechanism import frames
+from sst_ros.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+
+
+class Trajectory:
+    """A motion over n instants. Arrays are shared between calls: treat them as read-only.
+
+    Args:
+        scene: what moves.
+        t: times [s], shape (n,), strictly ascending.
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
+        torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`.
+        joints: angles and rates of the joints where they are known already, shape (n, 18): gamma,
+            mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
+        status: 0 where the motion reached its end, 1 where a limit ended it, -1 where no step
+            resolved it.
+        message: the same in words.
+        method: the integrator, and why it was chosen.
+        error_estimate: estimated error of the orientation at the end [rad], nan if unknown.
+        energy_residual: energy at the end, less that at the start, less the work done [J]; a
+            number, or a function that computes it when it is asked for.
+        evaluations: how often the derivative was evaluated.
+        law: torques that act between the samples, for `at`; by default each is held over the
+            interval that ends at its sample.
+
+    Raises:
+        InputError: shapes do not fit, or times do not ascend.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        t: ArrayLike,
+        quaternion: ArrayLike,
+        body_rate: ArrayLike,
+        torque: ArrayLike,
+        *,
+        joints: ArrayLike | None = None,
+        status: int = 0,
+        message: str = "",
+        method: str = "",
+        error_estimate: float = float("nan"),
+        energy_residual: float | Callable[[], float] = float("nan"),
+        evaluations: int = 0,
+        law: Law | None = None,
+    ) -> None:
+        given = {"t": t, "quaternion": quaternion, "body_rate": body_rate, "torque": torque}
+        arrays = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        self.scene = scene
+        self.t: Array = arrays["t"]
+        self.quaternion: Array = arrays["quaternion"]
+        self.body_rate: Array = arrays["body_rate"]
+        self.torque: Array = arrays["torque"]
+        if joints is not None:
+            self._joints = arrays["joints"] = np.asarray(joints, dtype=float)
+        _refuse_misfits(arrays)
+        self.status = status
+        self.message = message
+        self.method = method
+        self.error_estimate = error_estimate
+        self.evaluations = evaluations
+        self.law = law
+        self._residual = energy_residual
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def success(self) -> bool:
+        """Whether the motion reached its end."""
+        return self.status == 0
+
+    @cached_property
+    def _joints(self) -> Array:
+        """Angles and rates of the joints, shape (n, 18)."""
+        with np.errstate(all="ignore"):
+            found = kernel.joints(self._dynamics.model, self._columns)
+        return np.stack([np.broadcast_to(x, self.t.shape) for row in found for x in row], axis=1)
+
+    @property
+    def gamma(self) -> Array:
+        """Angles of the actuators [rad], shape (n, 3)."""
+        return self._joints[:, 0:3]
+
+    @property
+    def mu(self) -> Array:
+        """Angles between base arcs and arcs of the star [rad], shape (n, 3)."""
+        return self._joints[:, 3:6]
+
+    @property
+    def beta(self) -> Array:
+        """Angles from the carriages to E [rad], shape (n, 3)."""
+        return self._joints[:, 6:9]
+
+    @property
+    def gamma_dot(self) -> Array:
+        """Rates of gamma [rad/s], shape (n, 3)."""
+        return self._joints[:, 9:12]
+
+    @property
+    def mu_dot(self) -> Array:
+        """Rates of mu [rad/s], shape (n, 3)."""
+        return self._joints[:, 12:15]
+
+    @property
+    def beta_dot(self) -> Array:
+        """Rates of beta [rad/s], shape (n, 3)."""
+        return self._joints[:, 15:18]
+
+    @cached_property
+    def euler_zyz(self) -> Array:
+        """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
+        return frames.unwrap_zyz(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+
+    @cached_property
+    def energy(self) -> Array:
+        """Kinetic and potential energy [J], shape (n,)."""
+        with np.errstate(all="ignore"):
+            model, columns = self._dynamics.model, self._columns
+            total = energy.kinetic(model, columns) + energy.potential(model, columns)
+        return np.asarray(np.broadcast_to(total, self.t.shape))
+
+    @cached_property
+    def energy_residual(self) -> float:
+        """Energy at the end, less that at the start, less the work done [J]; nan if unknown."""
+        return float(self._residual() if callable(self._residual) else self._residual)
+
+    @cached_property
+    def closure_error(self) -> float:
+        """Largest abs(r_k . t_k) of all samples: how far the loops are from closed; 0 if exact."""
+        rotation, worst = frames.rotation_matrix(self.quaternion), 0.0
+        for k, leg in enumerate(self._dynamics.model.legs):
+            angle = self.gamma[:, k, None]
+            r = np.cos(angle) * np.array(leg.v) + np.sin(angle) * np.array(leg.across)
+            t = rotation @ np.array((leg.e0, leg.e1, 0.0))
+            worst = max(worst, float(np.abs(np.einsum("ni,ni->n", r, t)).max(initial=0.0)))
+        return worst
+
+    def at(self, t: ArrayLike) -> Trajectory:
+        """Sample the motion at other times, to the accuracy of the run.
+
+        Each state is integrated from the sample before it, under the torques that act there.
+
+        Args:
+            t: one time or times [s], shape (m,), within the trajectory.
+
+        Raises:
+            InputError: a time lies outside.
+
+        """
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        inside = (times >= self.t[0]) & (times <= self.t[-1])
+        if times.ndim != 1 or not np.all(inside):
+            allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
+            raise InputError("at", [Problem("t", t, allowed)])
+        y = integrated(self, times)
+        return Trajectory(
+            self.scene,
+            times,
+            y[:, :4],
+            y[:, 4:7],
+            y[:, 7:10],
+            status=self.status,
+            message=self.message,
+            method=self.method,
+            error_estimate=self.error_estimate,
+            energy_residual=self._residual,
+            evaluations=self.evaluations,
+            law=self.law,
+        )
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table with a row an instant and a column a number, units in its `attrs`."""
+        return trajectory_file.frame(self)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Arrays with the dimensions time, leg, axis and part; needs the package xarray."""
+        return trajectory_file.dataset(self)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write a Parquet file that `load` reads back to the bit, units and scene included.
+
+        Raises:
+            InputError: the file exists, unless `overwrite`; or pyarrow is not installed.
+
+        """
+        trajectory_file.save(self, Path(path), overwrite=overwrite)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectory:
+        """Read a file that `save` has written.
+
+        Raises:
+            InputError: there is no such file, or it holds no trajectory.
+
+        """
+        return trajectory_file.load(cls, Path(path))
+
+    def plot(self) -> Figure:
+        """Draw actuator angles, rates, torques and the energy over time; needs matplotlib."""
+        return trajectory_file.draw(self)
+
+    def __repr__(self) -> str:
+        span = f"{self.t[0]:g} to {self.t[-1]:g} s" if len(self) else "no samples"
+        return (
+            f"<Trajectory of {self.scene.name}: {len(self)} samples, {span}; {self.message}; "
+            f"{self.method}; error estimate {self.error_estimate:.1e} rad>"
+        )
+
+    def _repr_html_(self) -> str:
+        return trajectory_file.html(self)
+
+    @property
+    def _dynamics(self) -> Dynamics:
+        return Dynamics.of(self.scene)
+
+    @property
+    def _columns(self) -> tuple[Array, ...]:
+        return (*self.quaternion.T, *self.body_rate.T)
+
+
+def _refuse_misfits(arrays: dict[str, Array]) -> None:
+    t, problems = arrays["t"], []
+    if t.ndim != 1 or not np.all(np.isfinite(t)):
+        problems.append(Problem("t", t, "must be finite times [s], shape (n,)"))
+    wanted = {"quaternion": 4, "body_rate": 3, "torque": 3, "joints": 18}
+    for name, array in arrays.items():
+        if name != "t" and array.shape != (len(t), wanted[name]):
+            allowed = f"must have the shape ({len(t)}, {wanted[name]})"
+            problems.append(Problem(name, array.shape, allowed))
+    if problems:
+        raise InputError("trajectory", problems)

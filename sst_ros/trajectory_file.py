@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables, files and pictures of a trajectory."""
+
+from __future__ import annotations
+
+import html as html_text
+import json
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import dump, read
+from sst_ros.torque import TorqueProfile, profile_from
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from sst_ros.trajectory import Trajectory
+
+_KEY = b"sst_ros"
+_FORMAT = 1
+
+QUANTITIES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "quaternion": ("1", ("x", "y", "z", "w")),
+    "body_rate": ("rad/s", ("x", "y", "z")),
+    "torque": ("N m", ("1", "2", "3")),
+    "gamma": ("rad", ("1", "2", "3")),
+    "mu": ("rad", ("1", "2", "3")),
+    "beta": ("rad", ("1", "2", "3")),
+    "gamma_dot": ("rad/s", ("1", "2", "3")),
+    "mu_dot": ("rad/s", ("1", "2", "3")),
+    "beta_dot": ("rad/s", ("1", "2", "3")),
+    "euler_zyz": ("rad", ("theta", "phi", "psi")),
+}
+"""Unit and names of the parts of each array with more than one column."""
+
+UNITS = {
+    "t": "s",
+    **{f"{name}_{part}": unit for name, (unit, parts) in QUANTITIES.items() for part in parts},
+    "energy": "J",
+}
+"""Unit of each column of a table."""
+
+_FIGURES = ("status", "message", "method", "error_estimate", "energy_residual", "evaluations")
+
+
+def frame(trajectory: Trajectory) -> pd.DataFrame:
+    """See `Trajectory.to_pandas`."""
+    pd = _needed("pandas", "record")
+    table = pd.DataFrame(_columns(trajectory))
+    table.attrs = {"units": UNITS, "scene": trajectory.scene.name}
+    return table
+
+
+def dataset(trajectory: Trajectory) -> xr.Dataset:
+    """See `Trajectory.to_xarray`."""
+    package = _needed("xarray", "all")
+    second = {4: "part", 3: "leg"}
+    arrays: dict[str, Any] = {}
+    for name, (unit, parts) in QUANTITIES.items():
+        over = "axis" if name == "body_rate" else "angle" if name == "euler_zyz" else None
+        dims = ("time", over or second[len(parts)])
+        arrays[name] = (dims, getattr(trajectory, name), {"units": unit})
+    arrays["energy"] = (("time",), trajectory.energy, {"units": "J"})
+    coordinates = {
+        "time": ("time", trajectory.t, {"units": "s"}),
+        "leg": [1, 2, 3],
+        "axis": ["x", "y", "z"],
+        "part": ["x", "y", "z", "w"],
+        "angle": ["theta", "phi", "psi"],
+    }
+    more = {name: getattr(trajectory, name) for name in _FIGURES}
+    found: xr.Dataset = package.Dataset(
+        arrays, coordinates, {"scene": trajectory.scene.name, **more}
+    )
+    return found
+
+
+def save(trajectory: Trajectory, path: Path, *, overwrite: bool) -> None:
+    """See `Trajectory.save`."""
+    pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
+
+    if path.exists() and not overwrite:
+        raise InputError("save", [Problem("path", str(path), "exists; overwrite=True replaces it")])
+    law = trajectory.law
+    metadata = {name: getattr(trajectory, name) for name in _FIGURES} | {
+        "format": _FORMAT,
+        "scene": dump(trajectory.scene),
+        "torque": law.record() if isinstance(law, TorqueProfile) else None,
+    }
+    fields = [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in UNITS.items()]
+    schema = pa.schema(fields, metadata={_KEY: json.dumps(metadata).encode()})
+    arrays = [pa.array(column) for column in _columns(trajectory).values()]
+    unfinished = path.with_name(path.name + ".part")
+    try:
+        parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), unfinished)
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        allowed = f"must be writable ({error})"
+        raise InputError("save", [Problem("path", str(path), allowed)]) from None
+
+
+def load(cls: type[Trajectory], path: Path) -> Trajectory:
+    """See `Trajectory.load`."""
+    pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
+
+    allowed = "must be a trajectory that `Trajectory.save` has written"
+    try:
+        table = parquet.read_table(path)
+        metadata = json.loads((table.schema.metadata or {})[_KEY])
+    except (OSError, pa.ArrowInvalid) as error:
+        raise InputError("load", [Problem("path", str(path), f"{allowed} ({error})")]) from None
+    except (KeyError, ValueError):
+        raise InputError("load", [Problem("path", str(path), allowed)]) from None
+    if metadata["format"] != _FORMAT:
+        raise InputError("load", [Problem("format", metadata["format"], f"must be {_FORMAT}")])
+    scene = read(Scene, metadata["scene"], str(path))
+    arrays = {
+        name: np.stack([table[f"{name}_{part}"].to_numpy() for part in parts], axis=1)
+        for name, (_, parts) in QUANTITIES.items()
+    }
+    joints = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+    return cls(
+        scene,
+        table["t"].to_numpy(),
+        *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
+        joints=np.hstack([arrays[name] for name in joints]),
+        law=profile_from(metadata["torque"]),
+        **{name: metadata[name] for name in _FIGURES},
+    )
+
+
+def draw(trajectory: Trajectory) -> Figure:
+    """See `Trajectory.plot`."""
+    _needed("matplotlib", "plot")
+    from matplotlib.figure import Figure
+
+    t = trajectory.t
+    shown = trajectory
+    if 2 <= len(t) < _FEW:
+        shown = trajectory.at(np.union1d(t, np.linspace(t[0], t[-1], _FEW)))
+    figure = Figure(figsize=(8.0, 9.0), layout="constrained")
+    panels = figure.subplots(4, 1, sharex=True)
+    rows = (("gamma", "rad"), ("gamma_dot", "rad/s"), ("torque", "N m"))
+    for axes, (name, unit) in zip(panels, rows, strict=False):
+        for k, column in enumerate(getattr(shown, name).T, start=1):
+            axes.plot(shown.t, column, label=f"leg {k}", linewidth=1.2)
+        axes.set_ylabel(f"{name} [{unit}]")
+        axes.grid(alpha=0.3)
+    panels[0].legend(loc="best", ncols=3)
+    panels[3].plot(shown.t, shown.energy, color="black", linewidth=1.2)
+    panels[3].set(ylabel="energy [J]", xlabel="time [s]")
+    panels[3].grid(alpha=0.3)
+    figure.suptitle(f"{trajectory.scene.name}: {trajectory.message}")
+    return figure
+
+
+_FEW = 300
+"""Samples below which a picture asks for more."""
+
+
+def html(trajectory: Trajectory) -> str:
+    """Summary as a table, and the picture where matplotlib is installed."""
+    rows = {
+        "scene": trajectory.scene.name,
+        "samples": f"{len(trajectory)}, {trajectory.t[0]:g} to {trajectory.t[-1]:g} s",
+        "status": f"{trajectory.status}: {trajectory.message}",
+        "method": trajectory.method,
+        "error estimate": f"{trajectory.error_estimate:.1e} rad",
+    }
+    cells = "".join(
+        f"<tr><th style='text-align:left'>{name}</th><td>{html_text.escape(value)}</td></tr>"
+        for name, value in rows.items()
+    )
+    return f"<table>{cells}</table>{_picture(trajectory)}"
+
+
+def _picture(trajectory: Trajectory) -> str:
+    import io
+
+    try:
+        figure = draw(trajectory)
+    except InputError:
+        return ""
+    text = io.StringIO()
+    figure.savefig(text, format="svg")
+    return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _columns(trajectory: Trajectory) -> dict[str, Any]:
+    columns: dict[str, Any] = {"t": trajectory.t}
+    for name, (_, parts) in QUANTITIES.items():
+        array = getattr(trajectory, name)
+        columns |= {f"{name}_{part}": array[:, i] for i, part in enumerate(parts)}
+    return columns | {"energy": trajectory.energy}
+
+
+@cache
+def _needed(module: str, extra: str) -> Any:
+    """Import a package that an extra brings.
+
+    Raises:
+        InputError: it is not installed; says how to install it.
+
+    """
+    from importlib import import_module
+
+    try:
+        return import_module(module)
+    except ImportError:
+        allowed = f"must be installed: pip install 'sst_ros[{extra}]'"
+        raise InputError("installation", [Problem(module, None, allowed)]) from None

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""simulate(): what it takes, what it returns, and that it is the run of Simulation."""
+
+import numpy as np
+import pytest
+
+from sst_ros.errors import InputError
+from sst_ros.scene.scene import load
+from sst_ros.scene.values import plain
+from sst_ros.scene.yaml_document import dump
+from sst_ros.simulate import simulate
+from sst_ros.simulation import Simulation
+
+EXAMPLE2 = load("example2")
+
+
+def test_a_name_a_path_a_dict_and_a_scene_are_the_same(tmp_path):
+    import yaml
+
+    path = tmp_path / "own.yaml"
+    path.write_text(dump(EXAMPLE2))
+    document = yaml.safe_load(dump(EXAMPLE2))
+    document["star"]["alpha_deg"] = np.array(document["star"]["alpha_deg"])
+    ends = [
+        simulate(scene, duration=0.01).gamma[-1].tolist()
+        for scene in ("example2", path, str(path), document, EXAMPLE2)
+    ]
+    assert ends == [ends[0]] * 5
+    assert plain({"a": np.float64(1.0)}) == {"a": 1.0}
+
+
+def test_the_run_of_simulate_with_a_control_period_is_that_of_simulation():
+    def angles(state):
+        return state.joints.gamma, state.joints.gamma_dot
+
+    def controller(t, state):
+        return [2.0 - 3.0 * g - 0.5 * r for g, r in zip(*angles(state), strict=True)]
+
+    found = simulate(EXAMPLE2, controller, 0.1, control_period=0.001, tolerance=1e-10)
+    simulation = Simulation(EXAMPLE2, tolerance=1e-10)
+    assert len(found) == 101
+    for k in range(101):
+        state = simulation.state
+        assert found.t[k] == state.time_ns / 1e9
+        assert tuple(found.quaternion[k]) == state.quaternion
+        assert tuple(found.body_rate[k]) == state.body_rate
+        assert tuple(found.gamma[k]) == state.joints.gamma
+        assert tuple(found.torque[k]) == state.torque
+        simulation.step(tuple(controller(0.0, state)), 1_000_000)
+    between = simulate(
+        EXAMPLE2, controller, 0.1, control_period=0.001, tolerance=1e-10, t_eval=[0.02, 0.0305]
+    )
+    assert between.quaternion[0].tolist() == found.quaternion[20].tolist()
+    np.testing.assert_allclose(found.at(0.0305).gamma, between.gamma[1:], atol=1e-12)
+
+
+def test_a_limit_ends_the_motion_and_keeps_what_is_valid():
+    found = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 3.0)
+    assert (found.status, found.success) == (1, False)
+    assert "gamma_1 > 1.570796" in found.message
+    assert found.gamma[-1, 0] == pytest.approx(np.pi / 2, abs=1e-7)
+    assert np.all(found.gamma <= np.pi / 2)
+    few = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 3.0, t_eval=[0.1, 0.2, 2.0])
+    assert few.t[:2].tolist() == [0.1, 0.2]
+    assert few.t[2] == pytest.approx(found.t[-1], abs=1e-9)
+
+
+def test_another_start():
+    for initial in (([0.5, 0.6, 0.7], np.zeros(3)), {"gamma": [0.5, 0.6, 0.7]}):
+        found = simulate(EXAMPLE2, duration=0.01, initial=initial)
+        np.testing.assert_allclose(found.gamma[0], [0.5, 0.6, 0.7], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"scene": "nosuch"}, "must be a readable"),
+        ({"scene": 3}, "must be a Scene"),
+        ({"torque": 1.0}, "three finite numbers"),
+        ({"torque": (1.0, float("nan"), 0.0)}, "three finite numbers"),
+        ({"torque": lambda: None}, r"f\(t\) or f\(t, state\)"),
+        ({"torque": lambda t: (t, t)}, "three finite numbers"),
+        ({"duration": -1.0}, "duration(.|\n)*from 1e-9"),
+        ({"duration": float("inf")}, "duration(.|\n)*from 1e-9"),
+        ({"t_eval": [0.2, 0.1]}, "ascending"),
+        ({"t_eval": [0.1, 3.0]}, "ascending"),
+        ({"method": "euler"}, "must be one of auto, rk4, dopri5, dop853, rodas4, gauss"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),
+        ({"initial": {"gama": 1}}, "must have the key gamma"),
+        ({"initial": {"gamma": [3.0, 1.0, 1.0]}}, "must lie in the stroke"),
+    ],
+)
+def test_bad_input_is_refused(arguments, said):
+    with pytest.raises(InputError, match=said):
+        simulate(**{"scene": EXAMPLE2, "duration": 0.01, **arguments})
+
+
+def test_a_scene_without_a_duration_asks_for_one():
+    from dataclasses import replace
+
+    with pytest.raises(InputError, match=r"duration(.|\n)*must be given"):
+        simulate(replace(EXAMPLE2, duration=None))

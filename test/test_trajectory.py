@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectory: derived quantities against the states of Simulation, files to the bit, at(t)."""
+
+import numpy as np
+import pytest
+
+from sst_ros.errors import InputError
+from sst_ros.scene.scene import load
+from sst_ros.simulate import simulate
+from sst_ros.simulation import Simulation
+from sst_ros.torque import PolynomialTorque, TorqueTable
+from sst_ros.trajectory import Trajectory
+
+EXAMPLE2 = load("example2")
+ARRAYS = (
+    "t", "quaternion", "body_rate", "torque", "gamma", "mu", "beta", "gamma_dot", "mu_dot",
+    "beta_dot", "euler_zyz", "energy",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate("general", duration=0.2, t_eval=np.linspace(0.0, 0.2, 41))
+
+
+def test_angles_and_rates_are_those_of_the_states(run):
+    bare = Trajectory(run.scene, run.t, run.quaternion, run.body_rate, run.torque)
+    for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"):
+        np.testing.assert_allclose(getattr(bare, name), getattr(run, name), rtol=1e-13, atol=1e-14)
+
+
+def test_energy_and_closure(run):
+    assert abs(run.energy_residual) < 1e-9
+    assert run.closure_error < 1e-14
+    assert run.energy.shape == run.t.shape
+
+
+def test_shapes_units_and_names_in_tables(run):
+    table = run.to_pandas()
+    assert list(table) == list(table.attrs["units"])
+    np.testing.assert_array_equal(table["gamma_2"], run.gamma[:, 1])
+    assert table.attrs["units"]["body_rate_x"] == "rad/s"
+
+
+def test_labelled_arrays(run):
+    pytest.importorskip("xarray", reason="xarray is optional")
+    found = run.to_xarray()
+    np.testing.assert_array_equal(found["gamma"].sel(leg=2), run.gamma[:, 1])
+    assert found["torque"].attrs["units"] == "N m"
+
+
+def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path):
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    path = tmp_path / "run.parquet"
+    run.save(path)
+    again = Trajectory.load(path)
+    for name in ARRAYS:
+        one, other = getattr(run, name), getattr(again, name)
+        assert one.tobytes() == np.ascontiguousarray(other).tobytes(), name
+    assert again.scene == run.scene
+    for name in ("status", "message", "method", "error_estimate", "energy_residual"):
+        assert getattr(again, name) == getattr(run, name)
+    np.testing.assert_array_equal(again.at(0.1234).gamma, run.at(0.1234).gamma)
+    with pytest.raises(InputError, match=r"exists"):
+        run.save(path)
+    run.save(path, overwrite=True)
+
+
+def test_what_is_no_trajectory_is_refused(tmp_path):
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    (tmp_path / "text.parquet").write_text("no table")
+    for path in (tmp_path / "text.parquet", tmp_path / "absent.parquet"):
+        with pytest.raises(InputError, match=r"must be a trajectory"):
+            Trajectory.load(path)
+
+
+PROFILES = {
+    "sine": None,
+    "numbers": (0.5, -0.2, 0.3),
+    "table": TorqueTable([0.0, 0.03, 0.11], [[1, 0, 0], [0, 1, 0], [0.2, 0, 1]]),
+    "pieces": PolynomialTorque([[[20, 0, 9], [-4, 1, 0]], [[1, 2, 3], [3, 2, 1]]], [0.0, 0.1, 0.3]),
+    "function": lambda t: (np.cos(9.0 * t), t, -t),
+}
+
+
+@pytest.mark.parametrize("torque", PROFILES.values(), ids=PROFILES)
+def test_between_samples_it_is_as_accurate_as_at_them(torque):
+    times = [0.0123, 0.0717, 0.1001, 0.1777]
+    coarse = simulate(EXAMPLE2, torque, 0.2, t_eval=np.linspace(0.0, 0.2, 6), tolerance=1e-12)
+    direct = simulate(EXAMPLE2, torque, 0.2, t_eval=times, tolerance=1e-12)
+    found = coarse.at(times)
+    np.testing.assert_allclose(found.quaternion, direct.quaternion, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(found.body_rate, direct.body_rate, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.torque, direct.torque, rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match=r"must be times from 0 to 0.2"):
+        coarse.at(0.3)
+
+
+def test_samples_under_held_torques_need_nothing_else():
+    """As those of a recording: each torque is that of the interval that ends there."""
+    simulation, states = Simulation(EXAMPLE2, tolerance=1e-12), []
+    for k in range(11):
+        states.append(simulation.state)
+        simulation.step((0.1 * k, 0.5, -0.3), 10_000_000)
+    bare = Trajectory(
+        EXAMPLE2,
+        [state.time_ns / 1e9 for state in states],
+        [state.quaternion for state in states],
+        [state.body_rate for state in states],
+        [state.torque for state in states],
+    )
+    simulation.reset()
+    for k in range(4):
+        simulation.step((0.1 * k, 0.5, -0.3), 10_000_000)
+    wanted = simulation.within(34_567_000)
+    np.testing.assert_allclose(bare.at(0.034567).quaternion[0], wanted.quaternion, atol=1e-12)
+    assert bare.at(0.034567).torque[0].tolist() == list(wanted.torque)
+
+
+def test_misfits_are_refused():
+    with pytest.raises(InputError, match=r"quaternion(.|\n)*must have the shape"):
+        Trajectory(EXAMPLE2, [0.0, 1.0], np.zeros((1, 4)), np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_a_picture_and_a_summary_for_notebooks(run):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    assert [len(axes.lines) for axes in run.plot().axes] == [3, 3, 3, 1]
+    assert "<table>" in run._repr_html_()
+    assert "<svg" in run._repr_html_()
