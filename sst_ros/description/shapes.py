@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the links look like: tubes, balls and boxes in the links' own frames.
 
-URDF, markers and the view draw these and nothing else. Thicknesses are for the eye; arcs and radii
+URDF and the view draw these and nothing else. Thicknesses are for the eye; arcs and radii
 are the scene's.
 """
 

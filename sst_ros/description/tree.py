@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manipulator as a tree of links and joints, as URDF, markers and the view see it.
+"""The manipulator as a tree of links and joints, as URDF and the view see it.
 
-    base -gamma_k- actuated_k -mu_k- intermediate_k -beta_1- star
-                                                    -beta_2- star_from_2
-                                                    -beta_3- star_from_3
+    base_link -gamma_k- actuated_k -mu_k- intermediate_k -beta_1- star
+                                                         -beta_2- star_from_2
+                                                         -beta_3- star_from_3
 
 All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
 The star hangs on leg 1. On legs 2 and 3 hangs a frame without a body: {E} as that leg sees it. The
@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_ros.description.frame_ids import BASE_FRAME
 from sst_ros.mechanism.geometry import Array, Geometry
 
-BASE, STAR = "base", "star"
+BASE, STAR = BASE_FRAME, "star"
 LEGS = (1, 2, 3)
 STARS = (STAR, "star_from_2", "star_from_3")
 """{E} as seen from legs 1, 2 and 3."""

@@ -29,7 +29,7 @@ from sst_ros.scene.scene import Scene
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
-    **dict.fromkeys(("motion", "markers", "duration"), "is nothing that a batch uses"),
+    **dict.fromkeys(("motion", "duration"), "is nothing that a batch uses"),
 }
 
 

@@ -61,7 +61,7 @@ class Simulator:
         self._diagnostics = topics.DIAGNOSTICS.publisher(self.node)
         Services(self.node, self._loop)
         simulation_interfaces.offer(self.node, self._loop)
-        robot_description.offer(self.node, simulated, given, lambda: self._loop.simulation.state)
+        robot_description.offer(self.node, simulated, given)
         self.node.create_timer(1.0, self._report, clock=STEADY)
         self._read_gauges()
         realtime.quiet()

@@ -19,7 +19,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 
@@ -109,14 +108,6 @@ ROBOT_DESCRIPTION = Endpoint(
     latched=True,
     when="publish_description is true",
 )
-MARKERS = Endpoint(
-    PUBLISHES,
-    "~/markers",
-    MarkerArray,
-    "the manipulator, the path of E, s and the torques, for RViz, in base",
-    depth=1,
-    when="the scene has markers",
-)
 COMMANDS = Endpoint(
     SUBSCRIBES, "~/commands", Float64MultiArray, "torques of gamma_1..3 [N m], held until the next"
 )
@@ -158,7 +149,6 @@ SIMULATOR = (
     DIAGNOSTICS,
     CLOCK,
     ROBOT_DESCRIPTION,
-    MARKERS,
     COMMANDS,
     COMMANDS_STAMPED,
     EXTERNAL_MOMENT,

@@ -140,17 +140,6 @@ class Actuators(Section):
 
 
 @dataclass(frozen=True)
-class Markers(Section):
-    """What the simulator shows in RViz on ~/markers; needs no description and no transforms."""
-
-    rate: float = number("messages per second", "Hz", default=20.0, above=0.0, most=100.0)
-    trace: float = number(
-        "length of the path of E that is shown", "s", default=5.0, least=0.0, most=600.0
-    )
-    torque_scale: float = number("length of the torque arrows", "m/(N m)", default=0.04, above=0.0)
-
-
-@dataclass(frozen=True)
 class Stroke(Section):
     """The range of the actuators, 0 < gamma_k < arc P_k P_k+1."""
 

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,6 @@ from sst_ros.scene.loads import (
     Gravity,
     Initial,
     JointFriction,
-    Markers,
     Moment,
     SineTorque,
     Spring,
@@ -44,7 +45,6 @@ __all__ = [
     "Initial",
     "JointFriction",
     "Link",
-    "Markers",
     "Moment",
     "Payload",
     "Scene",
@@ -64,6 +64,10 @@ __all__ = [
 @dataclass(frozen=True)
 class Scene(Section):
     """All that is simulated."""
+
+    REMOVED: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {"markers": "RViz shows robot_description and the transforms of robot_state_publisher"}
+    )
 
     name: str = text("short name")
     description: str = text("what the scene shows")
@@ -88,7 +92,6 @@ class Scene(Section):
         "torques that torque_player plays", SineTorque, default=None
     )
     motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
-    markers: Markers | None = section("what is shown in RViz", Markers, default=None)
     duration: float | None = number("length of a run", "s", default=None, above=0.0)
     provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
 

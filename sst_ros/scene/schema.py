@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 from sst_ros.errors import InputError, Problem
 
@@ -116,7 +117,12 @@ def _declare(spec: Spec, default: Any) -> Any:
 
 @dataclass(frozen=True)
 class Section:
-    """Base of every part of a document; refuses what its fields do not allow."""
+    """Base of every part of a document; refuses what its fields do not allow.
+
+    `REMOVED` names keys of earlier versions, which are read over with a warning, and what to use.
+    """
+
+    REMOVED: ClassVar[Mapping[str, str]] = MappingProxyType({})
 
     def __post_init__(self) -> None:
         problems = []

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -84,7 +85,10 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
     for key_node, value_node in node.value:
         name = str(_plain(key_node))
         key = f"{path}.{name}" if path else name
-        if name not in known:
+        if name in cls.REMOVED:
+            said = f"line {_line(key_node)}: {key} is ignored: {cls.REMOVED[name]}"
+            warnings.warn(said, FutureWarning, stacklevel=2)
+        elif name not in known:
             allowed = "unknown key; allowed are " + ", ".join(known)
             problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
         elif name in lines:

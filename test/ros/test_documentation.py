@@ -16,7 +16,6 @@ IDS = [node.command for node in NODES]
 WITHOUT_REASON = {
     "/clock",
     "/robot_description",
-    "/sst_simulator/markers",
     "/sst_simulator/external_moment",
     "/sst_simulator/commands_stamped",
 }
