@@ -61,6 +61,7 @@ class Walk:
     Attributes:
         history: changes of method.
         origin: time [s] of the run at which the times of `legs` are zero.
+        attempts: steps tried by `legs` since construction, rejected ones included.
 
     """
 
@@ -86,6 +87,7 @@ class Walk:
         self._h = float("inf")
         self._since_look = 0
         self.origin = 0.0
+        self.attempts = 0
 
     @property
     def method(self) -> Method:
@@ -117,6 +119,7 @@ class Walk:
                 h = left
             z = coarse_solution.rescaled(y, z, order, self.method.order)
             order = self.method.order
+            self.attempts += 1
             new_y, new_z, size = self._machine.pair(t, h, y, z, d)
             factor = self._factor(size / self.tolerance)
             if size > self.tolerance:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reference beyond double precision: DOP853 with fixed steps on longer floats, or mpmath's.
+"""DOP853 with fixed steps beyond double precision: long doubles, or mpmath's numbers.
 
-It runs the program of a scene, so that it solves to the last bit what the methods solve. Its own
-error is what two step sizes differ by. Where long doubles are no longer than doubles the same
-difference says so.
+The integration package runs on doubles, compiled to machine code; this is the one independent
+integrator on other number types. It evaluates the same traced program, so that it solves to the
+last bit what the methods solve.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -19,7 +20,7 @@ from sst_ros.dynamics.expression import Program
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.methods import DOP853
 
-Long: TypeAlias = NDArray[np.longdouble]
+LongArray: TypeAlias = NDArray[np.longdouble]
 EXTENDED, MPMATH = "long double", "mpmath"
 
 DIGITS = 30
@@ -27,14 +28,14 @@ DIGITS = 30
 
 
 @dataclass(frozen=True)
-class Arithmetic:
+class NumberType:
     """Numbers to calculate with.
 
     Attributes:
-        name: what they are called.
-        number: makes one of a float or an integer.
+        name: for reports.
+        number: converts a float or an integer.
         functions: elementary functions by the names that programs use.
-        back: makes a long double of one.
+        back: converts to a long double.
 
     """
 
@@ -44,7 +45,7 @@ class Arithmetic:
     back: Callable[[Any], Any]
 
 
-def arithmetic(name: str) -> Arithmetic:
+def number_type(name: str) -> NumberType:
     """Return long doubles or mpmath's numbers of 30 digits.
 
     Raises:
@@ -54,7 +55,7 @@ def arithmetic(name: str) -> Arithmetic:
     names = ("sqrt", "sin", "cos", "tanh", "exp")
     if name == EXTENDED:
         functions = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
-        return Arithmetic(f"{np.finfo(np.longdouble).precision}-digit floats",
+        return NumberType(f"{np.finfo(np.longdouble).precision}-digit floats",
                           np.longdouble, functions, np.longdouble)  # fmt: skip
     try:
         import mpmath
@@ -64,12 +65,12 @@ def arithmetic(name: str) -> Arithmetic:
     context = mpmath.mp.clone()
     context.dps = DIGITS
     functions = {each: getattr(context, each) for each in (*names, "atan2")}
-    return Arithmetic(f"mpmath, {DIGITS} digits", context.mpf, functions,
+    return NumberType(f"mpmath, {DIGITS} digits", context.mpf, functions,
                       lambda x: np.longdouble(mpmath.nstr(x, DIGITS)))  # fmt: skip
 
 
-class Precise:
-    """Fixed steps of DOP853.
+class HighPrecisionDop853:
+    """DOP853 with fixed steps on a number type.
 
     Args:
         program: derivative with the inputs t, state, drive.
@@ -79,20 +80,20 @@ class Precise:
     """
 
     def __init__(self, program: Program, kind: str, drive: Sequence[float]) -> None:
-        self.numbers = arithmetic(kind)
+        self.numbers = number_type(kind)
         namespace: dict[str, Any] = dict(self.numbers.functions)
         exec(program.source("rhs"), namespace)
         self._rhs: Callable[..., tuple[Any, ...]] = namespace["rhs"]
         number = self.numbers.number
         self._drive = tuple(map(number, drive))
-        self._a = [_weighed(row, number) for row in DOP853.a]
+        self._a = [[(i, number(w)) for i, w in enumerate(row) if w] for row in DOP853.a]
         weights = [number(w) for w in DOP853.b]
         # As doubles they do not quite add up to 1, which no step size would show.
         weights[-1] = number(1) - sum(weights[:-1], number(0))
         self._b = [(i, w) for i, w in enumerate(weights) if DOP853.b[i]]
         self._c = [number(c) for c in DOP853.c]
 
-    def solve(self, start: Sequence[float], interval: float, count: int, steps: int) -> Long:
+    def solve(self, start: Sequence[float], interval: float, count: int, steps: int) -> LongArray:
         """Return states at k * interval [s], k = 0 .. count, shape (count + 1, len(start)).
 
         The first four numbers are a quaternion, which is kept at length 1. A row of nan stands
@@ -103,14 +104,11 @@ class Precise:
         y = [number(x) for x in start]
         h = number(interval) / steps
         result[0] = [back(x) for x in y]
-        try:
-            with np.errstate(all="ignore"):
-                for k in range(count):
-                    for step in range(steps):
-                        y = self._step((k * steps + step) * h, y, h)
-                    result[k + 1] = [back(x) for x in y]
-        except (ArithmeticError, ValueError):
-            pass
+        with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
+            for k in range(count):
+                for step in range(steps):
+                    y = self._step((k * steps + step) * h, y, h)
+                result[k + 1] = [back(x) for x in y]
         return result
 
     def evaluate(self, start: Sequence[float]) -> tuple[Any, ...]:
@@ -126,7 +124,3 @@ class Precise:
         new = [x + h * sum(w * slopes[i][j] for i, w in self._b) for j, x in enumerate(y)]
         length = self.numbers.functions["sqrt"](sum(x * x for x in new[:4]))
         return [x / length for x in new[:4]] + new[4:]
-
-
-def _weighed(row: Sequence[float], number: Callable[[Any], Any]) -> list[tuple[int, Any]]:
-    return [(i, number(w)) for i, w in enumerate(row) if w]

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ways to solve a run: each method by fixed steps, and by tolerances, from coarse to fine.
+"""The solver grid of a work-precision study: methods, each with settings from coarse to fine.
 
-Fixed steps are `Machine.march`, a loop that looks at no error estimate. Tolerances are given to
-`Walk`, which is what `Simulation` steps with; its companion, for the global error, is counted and
-timed with it. Where the motion has kinks they are given to `Simulation` itself, under torques that
-are functions, with all that this costs in plain Python.
+Fixed steps use no error estimate. Tolerances go to the adaptive stepper that `Simulation` steps
+with; the coarse solution of its global error estimate is counted and timed with it. Where the
+right-hand side has kinks they go to `Simulation` itself, under torques that are functions of time.
 """
 
 from __future__ import annotations
@@ -18,110 +17,96 @@ from sst_ros.integration.adaptive_stepper import Mark, Walk
 from sst_ros.integration.compiled_method import Machine, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Array
-from sst_ros.studies.work_precision import Trial
+from sst_ros.studies.initial_value_problem import InitialValueProblem
 
-Solution = tuple[Array, int | None]
 FIXED, TOLERANCE = "fixed steps", "tolerance"
 
-_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
+_STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
 
 
 @dataclass(frozen=True)
-class Way:
-    """One way to solve a run.
+class SolverSetting:
+    """One point of the grid.
 
     Attributes:
         method: name of the method.
         kind: FIXED or TOLERANCE.
         setting: length of the steps [s], or the tolerance.
-        solve: returns the states at the instants, and how often the right-hand side was evaluated,
-            None where nobody counts. Raises SstError or ArithmeticError or ValueError.
-        timed: does the same work with as little else as there can be.
+        solve: returns the states at the instants, and the evaluations of the right-hand side,
+            None where they are not counted. Raises SstError, ArithmeticError or ValueError.
+        timed: does the same work with the least overhead.
 
     """
 
     method: str
     kind: str
     setting: float
-    solve: Callable[[], Solution]
+    solve: Callable[[], tuple[Array, int | None]]
     timed: Callable[[], object]
 
 
-def ladders(trial: Trial, compiled: bool) -> list[Iterator[Way]]:
-    """Return the ways by method and kind, each from coarse to fine."""
-    found: list[Iterator[Way]] = []
+def solver_grid(
+    problem: InitialValueProblem, compiled: bool
+) -> list[Iterator[SolverSetting]]:
+    """Return the settings by method and kind, each from coarse to fine."""
+    found: list[Iterator[SolverSetting]] = []
     for method in METHODS.values():
-        if not trial.clamped:  # a march knows no limit of torque
-            found.append(_fixed(trial, method, compiled))
+        if not problem.clamped:  # fixed steps know no limit of torque
+            found.append(_fixed(problem, method, compiled))
         if not method.error_order:
             continue
-        if not trial.kinked:
-            found.append(_chosen(trial, method, compiled))
+        if not problem.kinked:
+            found.append(_adaptive(problem, method, compiled))
         elif not isinstance(method, Rosenbrock):  # which takes no torques that are functions
-            found.append(_simulated(trial, method))
+            found.append(_simulated(problem, method))
     return found
 
 
-def _fixed(trial: Trial, method: Method, compiled: bool) -> Iterator[Way]:
-    machine = Machine(trial.system, method, compiled=compiled)
-    for steps in _PER_INTERVAL:
-        count, h = steps * trial.count, trial.interval / steps
+def _fixed(problem: InitialValueProblem, method: Method, compiled: bool) -> Iterator[SolverSetting]:
+    machine = Machine(problem.system, method, compiled=compiled)
+    for steps in _STEPS_PER_INTERVAL:
+        count, h = steps * problem.count, problem.interval / steps
 
         def solve(steps: int = steps, count: int = count) -> tuple[Array, int]:
-            return trial.marched(machine, steps), len(method.a) * count
+            return problem.fixed_steps(machine, steps), len(method.a) * count
 
         def timed(count: int = count, h: float = h) -> None:
-            machine.march(0.0, h, count, list(trial.start), trial.drive)
+            machine.march(0.0, h, count, list(problem.start), problem.drive)
 
-        yield Way(method.name, FIXED, h, solve, timed)
-
-
-class _Counting(Walk):
-    """A walk that counts the steps that it tries."""
-
-    tried = 0
-
-    def _machine_of(self, method: Method) -> Machine:
-        new = method.name not in self._machines
-        machine = super()._machine_of(method)
-        if new:
-            pair = machine.pair
-
-            def counted(*arguments: object) -> object:
-                self.tried += 1
-                return pair(*arguments)  # type: ignore[arg-type]
-
-            vars(machine)["pair"] = counted
-        return machine
+        yield SolverSetting(method.name, FIXED, h, solve, timed)
 
 
-def _chosen(trial: Trial, method: Method, compiled: bool) -> Iterator[Way]:
+def _adaptive(
+    problem: InitialValueProblem, method: Method, compiled: bool
+) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
-        walk = _Counting(trial.system, method.name, tolerance, compiled=compiled)
+        stepper = Walk(problem.system, method.name, tolerance, compiled=compiled)
 
-        def travel(walk: Walk = walk, fresh: Mark = walk.mark()) -> Array:  # noqa: B008
-            walk.go_back(fresh)
-            rows = [list(trial.start)]
-            y, z, order = list(trial.start), list(trial.start), method.order
-            for k in range(trial.count):
-                begin, end = k * trial.interval, (k + 1) * trial.interval
-                for leg in walk.legs(begin, end, y, z, trial.drive, order):
-                    y, z, order = leg.y, leg.z, leg.order
+        def run(stepper: Walk = stepper, fresh: Mark = stepper.mark()) -> Array:  # noqa: B008
+            stepper.go_back(fresh)
+            rows = [list(problem.start)]
+            y, coarse, order = list(problem.start), list(problem.start), method.order
+            for k in range(problem.count):
+                begin, end = k * problem.interval, (k + 1) * problem.interval
+                for step in stepper.legs(begin, end, y, coarse, problem.drive, order):
+                    y, coarse, order = step.y, step.z, step.order
                 rows.append(y)
             return np.array(rows)
 
-        def solve(walk: _Counting = walk, travel: Callable[[], Array] = travel) -> Solution:
-            walk.tried = 0
-            return travel(), 3 * len(method.a) * walk.tried
+        def solve(stepper: Walk = stepper, run: Callable[[], Array] = run) -> tuple[Array, int]:
+            before = stepper.attempts
+            states = run()
+            # Two half steps and a whole one for the error estimate.
+            return states, 3 * len(method.a) * (stepper.attempts - before)
 
-        yield Way(method.name, TOLERANCE, tolerance, solve, travel)
+        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 
 
-def _simulated(trial: Trial, method: Method) -> Iterator[Way]:
+def _simulated(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
 
         def solve(tolerance: float = tolerance) -> tuple[Array, None]:
-            return trial.simulated(method.name, tolerance)[0], None
+            return problem.simulated(method.name, tolerance), None
 
-        yield Way(method.name, TOLERANCE, tolerance, solve, solve)
+        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, solve)

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which step suits a scene, from the spectrum of its linearised dynamics at the start."""
+"""Which method and step suit a scene, from the spectrum of its linearised dynamics at the start.
+
+This is the advice of `scene show` and of the accuracy page, which measures its error.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,45 +20,74 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Simulation
 
 LONGEST_STEP = 1e-2
+"""Longest control period that is recommended [s]."""
+
 STABLE = 3.3
 """Dormand-Prince 5(4) is stable for h abs(lambda) up to about this on the negative real axis."""
 
 ACCURATE = 0.3
 """h abs(lambda) at which its local error is far below 1e-6."""
 
+TOLERANCE = 1e-10
+"""Local tolerance that goes with the advice; `Simulation` divides the period where it must."""
+
 PERIODS, PERIOD_NS = 20, 5_000_000
-"""Over so many periods [ns] auto is watched."""
+"""Number and length [ns] of the control periods over which `auto` is run to see what it chooses."""
 
 
-def advise(scene: Scene) -> str:
-    """Say in a sentence which step and method to use, and why."""
+@dataclass(frozen=True)
+class StepAdvice:
+    """A recommendation.
+
+    Attributes:
+        text: one sentence.
+        method: name of the method.
+        step: longest control period [s]; None where the scene cannot start.
+        stiff: `auto` changes to the implicit method.
+        tolerance: local tolerance.
+
+    """
+
+    text: str
+    method: str = "auto"
+    step: float | None = None
+    stiff: bool = False
+    tolerance: float = TOLERANCE
+
+
+def step_advice(scene: Scene) -> StepAdvice:
+    """Recommend a method and a step for a scene."""
     try:
         simulation = Simulation(scene)
     except SstError as error:
-        return f"none, the scene cannot start: {error}"
+        return StepAdvice(f"none, the scene cannot start: {error}")
     state, dynamics = simulation.state, simulation.dynamics
     lagged = (0.0,) * (len(dynamics.state) - 7)
+    stepper = Walk(System(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
     y = (*state.quaternion, *state.body_rate, *lagged)
-    walk = Walk(System(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
-    eigenvalues = walk.spectrum(0.0, y, (0.0,) * len(dynamics.drive))
+    eigenvalues = stepper.spectrum(0.0, y, (0.0,) * len(dynamics.drive))
     fastest = float(np.abs(eigenvalues).max())
+    name = DORMAND_PRINCE.name
     if fastest == 0.0:
-        return f"dopri5 with steps of {LONGEST_STEP:g} s; nothing moves fast at the start"
-    limit = STABLE / fastest
+        text = f"{name} with steps of {LONGEST_STEP:g} s; nothing moves fast at the start"
+        return StepAdvice(text, name, LONGEST_STEP)
+    limit, rate = STABLE / fastest, f"the fastest rate at the start is {fastest:.3g} 1/s"
     if _stiff(simulation, scene):
-        return (
-            f"auto, which changes to {RODAS4.name}: the scene is stiff; the fastest rate at the "
-            f"start is {fastest:.3g} 1/s, and dopri5 would be unstable in steps above {limit:.2g} s"
+        text = (
+            f"auto, which changes to {RODAS4.name}: the scene is stiff; {rate}, and {name} would "
+            f"be unstable in steps above {limit:.2g} s"
         )
+        return StepAdvice(text, "auto", LONGEST_STEP, stiff=True)
     step = _rounded(min(LONGEST_STEP, ACCURATE / fastest))
-    return (
-        f"dopri5 with steps of {step:g} s or less; the fastest rate at the start is "
-        f"{fastest:.3g} 1/s, and steps above {limit:.2g} s would be unstable"
+    text = (
+        f"{name} with steps of {step:g} s or less; {rate}, and steps above {limit:.2g} s would be "
+        "unstable"
     )
+    return StepAdvice(text, name, step)
 
 
 def _stiff(simulation: Simulation, scene: Scene) -> bool:
-    """Tell whether auto takes the method for stiff motions, over a short run."""
+    """Return whether `auto` changes to the implicit method in a short run."""
     profile = sine(scene.torque) if scene.torque else lambda _: (0.0, 0.0, 0.0)
     try:
         for period in range(PERIODS):
@@ -62,7 +95,7 @@ def _stiff(simulation: Simulation, scene: Scene) -> bool:
             if simulation.method == RODAS4.name:
                 return True
     except SstError:
-        pass  # the run is over before that
+        pass  # the run ends before that
     return False
 
 

@@ -1,252 +1,289 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a study of accuracy solves: a scene, its own torques, the time to its end, and the answer.
-
-Torques are continuous functions of time, not held over ticks: zero where the scene has none. The
-run is compared up to its first stop or impact. Elastic ends and limits of torque have kinks; there
-`Simulation`, which finds them, is the reference.
-"""
+"""Work-precision study: the error of every method and setting on a scene, and what it costs."""
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
+import itertools
 import math
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from sst_ros.control.torque_profiles import sine
-from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import InputError, Problem, RunStopped
-from sst_ros.integration.compiled_method import Machine
-from sst_ros.integration.methods import DOP853
-from sst_ros.integration.ode import System
-from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.report import states
+from sst_ros.dynamics import kernel
+from sst_ros.errors import SingularConfiguration, SstError
+from sst_ros.integration.codegen import numba_version
+from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.geometry import Array
+from sst_ros.progress import slices
+from sst_ros.report import formulation
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation, Torque
-from sst_ros.studies.high_precision import EXTENDED, Long, Precise
+from sst_ros.studies.high_precision import EXTENDED
+from sst_ros.studies.initial_value_problem import InitialValueProblem, StateError
+from sst_ros.studies.reference_solution import ReferenceSolution, solve_reference
+from sst_ros.studies.solver_grid import TOLERANCE, SolverSetting, solver_grid
+from sst_ros.studies.step_advice import StepAdvice, step_advice
 
-INTERVALS = 20
-"""A run is compared at this many instants or more."""
+ABOVE_REFERENCE = 100.0
+"""Errors are reported only if they are so many times larger than the reference's own."""
 
-PATIENCE_S = 20.0
-"""The reference stays in double precision where the longer one would take more than this [s]."""
+USELESS = 0.1
+"""An orientation error above this [rad] is a failure."""
 
-WHOLE_RUN_S = 1.0
-"""Length of the run of a scene that names none [s]."""
+SAME_EQUATIONS = 1e-10
+"""Kernel and the paper's equations must agree to this part."""
+
+ROUNDING = 2e-14
+"""Finer steps are not expected to give less than this [rad]."""
+
+LONGEST_RUN_S = 0.4
+"""No finer settings are tried after a run that took longer than this [s]."""
+
+SLOWER = 5.0
+"""`Simulation` under torques that are functions is plain Python and may take so much longer."""
+
+_REPEAT_S, _REPEATS = 0.15, 15
 
 
 @dataclass(frozen=True)
-class Error:
-    """Distance from the reference: orientation [rad], gamma [rad], gamma_dot [rad/s]."""
-
-    orientation: float
-    gamma: float
-    gamma_dot: float
-
-
-@dataclass(frozen=True)
-class Reference:
-    """The answer: states at the instants, its own error, and how it was found."""
-
-    states: Long
-    own: Error
-    how: str
-
-
-class Trial:
-    """A scene made ready to be solved in many ways.
-
-    Args:
-        scene: what is solved.
-        like: a trial whose instants are taken.
+class SolverResult:
+    """One point of the solver grid.
 
     Attributes:
-        system: derivative by time, torques and work included.
-        drive: constant inputs of it, all zero.
-        start: state at time zero.
-        interval_ns: time between the instants of comparison [ns].
-        count: number of intervals.
-        ends: why the run ends before the scene's duration; empty where it does not.
-
-    Raises:
-        AssemblyError: the initial gamma has no unique admissible assembly.
-        InputError: the scene cannot start, or stops at once.
+        method: name of the method.
+        kind: FIXED or TOLERANCE.
+        setting: length of the steps [s], or the tolerance.
+        evaluations: of the right-hand side, rejected steps included; None where not counted.
+        wall_s: shortest and median wall time of the run [s].
+        final, largest: errors at the end, and the largest over the run; None for a failure.
+        energy, closure: residuals at the end: energy [J], None where work is not integrated, and
+            abs(r_k . t_k).
+        failure: why it failed; empty where it did not.
+        end: last state; nan for a failure.
 
     """
 
-    def __init__(self, scene: Scene, like: Trial | None = None) -> None:
-        self.scene = scene
-        self.geometry = Geometry.of(scene)
-        self.dynamics = Dynamics.of(scene)
-        self.system = System(self.dynamics, scene.torque, work=True)
-        self.drive = (0.0,) * len(self.system.drive)
-        self.start = (*states.initial(scene), 0.0)
-        self.torque: Torque = sine(scene.torque) if scene.torque else (0.0, 0.0, 0.0)
-        limit = scene.actuators.torque_limit if scene.actuators else None
-        asked = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
-        self.clamped = limit is not None and asked > limit
-        self.kinked = self.clamped or scene.stroke.at_end == "elastic"
-        horizon = self._horizon() if like is None else (like.interval_ns, like.count, like.ends)
-        self.interval_ns: int = horizon[0]
-        self.count: int = horizon[1]
-        self.ends: str = horizon[2]
+    method: str
+    kind: str
+    setting: float
+    evaluations: int | None
+    wall_s: tuple[float, float]
+    final: StateError | None
+    largest: StateError | None
+    energy: float | None
+    closure: float | None
+    failure: str
+    end: Array
 
     @property
-    def interval(self) -> float:
-        """Time between the instants of comparison [s]."""
-        return self.interval_ns / NANOSECONDS
+    def error(self) -> float:
+        """Largest error of the orientation [rad]; infinite for a failure."""
+        return self.largest.orientation if self.largest else math.inf
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Result of a work-precision study of a scene.
+
+    Attributes:
+        scene: its name.
+        seconds: time span of the comparison [s].
+        ends: why the span ends before the scene's duration; empty where it does not.
+        compiled: by numba.
+        reference: the reference solution.
+        rows: the solver grid.
+        advice: what `step_advice` recommends, as `scene show` prints it.
+        measured: error [rad] and wall time [s] of `Simulation` with that advice; None where the
+            scene's torques allow no such run.
+        formulation: largest difference of W_dot from the paper's equations along the reference,
+            relative to the largest W_dot; None where it cannot be compared.
+        warnings: contradictions.
+
+    """
+
+    scene: str
+    seconds: float
+    ends: str
+    compiled: bool
+    reference: ReferenceSolution
+    rows: tuple[SolverResult, ...]
+    advice: StepAdvice
+    measured: tuple[float, float] | None
+    formulation: float | None
+    warnings: tuple[str, ...]
 
     @property
-    def seconds(self) -> float:
-        """Time over which the run is compared [s]."""
-        return self.count * self.interval_ns / NANOSECONDS
+    def floor(self) -> float:
+        """Smallest orientation error that is reported [rad]."""
+        return ABOVE_REFERENCE * self.reference.own.orientation
 
-    def errors(self, solution: Array | Long, reference: Long) -> tuple[Error, Error]:
-        """Distances of states (count + 1, n) at the end, and the largest; nan where unknown."""
-        turn = np.minimum(
-            np.linalg.norm(solution[:, :4] - reference[:, :4], axis=1),
-            np.linalg.norm(solution[:, :4] + reference[:, :4], axis=1),
-        )
-        angle = 4.0 * np.arcsin(np.minimum(0.5 * turn, 1.0))
-        joints = np.abs(self.joints(solution) - self.joints(reference))
-        gamma, rate = joints[:, :3].max(axis=1), joints[:, 9:12].max(axis=1)
-        whole = tuple(float(values.max()) for values in (angle, gamma, rate))
-        return Error(float(angle[-1]), float(gamma[-1]), float(rate[-1])), Error(*whole)
+    def best(self, target: float) -> SolverResult | None:
+        """Return the fastest setting with an orientation error of at most `target` [rad].
 
-    def joints(self, solution: Array | Long) -> Array:
-        """Nine angles and nine rates of states, shape (n, 18)."""
-        result = np.full((len(solution), 18), np.nan)
-        for row, y in enumerate(solution[:, :7].astype(float).tolist()):
-            if all(map(math.isfinite, y)):
-                with contextlib.suppress(ArithmeticError, ValueError):
-                    result[row] = self.dynamics.joints(*y)
-        return result
-
-    def residuals(self, y: Array) -> tuple[float, float]:
-        """Energy [J] that nobody has put in, and the largest abs(r_k . t_k), at a final state."""
-        stored = []
-        for state in (self.start, y.tolist()):
-            size = len(self.dynamics.state)
-            zero = (0.0,) * len(self.dynamics.drive)
-            stored.append(sum(self.dynamics.energies(*state[:size], *zero)[:2]))
-        joints = self.joints(y[None])[0]
-        r = kinematics.carriage_directions(self.geometry, joints[:3])
-        t = self.geometry.e @ rotation_matrix(y[:4]).T
-        closure = float(np.abs(np.sum(r * t, axis=1)).max())
-        return float(stored[1] - stored[0] - y[-1]), closure
-
-    def reference(self, kind: str = EXTENDED, *, compiled: bool) -> Reference:
-        """Solve it as well as can be.
-
-        Args:
-            kind: precise.EXTENDED or precise.MPMATH.
-            compiled: search for the step size under numba.
-
+        A setting counts only if at least one finer setting of its method was tried and every one
+        of them is as good: a coarse setting whose errors happen to cancel is no recommendation.
         """
-        return self._by_simulation() if self.kinked else self._by_steps(kind, compiled)
+        good: list[SolverResult] = []
+        for _, group in itertools.groupby(self.rows, key=lambda row: (row.method, row.kind)):
+            fine_first = list(group)[::-1]
+            good += list(itertools.takewhile(lambda row: row.error <= target, fine_first))[1:]
+        return min(good, key=lambda row: row.wall_s[0], default=None)
 
-    @cached_property
-    def _machine(self) -> Machine:
-        return Machine(self.system, DOP853, compiled=False)
 
-    def marched(self, machine: Machine, steps: int) -> Array:
-        """States at the instants by so many steps an interval; nan after the last finite one."""
-        result = np.full((self.count + 1, len(self.start)), np.nan)
-        y = list(self.start)
-        result[0] = y
-        h = self.interval / steps
-        try:
-            with np.errstate(all="ignore"):
-                for k in range(self.count):
-                    y = machine.march(k * self.interval, h, steps, y, self.drive)
-                    result[k + 1] = y
-        except (ArithmeticError, ValueError):
-            pass
-        return result
+def work_precision(
+    scene: Scene,
+    *,
+    solved: Scene | None = None,
+    kind: str = EXTENDED,
+    compiled: bool = True,
+    shown: bool = False,
+    longest_s: float = LONGEST_RUN_S,
+) -> WorkPrecision:
+    """Solve a scene with every method and setting and compare with the reference.
 
-    def _by_steps(self, kind: str, compiled: bool) -> Reference:
-        machine = Machine(self.system, DOP853, compiled=True) if compiled else self._machine
-        found: list[tuple[float, int, Array]] = []
-        before = self.marched(machine, 1)
-        for power in range(1, 14):
-            after = self.marched(machine, 2**power)
-            apart = self.errors(before, after.astype(np.longdouble))[1].orientation
-            if math.isfinite(apart):
-                found.append((apart, 2**power, after))
-            done = len(found) > 1 and (apart < 1e-13 or apart > found[-2][0] < 1e-9)
-            if done or self.count * 2**power > 200_000:
-                break
-            before = after
-        if not found:
-            raise InputError(self.scene.name, [Problem("duration", self.scene.duration,
-                             "the reference finds no finite motion")])  # fmt: skip
-        best = min(found, key=lambda row: row[0])
-        precise = Precise(self.system.program, kind, self.drive)
-        began = time.perf_counter()
-        for _ in range(3):
-            precise.evaluate(self.start)
-        cost = (time.perf_counter() - began) / 3 * 1.5 * 12 * self.count
-        steps = (3 * best[1] // 2, 2 * best[1])
-        if kind != EXTENDED or cost * sum(steps) < PATIENCE_S:
-            rough, fine = (precise.solve(self.start, self.interval, self.count, n) for n in steps)
-            how = f"DOP853, {self.interval / steps[1]:.3g} s steps, {precise.numbers.name}"
+    Args:
+        scene: what the reference solves.
+        solved: what the methods solve, if it is another scene: the study must see the difference.
+        kind: arithmetic of the reference, high_precision.EXTENDED or MPMATH.
+        compiled: by numba, where it is installed.
+        shown: draw a progress bar on the terminal.
+        longest_s: no finer settings are tried after a run that took longer than this [s].
+
+    Raises:
+        AssemblyError: the initial gamma has no unique admissible assembly.
+        InputError: the scene cannot start, or mpmath is asked for and not installed.
+
+    """
+    compiled = compiled and numba_version() is not None
+    target = InitialValueProblem(scene)
+    problem = target if solved is None else InitialValueProblem(solved, like=target)
+    grid = solver_grid(problem, compiled)
+    rows: list[SolverResult] = []
+    truth: ReferenceSolution | None = None
+    for part in slices(len(grid) + 1, 1, f"{scene.name:<16}", shown):
+        if truth is None:
+            truth = solve_reference(target, kind, compiled=compiled)
         else:
-            fine = best[2].astype(np.longdouble)
-            rough = self.marched(machine, best[1] // 2).astype(np.longdouble)
-            how = f"DOP853, {self.interval / best[1]:.3g} s steps, double precision"
-        return Reference(fine, self._own(rough, fine), how)
+            rows += _refined(grid[part.start - 1], problem, truth, longest_s)
+    assert truth is not None
+    difference = _formulation(target, truth)
+    advice = step_advice(scene)
+    return WorkPrecision(
+        scene.name, target.seconds, target.ends, compiled, truth, tuple(rows), advice,
+        _measured(problem, truth, advice), difference,
+        tuple(_warnings(problem, truth, rows, difference)),
+    )  # fmt: skip
 
-    def _by_simulation(self) -> Reference:
-        rough, fine = (self.simulated("dop853", eps)[0].astype(np.longdouble)
-                       for eps in (1e-13, 1e-14))  # fmt: skip
-        return Reference(fine, self._own(rough, fine), "Simulation, dop853, tolerance 1e-14")
 
-    def _own(self, rough: Long, fine: Long) -> Error:
-        """Tell twice what two step sizes differ by, but not less than what doubles can tell."""
-        apart, joints = self.errors(rough, fine)[1], np.abs(self.joints(fine))
-        gamma, rate = (2.3e-16 * float(joints[:, i : i + 3].max()) for i in (0, 9))
-        return Error(max(2.0 * apart.orientation, 1e-17), max(2.0 * apart.gamma, gamma),
-                     max(2.0 * apart.gamma_dot, rate))  # fmt: skip
+def _refined(
+    settings: Iterator[SolverSetting],
+    problem: InitialValueProblem,
+    truth: ReferenceSolution,
+    longest_s: float,
+) -> Iterator[SolverResult]:
+    """Go from coarse to fine until a run takes long or two errors lie below the floor."""
+    below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
+    for setting in settings:
+        row = _result(setting, problem, truth)
+        yield row
+        below += row.error < max(floor, ROUNDING)
+        slower = SLOWER if problem.kinked and setting.kind == TOLERANCE else 1.0
+        if row.wall_s[0] > longest_s * slower or below > 1:
+            return
 
-    def simulated(self, method: str, tolerance: float) -> tuple[Array, Simulation]:
-        """States at the instants by a `Simulation`, which runs as it does for everybody.
 
-        Raises:
-            RunStopped: it comes to an end before the others.
-
-        """
-        simulation = Simulation(self.scene, method, tolerance=tolerance)
-        rows = [np.array(self.start)]
-        for _ in range(self.count):
-            now = simulation.step(self.torque, self.interval_ns)
-            padding = (math.nan,) * (len(self.start) - 7)
-            rows.append(np.array([*now.quaternion, *now.body_rate, *padding]))
-        return np.array(rows), simulation
-
-    def _horizon(self) -> tuple[int, int, str]:
-        whole = self.scene.duration or WHOLE_RUN_S
-        stopping = self.scene
-        if self.scene.stroke.at_end == "impact":
-            stroke = dataclasses.replace(self.scene.stroke, at_end="stop", restitution=None)
-            stopping = dataclasses.replace(self.scene, stroke=stroke)
-        simulation, ends = Simulation(stopping, tolerance=1e-9), ""
+def _result(
+    setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
+) -> SolverResult:
+    states, evaluations, failure = np.full((1, len(problem.start)), np.nan), None, ""
+    wall = (0.0, 0.0)
+    with np.errstate(all="ignore"):
         try:
-            for _ in range(100):
-                simulation.step(self.torque, round(whole / 100 * NANOSECONDS))
-        except RunStopped as stopped:
-            what = "impact" if stopping is not self.scene else "stop"
-            ends = f"{what} at {stopped.time:.6f} s, {stopped.reason}"
-            whole = stopped.time
-        if whole * NANOSECONDS < 1000 * INTERVALS:
-            allowed = f"the run is over before it can be studied: {ends or f'{whole} s'}"
-            raise InputError(self.scene.name, [Problem("initial", whole, allowed)])
-        tick = 10.0 ** math.floor(math.log10(whole / INTERVALS) + 1e-9)
-        tick *= max(f for f in (1, 2, 5) if f * tick * INTERVALS <= whole * (1 + 1e-9))
-        interval_ns = round(tick * NANOSECONDS)
-        return interval_ns, math.floor(whole * NANOSECONDS * (1 + 1e-9) / interval_ns), ends
+            states, evaluations = setting.solve()
+            wall = _timed(setting.timed)
+        except (SstError, ArithmeticError, ValueError) as error:
+            failure = str(error).splitlines()[0] if str(error) else "not finite"
+    if not failure and not np.isfinite(states[:, :7]).all():
+        failure = "not finite"
+    final = largest = energy = closure = None
+    if not failure:
+        final, largest = problem.errors(states, truth.states)
+        if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
+            failure, final, largest = f"off by {largest.orientation:.1g} rad", None, None
+        else:
+            residual, closure = problem.residuals(states[-1])
+            energy = residual if math.isfinite(residual) else None
+    return SolverResult(setting.method, setting.kind, setting.setting, evaluations, wall, final,
+                        largest, energy, closure, failure, states[-1])  # fmt: skip
+
+
+def _timed(run: Callable[[], object]) -> tuple[float, float]:
+    walls: list[float] = []
+    while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
+        began = time.perf_counter()
+        run()
+        walls.append(time.perf_counter() - began)
+        if walls[-1] > LONGEST_RUN_S:
+            break
+    return min(walls), float(np.median(walls))
+
+
+def _measured(
+    problem: InitialValueProblem, truth: ReferenceSolution, advice: StepAdvice
+) -> tuple[float, float] | None:
+    """Run `Simulation` as advised; implicit methods take no torques that are functions of time."""
+    if advice.step is None or (advice.stiff and callable(problem.torque)):
+        return None
+    began = time.perf_counter()
+    try:
+        periods = math.ceil(problem.interval / advice.step * (1.0 - 1e-9))
+        states = problem.simulated(advice.method, advice.tolerance, periods)
+    except SstError:
+        return None
+    return problem.errors(states, truth.states)[1].orientation, time.perf_counter() - began
+
+
+def _formulation(problem: InitialValueProblem, truth: ReferenceSolution) -> float | None:
+    """Compare the kernel with the paper's equations along the reference; loads are left out."""
+    bare = Scene(**{name: getattr(problem.scene, name) for name in formulation.PAPER})
+    mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
+    differences, sizes = [], []
+    for k, state in enumerate(truth.states[:, :7].astype(float).tolist()):
+        given = problem.torque
+        torque = given(k * problem.interval) if callable(given) else given
+        try:
+            paper = formulation.of_the_paper(mechanism, tuple(state), np.array(torque))
+        except (SingularConfiguration, np.linalg.LinAlgError):
+            continue
+        ours = np.array(kernel.derivative(model, tuple(state), torque)[4:7])
+        differences.append(float(np.linalg.norm(ours - paper)))
+        sizes.append(float(np.linalg.norm(paper)))
+    return max(differences) / max(sizes) if sizes and max(sizes) > 0.0 else None
+
+
+def _warnings(
+    problem: InitialValueProblem,
+    truth: ReferenceSolution,
+    rows: list[SolverResult],
+    difference: float | None,
+) -> Iterator[str]:
+    if difference is not None and difference > SAME_EQUATIONS:
+        yield f"the kernel differs from the paper's equations by {difference:.1e}"
+    if problem.clamped:
+        yield "the torques are clamped to the actuators' limit: no fixed steps are tried"
+    best: dict[str, tuple[float, SolverResult]] = {}
+    for row in rows:
+        error = row.final.orientation if row.final else math.inf
+        if row.final and error < best.get(row.method, (math.inf,))[0]:
+            best[row.method] = error, row
+    for (error, one), (other_error, other) in itertools.combinations(best.values(), 2):
+        pair = np.stack([one.end, other.end])[:, :7]
+        apart = problem.errors(pair[:1], pair[1:].astype(np.longdouble))[0].orientation
+        least = min(error, other_error)
+        if least > 100.0 * max(apart, 10.0 * truth.own.orientation, 1e-13):
+            yield (
+                f"{one.method} and {other.method} agree to {apart:.1e} rad, but are {least:.1e} "
+                "rad off the reference: they do not solve what the reference solves"
+            )
+            return

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One style for all figures: colours, lines, sizes, and how a figure is saved.
+
+A function that draws takes data and returns a `Figure`; `styled` gives it the style.
+"""
+
+from __future__ import annotations
+
+import functools
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sst_ros.mechanism.geometry import Array
+
+BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
+"""Colours that the colour-blind can distinguish (Okabe and Ito); line styles differ too."""
+
+LINES: tuple[dict[str, Any], ...] = (
+    {"color": BLUE, "linestyle": "-", "linewidth": 2.6},
+    {"color": VERMILION, "linestyle": "--", "linewidth": 1.8},
+    {"color": GREEN, "linestyle": ":", "linewidth": 1.8},
+    {"color": PURPLE, "linestyle": "-.", "linewidth": 1.5},
+    {"color": ORANGE, "linestyle": (0, (5, 1)), "linewidth": 1.2},
+    {"color": "#000000", "linestyle": "-", "linewidth": 0.8},
+)
+"""Curves that may coincide: each is thinner than the one below it, so that all can be seen."""
+
+STYLE: Any = {
+    "figure.dpi": 150,
+    "savefig.dpi": 150,
+    "figure.constrained_layout.use": True,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.formatter.useoffset": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.alpha": 0.35,
+    "legend.framealpha": 0.85,
+    "lines.solid_capstyle": "butt",
+    "agg.path.chunksize": 1000,  # long jagged curves in one piece take hundreds of megabytes
+}
+
+SMALLEST_SHOWN = 1e-17
+"""Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
+
+SUBSCRIPTS = "₁₂₃"
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Give a function that makes a figure the style."""
+
+    @functools.wraps(function)
+    def within(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        with mpl.rc_context(STYLE):
+            return function(*args, **kwargs)
+
+    return within
+
+
+@styled
+def save_figure(figure: Figure, *paths: Path) -> None:
+    """Write a figure into files; their suffixes name the formats."""
+    for path in paths:
+        figure.savefig(path)
+
+
+def three(letter: str) -> tuple[str, str, str]:
+    """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
+    first, second, third = (f"{letter}{subscript}" for subscript in SUBSCRIPTS)
+    return first, second, third
+
+
+def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:
+    """Make panels one above the other with a common time axis."""
+    figure = Figure(figsize=(7.0, 1.0 + height * len(labels)))
+    grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, label in zip(grid, labels, strict=True):
+        axes.set_ylabel(label)
+    grid[-1].set_xlabel("time t [s]")
+    return figure, list(grid)
+
+
+def lines(
+    axes: Axes, seconds: Array, values: Array, names: Sequence[str], *, least_span: float = 0.0
+) -> None:
+    """Draw columns over time, the legend above the panel.
+
+    An axis never shows less than `least_span`, so that rounding is a flat line.
+    """
+    for column, name, style in zip(values.T, names, LINES, strict=False):
+        axes.plot(seconds, column, label=name, **style)
+    known = values[np.isfinite(values)]
+    if len(known) and np.ptp(known) < least_span:
+        middle = 0.5 * float(known.min() + known.max())
+        axes.set_ylim(middle - 0.5 * least_span, middle + 0.5 * least_span)
+    if len(names) > 1:
+        legend(axes)
+    span([axes], seconds)
+
+
+def legend(axes: Axes) -> None:
+    """Put the legend above the panel, where no curve can be."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=4, borderaxespad=0.1, fontsize=8,
+        frameon=False,
+    )  # fmt: skip
+
+
+def span(panels: Sequence[Axes], seconds: Array) -> None:
+    """Show the whole run and no more."""
+    for axes in panels:
+        axes.set_xlim(float(np.min(seconds)), float(np.max(seconds)))
+
+
+def note(figure: Figure, text: str, width: int) -> None:
+    """Write a note of `width` letters a line at the foot of a figure."""
+    lines = [part for line in text.splitlines() for part in textwrap.wrap(line, width)]
+    figure.text(0.01, 0.01, "\n".join(lines), fontsize=6.5, color="#555555", va="bottom")
+
+
+def positive(values: Array) -> Array:
+    """Return values for a logarithmic axis: nan for what lies below SMALLEST_SHOWN."""
+    return np.asarray(np.where(values > SMALLEST_SHOWN, values, np.nan))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figure of a work-precision study: error against wall time, both logarithmic."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from sst_ros.plot.style import BLUE, GREEN, INK, PURPLE, VERMILION, note, styled
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+MARKERS = {
+    "rk4": (BLUE, "o"), "dopri5": (VERMILION, "s"), "dop853": (GREEN, "^"), "rodas4": (PURPLE, "D"),
+}  # fmt: skip
+"""Colour and marker of each method; steps are solid and full, tolerances dashed and hollow."""
+
+FIXED = "fixed steps"
+
+
+@styled
+def draw_work_precision(
+    rows: DataFrame,
+    *,
+    floors: tuple[float, float],
+    seconds: float,
+    target: float,
+    best: tuple[float, float] | None,
+    title: str,
+    footnote: str,
+) -> Figure:
+    """Draw the largest errors of orientation and actuator rates side by side.
+
+    Args:
+        rows: the solver grid: method, kind, wall_min_s, largest_orientation_rad,
+            largest_gamma_dot_rad_per_s, failure.
+        floors: smallest errors of both that are drawn [rad], [rad/s].
+        seconds: time span of the run [s].
+        target: error of the orientation that is marked [rad].
+        best: wall time [ms] and error [rad] of the fastest setting for the target.
+        title: two lines.
+        footnote: small print.
+
+    """
+    figure = Figure(figsize=(11.0, 6.4), layout="none")
+    panels = figure.subplots(1, 2, sharex=True)
+    figure.subplots_adjust(left=0.075, right=0.985, top=0.875, bottom=0.205, wspace=0.2)
+    quantities = ("largest_orientation_rad", "largest_gamma_dot_rad_per_s")
+    labels = ("largest error of the orientation [rad]", "largest error of γ̇ [rad/s]")
+    for axes, quantity, floor, label in zip(panels, quantities, floors, labels, strict=True):
+        _panel(axes, rows, quantity, floor)
+        axes.set_ylabel(label)
+        axes.set_xlabel(f"wall time for {seconds:g} s of motion [ms]")
+    if best is not None:
+        panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
+        panels[0].plot(*best, "o", markersize=14, markerfacecolor="none", markeredgecolor=INK,
+                       markeredgewidth=1.4, zorder=5)  # fmt: skip
+    figure.legend(handles=_legend(rows, target if best else None), loc="center",
+                  bbox_to_anchor=(0.5, 0.095), ncol=8, fontsize=8.5, frameon=False)  # fmt: skip
+    figure.suptitle(title, fontsize=12)
+    note(figure, footnote, 185)
+    return figure
+
+
+def _panel(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
+    for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
+        colour, marker = MARKERS[name]
+        fixed = kind == FIXED
+        axes.plot(1e3 * group.wall_min_s, group[quantity], color=colour, marker=marker,
+                  markersize=6.5, linestyle="-" if fixed else "--", linewidth=1.5,
+                  markerfacecolor=colour if fixed else "white", markeredgecolor=colour,
+                  zorder=3)  # fmt: skip
+    errors: Any = drawn[quantity]
+    high = 10.0 ** math.ceil(math.log10(errors.max() if len(errors) else 1.0) + 0.01)
+    low = 10.0 ** math.floor(math.log10(errors.min() if len(errors) else high * 1e-3) - 0.7)
+    top = high * (high / low) ** 0.1
+    failed = rows[rows.failure != ""]
+    if len(failed):
+        _failures(axes, failed, high, top)
+    if floor > low:
+        axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
+        axes.text(0.02, math.sqrt(low * floor), "100 × the reference's own error: none plotted",
+                  transform=axes.get_yaxis_transform(), fontsize=7.5, va="center")  # fmt: skip
+    axes.set_ylim(low, top)
+    axes.yaxis.set_major_locator(LogLocator(numticks=12))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _failures(axes: Axes, failed: DataFrame, high: float, top: float) -> None:
+    """Show failures in a band above everything, at their wall time."""
+    axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
+    middle = math.sqrt(high * top)
+    axes.text(0.99, middle, f"failed: {len(failed)}", transform=axes.get_yaxis_transform(),
+              ha="right", va="center", fontsize=8.5)  # fmt: skip
+    for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
+        colour, marker = MARKERS[name]
+        x = wall if wall > 0.0 else np.nan
+        axes.plot(x, middle, marker, color=colour, markerfacecolor="none", markersize=6.5, zorder=3)
+        axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
+
+
+def _legend(rows: DataFrame, target: float | None) -> list[Line2D]:
+    handles = [
+        Line2D([], [], color=colour, marker=marker, label=name, linewidth=1.5)
+        for name, (colour, marker) in MARKERS.items() if name in set(rows.method)
+    ]  # fmt: skip
+    handles.append(Line2D([], [], color=INK, marker="o", label="fixed steps (full)"))
+    handles.append(Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="--",
+                          label="tolerance (hollow)"))  # fmt: skip
+    if (rows.failure != "").any():
+        handles.append(Line2D([], [], color=INK, marker="x", linestyle="none", label="failed"))
+    if target is not None:
+        handles.append(Line2D([], [], color=INK, marker="o", linestyle=":", markersize=11,
+                              markerfacecolor="none", label=f"fastest for {target:g} rad"))  # fmt: skip
+    return handles
