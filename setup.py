@@ -56,7 +56,7 @@ setup(
         "ros": wheels("kilted"),
         "jazzy": wheels("jazzy"),
         "record": ["rosbags>=0.11"],
-        "report": ["rosbags>=0.11", "matplotlib>=3.5"],
+        "report": ["rosbags>=0.11", "matplotlib>=3.5", "pandas>=2"],
         "export": ["rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
         "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
         "fast": ["numba>=0.57"],

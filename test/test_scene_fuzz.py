@@ -19,7 +19,7 @@ from sst_ros.cli.scene_check import check
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import Scene, names
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.studies.scene_summary import sheet
+from sst_ros.studies.scene_summary import summary
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCES = {name: (FOLDER / f"{name}.yaml").read_text(encoding="utf-8") for name in names()}
@@ -79,7 +79,7 @@ def judged(source, path, described=False):
         assert [p.key for p in error.problems] == ["initial.gamma"]
         assert "gamma" in source.splitlines()[error.problems[0].line - 1]
     if described:
-        assert sheet(scene).startswith(scene.name)
+        assert summary(scene).startswith(scene.name)
 
 
 @pytest.fixture(scope="module")

@@ -34,9 +34,9 @@ def _list(_: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace) -> None:
-    from sst_ros.studies.scene_summary import sheet
+    from sst_ros.studies.scene_summary import summary
 
-    print(sheet(scene.load(options.scene)), end="")
+    print(summary(scene.load(options.scene)), end="")
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -11,8 +11,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from sst_ros.plot.accuracy import LOOKS
 from sst_ros.plot.paper_figures import STYLE
+from sst_ros.plot.work_precision import MARKERS as LOOKS
 from sst_ros.studies.stability import LONGEST_S, Stable
 
 

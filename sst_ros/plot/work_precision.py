@@ -49,7 +49,8 @@ def draw_work_precision(
         footnote: small print.
 
     """
-    figure = Figure(figsize=(11.0, 6.4), layout="none")
+    figure = Figure(figsize=(11.0, 6.4))
+    figure.set_layout_engine("none")
     panels = figure.subplots(1, 2, sharex=True)
     figure.subplots_adjust(left=0.075, right=0.985, top=0.875, bottom=0.205, wspace=0.2)
     quantities = ("largest_orientation_rad", "largest_gamma_dot_rad_per_s")

@@ -117,7 +117,9 @@ def fastest(study: WorkPrecision, target: float = TARGET) -> str:
     if best is None:
         least = min((row.error for row in study.rows if row.largest), default=None)
         reached = "every one failed" if least is None else f"the least error is {least:.0e} rad"
-        return f"No setting that was tried reaches {target:.0e} rad with every finer one; {reached}."
+        return (
+            f"No setting that was tried reaches {target:.0e} rad with every finer one; {reached}."
+        )
     return f"{target:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best)}."
 
 

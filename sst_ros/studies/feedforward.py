@@ -40,7 +40,7 @@ from sst_ros.studies.channel import Channel
 from sst_ros.studies.control_loop import Loop, follow
 from sst_ros.studies.hold_order import Exact, Hold, exact, held
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
-from sst_ros.studies.pool import answers
+from sst_ros.studies.parallel import evaluate_grid
 
 REST_S = 0.3
 """Time for which a loop goes on after the motion, to see whether it settles [s]."""
@@ -168,7 +168,9 @@ def study(plan: Plan, *, workers: int | None = None, shown: bool = False) -> Stu
         for at in INSTANTS for n in plan.multiples
     ]  # fmt: skip
     questions: list[Callable[[], Any]] = [*limits, *loops, partial(_exact, scene), *holds]
-    found = answers(_asked, questions, workers=workers, label=f"{scene.name:<16}", shown=shown)
+    found = evaluate_grid(
+        _asked, questions, workers=workers, label=f"{scene.name:<16}", shown=shown
+    )
     bounds, found = found[: len(limits)], found[len(limits) :]
     outcomes, found = found[: len(loops)], found[len(loops) :]
     return Study(

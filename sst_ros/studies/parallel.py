@@ -24,7 +24,7 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
-def evaluate(
+def evaluate_grid(
     function: Callable[[Point], Result],
     points: Sequence[Point],
     *,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sheet of a scene: what it is made of, what each term costs, what to run it with."""
+"""Summary of a scene: what it consists of, what each term costs, advice for its step."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sst_ros.dynamics.limits import limits_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.step_advice import advise
+from sst_ros.studies.step_advice import step_advice
 from sst_ros.studies.term_costs import costs
 
 WIDTH = 100
 
 
-def sheet(scene: Scene) -> str:
-    """Write the sheet of a scene as text."""
+def summary(scene: Scene) -> str:
+    """Write the summary of a scene as text."""
     dynamics = Dynamics.of(scene)
     parts = (
         [f"{scene.name}: {scene.description}"],
@@ -28,8 +28,8 @@ def sheet(scene: Scene) -> str:
         _right_hand_side(scene, dynamics),
         ["ends", *_columns(_ends(scene))],
         ["topics of the simulator", *_columns(_topics(dynamics))],
-        ["suggestion", *_wrapped(advise(scene), "  ")],
-        ["where the numbers come from", *_columns(scene.provenance)],
+        ["advice", *_wrapped(step_advice(scene).text, "  ")],
+        ["sources of the numbers", *_columns(scene.provenance)],
     )
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
@@ -55,7 +55,10 @@ def _run(scene: Scene) -> Iterator[tuple[str, str]]:
         rows = zip(tau.amplitude, tau.frequency, tau.phase, strict=True)
         yield "torque", ", ".join(f"{a:g} sin({f:g} t + {p:.6g})" for a, f, p in rows) + " N m"
     if scene.motion is not None:
-        yield "motion", f"{scene.motion.kind}; `python -m sst_ros plan check` says what it asks for"
+        yield (
+            "motion",
+            f"{scene.motion.kind}; `python -m sst_ros plan check` shows what it requires",
+        )
     yield "duration", "open" if scene.duration is None else f"{scene.duration:g} s"
 
 
@@ -75,7 +78,7 @@ def _right_hand_side(scene: Scene, dynamics: Dynamics) -> list[str]:
     absent = [cost for cost in found if not cost.present]
     total = sum(cost.adds for cost in absent)
     names = ", ".join(cost.name for cost in absent) or "none"
-    lines += ["", f"terms left out, {total} operations", *_wrapped(names, "  ")]
+    lines += ["", f"terms absent, {total} operations", *_wrapped(names, "  ")]
     return lines
 
 
@@ -100,13 +103,13 @@ def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Write pairs in two columns, the second one wrapped."""
     pairs = list(rows)
     width = max((len(name) for name, _ in pairs), default=0)
-    for name, said in pairs:
-        yield from _wrapped(said, f"  {name:<{width}}  ")
+    for name, text in pairs:
+        yield from _wrapped(text, f"  {name:<{width}}  ")
 
 
-def _wrapped(said: str, first: str) -> list[str]:
+def _wrapped(text: str, first: str) -> list[str]:
     return textwrap.wrap(
-        said,
+        text,
         WIDTH,
         initial_indent=first,
         subsequent_indent=" " * len(first),

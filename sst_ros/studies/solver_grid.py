@@ -46,9 +46,7 @@ class SolverSetting:
     timed: Callable[[], object]
 
 
-def solver_grid(
-    problem: InitialValueProblem, compiled: bool
-) -> list[Iterator[SolverSetting]]:
+def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[SolverSetting]]:
     """Return the settings by method and kind, each from coarse to fine."""
     found: list[Iterator[SolverSetting]] = []
     for method in METHODS.values():

@@ -27,7 +27,7 @@ from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import Simulation
 from sst_ros.studies.extreme_cases import Case, cases, run
-from sst_ros.studies.work_precision import Trial
+from sst_ros.studies.initial_value_problem import InitialValueProblem
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
 """Viscous coefficients of the stiff family [N m s/rad]."""
@@ -127,14 +127,14 @@ def _stored(simulation: Simulation, y: Vector) -> float:
     return float(sum(dynamics.energies(*y, *rest)[:2]))
 
 
-def largest_step(trial: Trial, method: Method) -> float:
+def largest_step(problem: InitialValueProblem, method: Method) -> float:
     """Find by bisection the longest step [s] with which rates do not run away."""
-    machine = Machine(trial.system, method, compiled=False)
+    machine = Machine(problem.system, method, compiled=False)
 
     def stable(h: float) -> bool:
         try:
             with np.errstate(all="ignore"):
-                y = machine.march(0.0, h, _STEPS, list(trial.start), trial.drive)
+                y = machine.march(0.0, h, _STEPS, list(problem.start), problem.drive)
         except (ArithmeticError, ValueError):
             return False
         return all(map(math.isfinite, y)) and math.hypot(*y[4:7]) < _RUNAWAY
@@ -160,12 +160,12 @@ def family(*, shown: bool = False) -> list[Stable]:
     stiff, found = scenes.load("stiff"), []
     for part in slices(len(VISCOSITIES), 1, "largest steps  ", shown):
         viscosity = VISCOSITIES[part.start]
-        trial = Trial(viscous(stiff, viscosity))
-        walk = Walk(trial.system, "dopri5", 1e-6, compiled=False)
-        spectrum = walk.spectrum(0.0, trial.start, trial.drive)
+        problem = InitialValueProblem(viscous(stiff, viscosity))
+        walk = Walk(problem.system, "dopri5", 1e-6, compiled=False)
+        spectrum = walk.spectrum(0.0, problem.start, problem.drive)
         decay = float(-spectrum.real.min())
         for method in METHODS.values():
-            found.append(Stable(method.name, viscosity, decay, largest_step(trial, method)))
+            found.append(Stable(method.name, viscosity, decay, largest_step(problem, method)))
     return found
 
 

@@ -20,7 +20,7 @@ class Term:
     """Something that a scene may have.
 
     Attributes:
-        name: what it is called in the sheet.
+        name: its name in the summary.
         value: what the scene has of it, falsy for nothing.
         without: the scene without it.
 

@@ -11,6 +11,7 @@ from sst_ros import scene
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.stability import draw
 from sst_ros.studies import extreme_cases
+from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.stability import (
     LONGEST_S,
     Stable,
@@ -20,7 +21,6 @@ from sst_ros.studies.stability import (
     viscous,
 )
 from sst_ros.studies.stability_report import lines
-from sst_ros.studies.work_precision import Trial
 
 CASES = list(extreme_cases.cases())
 
@@ -34,13 +34,13 @@ def test_a_bound_is_found_to_one_per_cent():
 @pytest.mark.parametrize(("method", "reach"), [("rk4", 2.785), ("dopri5", 3.307)])
 def test_the_largest_step_is_that_of_the_theory(method, reach):
     """The ends of the real stability intervals, Hairer & Wanner, section IV.2."""
-    trial = Trial(viscous(scene.load("stiff"), 1e3))
-    assert largest_step(trial, METHODS[method]) * 4237.0 == pytest.approx(reach, rel=0.02)
+    problem = InitialValueProblem(viscous(scene.load("stiff"), 1e3))
+    assert largest_step(problem, METHODS[method]) * 4237.0 == pytest.approx(reach, rel=0.02)
 
 
 def test_the_implicit_method_is_stable_everywhere():
-    trial = Trial(viscous(scene.load("stiff"), 1e5))
-    assert largest_step(trial, METHODS["rodas4"]) == LONGEST_S
+    problem = InitialValueProblem(viscous(scene.load("stiff"), 1e5))
+    assert largest_step(problem, METHODS["rodas4"]) == LONGEST_S
 
 
 def test_right_and_wrong_are_told_apart():

@@ -12,12 +12,12 @@ from sst_ros.integration.ode import System
 from sst_ros.report import states
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
-from sst_ros.studies.step_advice import advise
+from sst_ros.studies.step_advice import step_advice
 
 
 def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():
     stiff = load("stiff")
-    assert re.match(r"auto, which changes to rodas4: the scene is stiff;", advise(stiff))
+    assert re.match(r"auto, which changes to rodas4: the scene is stiff;", step_advice(stiff).text)
     simulation = Simulation(stiff)
     for _ in range(20):
         simulation.step((0.0, 0.0, 0.0), 5_000_000)
@@ -27,7 +27,7 @@ def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():
 @pytest.mark.parametrize("name", ["friction", "spiral", "reach"])
 def test_the_advised_steps_of_other_scenes_resolve_their_motion(name):
     scene = load(name)
-    step = float(re.match(r"dopri5 with steps of (\S+) s or less", advise(scene))[1])
+    step = float(re.match(r"dopri5 with steps of (\S+) s or less", step_advice(scene).text)[1])
     system = System(Dynamics.of(scene))
     machine = Machine(system, DORMAND_PRINCE, compiled=False)
     start = list(states.initial(scene))

@@ -13,14 +13,15 @@ from matplotlib import image
 
 from sst_ros import scene
 from sst_ros.errors import InputError
-from sst_ros.plot.accuracy import draw
+from sst_ros.plot.style import save_figure
 from sst_ros.scene.bodies import Inertia
-from sst_ros.studies.accuracy import ABOVE_REFERENCE, study
-from sst_ros.studies.accuracy_report import page
-from sst_ros.studies.accuracy_table import COLUMNS, advice, as_csv, as_json, text
-from sst_ros.studies.high_precision import EXTENDED, MPMATH, Precise
+from sst_ros.studies.accuracy_report import COLUMNS, documents, fastest, figure, frame, page, text
+from sst_ros.studies.high_precision import EXTENDED, MPMATH, HighPrecisionDop853
+from sst_ros.studies.initial_value_problem import InitialValueProblem, StateError
+from sst_ros.studies.results import write
+from sst_ros.studies.scene_summary import summary
 from sst_ros.studies.solver_grid import FIXED, TOLERANCE
-from sst_ros.studies.work_precision import Trial
+from sst_ros.studies.work_precision import ABOVE_REFERENCE, SolverResult, work_precision
 
 SHORT = dataclasses.replace(scene.load("example2"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
@@ -30,7 +31,7 @@ EXACT = np.finfo(np.longdouble).eps < 1e-18
 @pytest.fixture(scope="module")
 def short():
     """Study of 0.2 s of Example 2 in plain Python."""
-    return study(SHORT, compiled=False, longest_s=0.02)
+    return work_precision(SHORT, compiled=False, longest_s=0.02)
 
 
 def _rows(found, method, kind=FIXED):
@@ -47,9 +48,11 @@ def test_the_reference_is_better_than_doubles_can_be(short):
 def test_the_reference_is_what_mpmath_finds():
     """At the same steps, so that only the arithmetic differs."""
     pytest.importorskip("mpmath")
-    trial = Trial(SHORT)
+    problem = InitialValueProblem(SHORT)
     ours, theirs = (
-        Precise(trial.system.program, kind, trial.drive).solve(trial.start, trial.interval, 2, 2)
+        HighPrecisionDop853(problem.system.program, kind, problem.drive).solve(
+            problem.start, problem.interval, 2, 2
+        )
         for kind in (EXTENDED, MPMATH)
     )
     assert np.abs(ours - theirs).max() < 1e-17
@@ -81,16 +84,53 @@ def test_every_row_is_whole(short):
 
 def test_what_it_writes_can_be_read(short, tmp_path):
     said = text(short)
-    assert advice(short) in said and advice(short).startswith("1e-09 rad over 0.2 s: ")
+    assert fastest(short) in said and fastest(short).startswith("1e-09 rad over 0.2 s: ")
     assert all(len(line) < 200 for line in said.splitlines())
-    rows = list(csv.DictReader(io.StringIO(as_csv([short]))))
+    write(tmp_path, "accuracy", csv=frame([short]), document={"studies": list(documents([short]))},
+          page=page([short]), figures={"picture": figure(short)})  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
-    document = json.loads(as_json([short]))
+    assert [float(row["wall_min_s"]) for row in rows] == [row.wall_s[0] for row in short.rows]
+    document = json.loads((tmp_path / "accuracy.json").read_text())
     assert document["studies"][0]["rows"][0]["method"] == "rk4" and "date" in document["report"]
-    assert "accuracy_example2.png" in page([short])
-    draw(short, tmp_path / "picture.png")
+    assert "accuracy_example2.png" in (tmp_path / "accuracy.md").read_text()
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
+
+
+def graded(*errors):
+    """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
+    rows = [
+        SolverResult(
+            "dop853", FIXED, 0.5**k, 1, (1e-3 * (k + 1),) * 2, None,
+            StateError(error, 0.0, 0.0) if error else None, None, None, "", np.zeros(7),
+        )
+        for k, error in enumerate(errors)
+    ]  # fmt: skip
+    return dataclasses.replace(
+        work_precision(BRIEF, compiled=False, longest_s=0.0), rows=tuple(rows)
+    )
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ((1e-5, 2.8e-7, 3.1e-6, 5e-7, 1e-7), 3),  # the second is luck: its errors cancel
+        ((1e-5, 2.8e-7, 1e-8, 1e-9), 1),
+        ((1e-5, 1e-5, 2.8e-7), None),  # nothing finer was tried
+        ((1e-7, None, 1e-8, 1e-9), 2),  # a failure in between
+        ((1e-3, 1e-4), None),
+    ],
+)
+def test_a_setting_counts_only_if_every_finer_one_is_as_good(errors, chosen):
+    best = graded(*errors).best(1e-6)
+    assert (None if best is None else best.setting) == (None if chosen is None else 0.5**chosen)
+
+
+def test_the_page_gives_the_advice_of_the_scene_summary(short):
+    assert short.advice.text in summary(SHORT).replace("\n  ", " ")
+    assert f"Advice: {short.advice.text}" in page([short])
+    assert short.measured[0] < 1e-6
 
 
 def test_another_inertia_in_the_runs_is_seen():
@@ -99,7 +139,7 @@ def test_another_inertia_in_the_runs_is_seen():
     inertia["zz"] *= 1.0 + 1e-7
     star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
     solved = dataclasses.replace(BRIEF, star=star)
-    found = study(BRIEF, solved=solved, compiled=False, longest_s=0.005)
+    found = work_precision(BRIEF, solved=solved, compiled=False, longest_s=0.005)
     least = min(row.largest.orientation for row in found.rows if row.largest)
     assert 1e-10 < least < 1e-6
     assert any("do not solve what the reference solves" in words for words in found.warnings)
@@ -109,39 +149,39 @@ def test_another_inertia_in_the_runs_is_seen():
 def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
     """Where reference and runs share the fault, the paper's equations do not."""
     wrong_kernel(lambda right: (*right[:6], right[6] * (1.0 + 1e-7)))
-    found = study(BRIEF, compiled=False, longest_s=0.001)
+    found = work_precision(BRIEF, compiled=False, longest_s=0.001)
     assert 1e-9 < found.formulation < 1e-6
     assert any("paper's equations" in words for words in found.warnings)
 
 
 def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
-    found = study(stiff, compiled=False, longest_s=0.005)
+    found = work_precision(stiff, compiled=False, longest_s=0.005)
     assert not any(row.failure for row in _rows(found, "rodas4"))
     failed = [row for row in found.rows if row.failure]
     assert failed and all(row.largest is None for row in failed)
     assert text(found).count("FAILED") == len(failed)
-    assert as_csv([found]).count("not finite") + as_csv([found]).count("off by") >= len(failed)
-    draw(found, tmp_path / "picture.png")
+    assert frame([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
+    save_figure(figure(found), tmp_path / "picture.png")
 
 
 def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
     """No method errs there, and a logarithm of that does not exist."""
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
-    found = study(resting, compiled=False, longest_s=0.002)
+    found = work_precision(resting, compiled=False, longest_s=0.002)
     assert found.reference.own.gamma_dot == 0.0
     assert any(row.largest and row.largest.gamma_dot == 0.0 for row in found.rows)
-    draw(found, tmp_path / "picture.png")
+    save_figure(figure(found), tmp_path / "picture.png")
 
 
 def test_a_run_that_stops_is_compared_up_to_its_end():
-    trial = Trial(scene.load("example2_thin"))
-    assert trial.seconds == pytest.approx(0.9) and "gamma_1 >" in trial.ends
-    trial = Trial(scene.load("impacts"))
-    assert trial.seconds == pytest.approx(0.9) and trial.ends.startswith("impact at 0.91")
+    problem = InitialValueProblem(scene.load("example2_thin"))
+    assert problem.seconds == pytest.approx(0.9) and "gamma_1 >" in problem.ends
+    problem = InitialValueProblem(scene.load("impacts"))
+    assert problem.seconds == pytest.approx(0.9) and problem.ends.startswith("impact at 0.91")
 
 
 def test_a_run_that_is_over_at_once_is_refused():
     start = dataclasses.replace(SHORT.initial, gamma=(0.0, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0))
     with pytest.raises(InputError, match="over before it can be studied"):
-        Trial(dataclasses.replace(SHORT, initial=start))
+        InitialValueProblem(dataclasses.replace(SHORT, initial=start))

@@ -8,24 +8,24 @@ import sys
 import time
 from pathlib import Path
 
-from sst_ros.studies.pool import answers
+from sst_ros.studies.parallel import evaluate_grid
 
-ASKING = "from study.test_pool import waiting; waiting()"
+ASKING = "from studies.test_parallel import waiting; waiting()"
 
 
-def told(number):
-    """Say who works, then work for long."""
+def slow(number):
+    """Print the process id, then work for long."""
     print(os.getpid(), flush=True)
     time.sleep(60.0)
     return number
 
 
 def waiting():
-    answers(told, [1, 2], workers=2)
+    evaluate_grid(slow, [1, 2], workers=2)
 
 
-def test_answers_come_in_the_order_of_the_questions():
-    assert answers(abs, [-3, 2, -1, 0], workers=2) == [3, 2, 1, 0]
+def test_results_come_in_the_order_of_the_points():
+    assert evaluate_grid(abs, [-3, 2, -1, 0], workers=2) == [3, 2, 1, 0]
 
 
 def test_no_worker_outlives_a_parent_that_is_killed():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures: a run of Example 2, as messages and as a recording."""
+"""Fixtures for all rooms: a run of Example 2, as messages and as a recording."""
 
 import importlib.util
 import sys
@@ -12,7 +12,7 @@ from sst_ros.dynamics import kernel, traced_dynamics
 
 # bags.py is loaded by its path: as `report.bags` it would need a package test/report.
 _SPEC = importlib.util.spec_from_file_location(
-    "sst_ros_test_bags", Path(__file__).parent / "bags.py"
+    "sst_ros_test_bags", Path(__file__).parent / "report" / "bags.py"
 )
 _BAGS = importlib.util.module_from_spec(_SPEC)
 sys.modules[_SPEC.name] = _BAGS

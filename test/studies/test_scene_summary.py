@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sheet of a scene and the costs in it: absent terms cost nothing, present ones are counted."""
+"""The summary of a scene and the costs in it: absent terms cost nothing, present ones are counted."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from sst_ros.scene.loads import (
     Stroke,
 )
 from sst_ros.scene.scene import Scene, load, names
-from sst_ros.studies.scene_summary import WIDTH, sheet
-from sst_ros.studies.step_advice import advise
+from sst_ros.studies.scene_summary import WIDTH, summary
+from sst_ros.studies.step_advice import step_advice
 from sst_ros.studies.term_costs import TERMS, costs, operations
 
 EXAMPLE2 = load("example2")
@@ -91,40 +91,40 @@ def test_a_viscous_friction_costs_a_few_multiplications_only():
 
 
 @every_scene
-def test_a_sheet_says_all_that_one_asks(name):
-    scene, said = load(name), sheet(load(name))
+def test_a_summary_has_all_parts(name):
+    scene, said = load(name), summary(load(name))
     total = sum(Dynamics.of(scene).program.operations.values())
     assert said.startswith(f"{name}: {scene.description}\n")
     assert f"right-hand side: 7 states, {total} operations" in said
     for cost in costs(scene):
         row = rf"^  {cost.name} +{cost.adds} +{cost.without}$"
-        listed = said[said.index("terms left out, 0 operations") : said.index("\nends")]
+        listed = said[said.index("terms absent, 0 operations") : said.index("\nends")]
         if cost.present:
             assert re.search(row, said, re.MULTILINE)
         else:
             assert cost.name in " ".join(listed.split())
     for key, reason in scene.provenance:
         assert re.search(rf"^  {key} +{re.escape(reason[:20])}", said, re.MULTILINE)
-    assert advise(scene) in " ".join(said.split())
+    assert step_advice(scene).text in " ".join(said.split())
     assert max(map(len, said.splitlines()[1:])) <= WIDTH
 
 
 def test_the_moments_topic_is_there_only_when_the_scene_takes_it():
     taking = replace(EXAMPLE2, moment=Moment(topic=True))
     giving = replace(EXAMPLE2, moment=Moment(value=(0.0, 0.0, 1.0)))
-    assert "~/external_moment" in sheet(taking)
-    assert "~/external_moment" not in sheet(giving)
-    assert "~/external_moment" not in sheet(EXAMPLE2)
+    assert "~/external_moment" in summary(taking)
+    assert "~/external_moment" not in summary(giving)
+    assert "~/external_moment" not in summary(EXAMPLE2)
 
 
 def test_lag_shows_in_the_size_of_the_state():
     lagging = replace(EXAMPLE2, actuators=Actuators(time_constant=0.1))
-    assert "right-hand side: 10 states" in sheet(lagging)
+    assert "right-hand side: 10 states" in summary(lagging)
 
 
 def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
     assert cli.main(["scene", "show", "stiff"]) == 0
-    assert capsys.readouterr().out == sheet(load("stiff"))
+    assert capsys.readouterr().out == summary(load("stiff"))
     assert cli.main(["scene", "list"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == names()
     bad = tmp_path / "bad.yaml"
