@@ -77,6 +77,12 @@ def save_figure(figure: Figure, *paths: Path) -> None:
         figure.savefig(path)
 
 
+def free_figure(width: float, height: float) -> Figure:
+    """Make a figure [inch] whose panels are placed by hand."""
+    with mpl.rc_context({"figure.constrained_layout.use": False}):
+        return Figure(figsize=(width, height))
+
+
 def three(letter: str) -> tuple[str, str, str]:
     """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
     first, second, third = (f"{letter}{subscript}" for subscript in SUBSCRIPTS)

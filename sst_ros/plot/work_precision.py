@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sst_ros.plot.style import BLUE, GREEN, INK, PURPLE, VERMILION, note, styled
+from sst_ros.plot.style import BLUE, GREEN, INK, PURPLE, VERMILION, free_figure, note, styled
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -49,8 +49,7 @@ def draw_work_precision(
         footnote: small print.
 
     """
-    figure = Figure(figsize=(11.0, 6.4))
-    figure.set_layout_engine("none")
+    figure = free_figure(11.0, 6.4)
     panels = figure.subplots(1, 2, sharex=True)
     figure.subplots_adjust(left=0.075, right=0.985, top=0.875, bottom=0.205, wspace=0.2)
     quantities = ("largest_orientation_rad", "largest_gamma_dot_rad_per_s")
@@ -122,5 +121,6 @@ def _legend(rows: DataFrame, target: float | None) -> list[Line2D]:
         handles.append(Line2D([], [], color=INK, marker="x", linestyle="none", label="failed"))
     if target is not None:
         handles.append(Line2D([], [], color=INK, marker="o", linestyle=":", markersize=11,
-                              markerfacecolor="none", label=f"fastest for {target:g} rad"))  # fmt: skip
+                              markerfacecolor="none", label=f"fastest for {target:g} rad")
+                       )  # fmt: skip
     return handles

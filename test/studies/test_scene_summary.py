@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a scene and the costs in it: absent terms cost nothing, present ones are counted."""
+"""The summary of a scene: absent terms cost nothing, present ones are counted."""
 
 from __future__ import annotations
 
