@@ -3,39 +3,25 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
-import socket
 import threading
 import time
 import webbrowser
 from collections.abc import Iterator
 
 import numpy as np
-from viser import ViserServer
 
-from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.view.buttons import ReelButtons, RunButtons, buttons
 from sst_ros.view.drawing import Drawing
 from sst_ros.view.panel import Panel
+from sst_ros.view.server import LOCAL, PORT, PageServer
 from sst_ros.view.source import Sample, Source
 
-LOCAL = "127.0.0.1"
-PORT = 8080
 PERIOD_S = 1.0 / 30.0
 _SHOW_EVERY, _DRAW_EVERY = 3, 6
 _PANEL_WIDTH = 400.0
-
-
-class LocalServer(ViserServer):
-    """viser without its way to publish the page through a server elsewhere."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse: the page drives a machine."""
-        return None
 
 
 class Page:
@@ -51,8 +37,9 @@ class Page:
 
     def __init__(self, source: Source, host: str = LOCAL, port: int = PORT) -> None:
         self._source = source
-        self._server = _serve(host, port)
-        self.url = f"http://{self._server.get_host()}:{self._server.get_port()}"
+        self._server = PageServer(host, port)
+        self.url = self._server.url
+        _arrange(self._server)
         self._parts: tuple[Drawing, Panel, RunButtons | ReelButtons] | None = None
         self._scene: Scene | None = None
         self._sample: Sample | None = None
@@ -71,8 +58,7 @@ class Page:
         """Stop serving."""
         self._stop.set()
         self._thread.join()
-        with _silence():
-            self._server.stop()
+        self._server.stop()
 
     def _live(self) -> None:
         for count in _beats(self._stop):
@@ -124,16 +110,8 @@ class Page:
             client.camera.fov = camera.fov
 
 
-def _serve(host: str, port: int) -> ViserServer:
-    try:  # viser would look for a free port for ever
-        for family, kind, _, _, address in socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM):
-            with socket.socket(family, kind) as probe:
-                probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        allowed = f"must be an address of this machine ({error})"
-        raise InputError("view", [Problem("host", host, allowed)]) from None
-    with _silence():
-        server = LocalServer(host, port, label="sst_ros", verbose=False)
+def _arrange(server: PageServer) -> None:
+    """Set the theme, the panel's place and the light."""
     server.gui.configure_theme(
         show_logo=False, show_share_button=False, brand_color=(0, 114, 178), control_width="large"
     )
@@ -142,14 +120,6 @@ def _serve(host: str, port: int) -> ViserServer:
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(None)
     server.scene.set_up_direction("+z")
-    return server
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep viser's own words from the terminal."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
 
 
 def _beats(stop: threading.Event) -> Iterator[int]:

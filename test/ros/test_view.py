@@ -34,7 +34,7 @@ def viewed(domain_of_module):
     """The process, the page in a browser, and an observer of the topics."""
     started, watching = Nodes(), Observer(domain_of_module)
     process = started.start("view", "--scene", "swing", "--port", "18080")
-    url = re.search(r"http://127\.0\.0\.1:\d+", started.line(process, 60)).group()
+    url = re.search(r"http://127\.0\.0\.1:\S+", started.line(process, 60)).group()
     with browse(url, SIZE) as page:
         page.until(lambda: page.time() is not None, "time of a run")
         watching.listen(String, "/sst_simulator/phase", latched=True)

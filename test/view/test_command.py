@@ -6,8 +6,6 @@ import pytest
 pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 
 from sst_ros.__main__ import main
-from sst_ros.errors import InputError
-from sst_ros.view.page import LOCAL, LocalServer, Page
 
 
 @pytest.mark.parametrize(
@@ -21,23 +19,3 @@ from sst_ros.view.page import LOCAL, LocalServer, Page
 def test_what_cannot_be_shown(words, said, capsys):
     assert main(["view", *words]) == 1
     assert said in capsys.readouterr().err
-
-
-class Nothing:
-    scene = None
-
-
-@pytest.mark.parametrize("host", ["203.0.113.1", "no.such.host.invalid", "\ud800"])
-def test_other_machines_addresses(host):
-    with pytest.raises(InputError, match="address of this machine"):
-        Page(Nothing(), host)
-
-
-def test_two_pages_take_two_ports_and_nothing_is_shared():
-    first, second = Page(Nothing(), port=18280), Page(Nothing(), port=18280)
-    assert first.url != second.url
-    assert first.url.startswith(f"http://{LOCAL}:")
-    assert first._server.request_share_url() is None
-    assert isinstance(first._server, LocalServer)
-    first.close()
-    second.close()

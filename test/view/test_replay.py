@@ -10,10 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report import bags
 
 from sst_ros.recording.recording import read
-from sst_ros.scene.scene import load
 
 pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
@@ -23,13 +21,6 @@ from tools.browser import browse, chromium
 
 PICTURES = Path(__file__).parents[2] / "view_out"
 RIGHT, HOME = "\ue014", "\ue011"
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory):
-    return bags.write(
-        tmp_path_factory.mktemp("replay") / "bag", bags.simulated(load("example2"), 0.3)
-    )
 
 
 class Clock:
@@ -77,7 +68,7 @@ def test_the_page_of_a_bag(bag):
     with subprocess.Popen(command, text=True, **pipes) as process:
         try:
             assert select.select([process.stdout], [], [], 60)[0]
-            url = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline()).group()
+            url = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline()).group()
             with browse(url, (960, 640)) as page:
                 page.until(lambda: page.text("#sst-phase") == "recording, held", "end of the bag")
                 assert page.time() == 0.3

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The web server of the page: viser's, behind a check of address, origin and token.
+
+Whoever reaches the page can apply torques. Every request, the websocket's included, must therefore
+
+- be addressed to this server (Host): no foreign name that was rebound to this machine is served;
+- come from the page itself where a browser states where it comes from (Origin);
+- carry the token of the printed URL, in the query or in the cookie that the first answer sets.
+
+viser has no hook for this, so its call of `websockets.asyncio.server.serve` is wrapped while it
+starts; a viser that starts otherwise is refused, never served without the check.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import http.cookies
+import io
+import ipaddress
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import websockets.asyncio.server
+from viser import ViserServer
+from websockets import Request, Response
+from websockets.asyncio.server import ServerConnection
+
+from sst_ros.errors import InputError, Problem, SstError
+
+LOCAL = "127.0.0.1"
+PORT = 8080
+TITLE = "sst_ros"
+_PORTS = (1024, 65535)
+_TRIED = 100
+"""Ports that are tried from the given one on."""
+
+Check = Callable[[ServerConnection, Request], Response | None]
+_starting = threading.Lock()
+
+
+class AccessCheck:
+    """Answers 403 to every request that is not the page's own; see the module."""
+
+    def __init__(self, host: str) -> None:
+        self.token = secrets.token_urlsafe(24)
+        self.installed = False
+        self._names = {host.lower()}
+        if not _loopback(host):
+            self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
+
+    def around(self, serve_files: Check) -> Check:
+        """Return viser's handler of requests, behind the check."""
+        self.installed = True
+
+        def handler(connection: ServerConnection, request: Request) -> Response | None:
+            reason = self.refusal(connection.local_address, request)
+            if reason:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+            if urlsplit(request.path).path == "/":
+                request.headers.pop("Accept-Encoding", None)  # the title is in the page's text
+            response = serve_files(connection, request)
+            if response is not None and response.status_code == http.HTTPStatus.OK:
+                self._complete(response, connection.local_address[1])
+            return response
+
+        return handler
+
+    def refusal(self, local: tuple[str, int], request: Request) -> str:
+        """Return why a request at a local address is refused; empty if it is not."""
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or _name(hosts[0]) not in self._own_names(local[0]):
+            return "This page answers only to its own address."
+        if any(origin not in (f"http://{hosts[0]}", f"https://{hosts[0]}") for origin in origins):
+            return "Another page must not use this one."
+        cookies = http.cookies.SimpleCookie()
+        with contextlib.suppress(http.cookies.CookieError):
+            cookies.load("; ".join(request.headers.get_all("Cookie")))
+        query = parse_qs(urlsplit(request.path).query)
+        morsel = cookies.get(_cookie(local[1]))
+        given = [*query.get("token", []), *([morsel.value] if morsel is not None else [])]
+        if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
+            return "Open the address that `view` has printed: it contains the access token."
+        return ""
+
+    def _own_names(self, address: str) -> set[str]:
+        """Names of the address at which a request arrived."""
+        return self._names | {address} | ({"localhost"} if _loopback(address) else set())
+
+    def _complete(self, response: Response, port: int) -> None:
+        """Set the cookie, and the title of the browser's tab; forbid frames and referrers."""
+        response.body = response.body.replace(
+            b"<title>Viser</title>", f"<title>{TITLE}</title>".encode(), 1
+        )
+        del response.headers["Content-Length"]
+        rules = "HttpOnly; SameSite=Strict; Path=/"
+        response.headers.update(
+            {
+                "Content-Length": str(len(response.body)),
+                "Set-Cookie": f"{_cookie(port)}={self.token}; {rules}",
+                "X-Frame-Options": "DENY",
+                "Referrer-Policy": "no-referrer",
+            }
+        )
+
+
+class PageServer(ViserServer):
+    """viser's server with the check, a bounded search for a port, and no public share.
+
+    Attributes:
+        url: address of the page, with its token.
+
+    Raises:
+        InputError: the host is no address of this machine, or no port is free.
+
+    """
+
+    def __init__(self, host: str = LOCAL, port: int = PORT) -> None:
+        check = AccessCheck(host)
+        with _silence(), _requests_pass(check):
+            super().__init__(host, _free_port(host, port), label=TITLE, verbose=False)
+        if not check.installed:
+            self.stop()
+            raise SstError("this release of viser cannot be guarded: pip install 'viser>=1.1,<2'")
+        shown = f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.get_port()}/?token={check.token}"
+
+    def stop(self) -> None:
+        """Stop serving."""
+        with _silence():
+            super().stop()
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse to publish the page through a server elsewhere: it drives a machine."""
+        return None
+
+
+@contextlib.contextmanager
+def _requests_pass(check: AccessCheck) -> Iterator[None]:
+    """Put the check before what viser answers with, for the server that it starts meanwhile."""
+    module = vars(websockets.asyncio.server)
+
+    def serve(*args: Any, process_request: Check, **options: Any) -> Any:
+        return original(*args, process_request=check.around(process_request), **options)
+
+    with _starting:
+        original = module["serve"]
+        module["serve"] = serve
+        try:
+            yield
+        finally:
+            module["serve"] = original
+
+
+def _free_port(host: str, port: int) -> int:
+    """Return the first free port; viser would look without end, or stop with a traceback."""
+    if not _PORTS[0] <= port <= _PORTS[1]:
+        allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
+        raise InputError("view", [Problem("port", port, allowed)])
+    try:
+        addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        _bind(addresses, 0)
+    except (OSError, UnicodeError) as error:
+        allowed = f"must be an address of this machine ({error})"
+        raise InputError("view", [Problem("host", host, allowed)]) from None
+    last = min(port + _TRIED - 1, _PORTS[1])
+    for tried in range(port, last + 1):
+        with contextlib.suppress(OSError):
+            _bind(addresses, tried)
+            return tried
+    raise InputError("view", [Problem("port", port, f"no port up to {last} is free")])
+
+
+def _bind(addresses: list[Any], port: int) -> None:
+    for family, kind, _, _, address in addresses:
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((address[0], port, *address[2:]))
+
+
+def _name(host: str) -> str:
+    """Return the name in a Host header, without port and brackets."""
+    with contextlib.suppress(ValueError):
+        return urlsplit(f"//{host}").hostname or ""
+    return ""
+
+
+def _loopback(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return address.lower() == "localhost"
+
+
+def _cookie(port: int) -> str:
+    return f"sst_view_{port}"
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep viser's messages from the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
