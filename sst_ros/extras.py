@@ -11,13 +11,13 @@ from sst_ros.errors import SstError
 EXTRAS = {
     "lz4": "record",
     "matplotlib": "plot",
-    "mpmath": "test",
+    "mpmath": "all",
     "numba": "fast",
     "pandas": "record",
     "pyarrow": "record",
     "rosbags": "record",
     "viser": "view",
-    "xarray": "record",
+    "xarray": "all",
     "zstandard": "record",
 }
 """Extra of this package that installs a module."""
