@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulator of the 3-RRP spherical star-triangle parallel manipulator."""
+"""Simulator of the 3-RRP spherical star-triangle parallel manipulator.
+
+`simulate` returns a whole motion as a `Trajectory`; `Simulation` goes step by step, for control
+loops; `Batch` runs many scenarios of one scene. All names are imported when they are first used.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +11,105 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sst_ros.control.controller import Controller
+    from sst_ros.control.controller_settings import ControllerSettings
+    from sst_ros.control.inverse_dynamics import InverseDynamics
+    from sst_ros.control.reference import ReferenceMotion
+    from sst_ros.control.reference_motions import reference_motion
+    from sst_ros.errors import (
+        AssemblyError,
+        InputError,
+        RunStopped,
+        SingularConfiguration,
+        SstError,
+    )
+    from sst_ros.integration.batch import Batch
+    from sst_ros.mechanism.geometry import Geometry
+    from sst_ros.mechanism.kinematics import direct as direct_kinematics
+    from sst_ros.mechanism.kinematics import inverse as inverse_kinematics
+    from sst_ros.mechanism.workspace import workspace
+    from sst_ros.plot.workspace import plot_workspace
+    from sst_ros.scene.arcs import arc_inertia
+    from sst_ros.scene.loads import SineTorque
     from sst_ros.scene.scene import Scene
     from sst_ros.scene.scene import load as load_scene
-    from sst_ros.simulation import Simulation
+    from sst_ros.simulate_motion import simulate
+    from sst_ros.simulation import Simulation, State
+    from sst_ros.torque import PolynomialTorque, TorqueTable
+    from sst_ros.trajectory import Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["Scene", "Simulation", "__version__", "load_scene"]
 
-# Imported at first use: the command line and the nodes must not wait for what they do not need.
-_WHERE = {
-    "Scene": ("sst_ros.scene.scene", "Scene"),
-    "Simulation": ("sst_ros.simulation", "Simulation"),
-    "load_scene": ("sst_ros.scene.scene", "load"),
+__all__ = [
+    "AssemblyError",
+    "Batch",
+    "Controller",
+    "ControllerSettings",
+    "Geometry",
+    "InputError",
+    "InverseDynamics",
+    "PolynomialTorque",
+    "ReferenceMotion",
+    "RunStopped",
+    "Scene",
+    "Simulation",
+    "SineTorque",
+    "SingularConfiguration",
+    "SstError",
+    "State",
+    "TorqueTable",
+    "Trajectory",
+    "__version__",
+    "arc_inertia",
+    "direct_kinematics",
+    "inverse_kinematics",
+    "load_scene",
+    "plot_workspace",
+    "reference_motion",
+    "simulate",
+    "workspace",
+]
+
+# Module of each name, and its name there where that is another one.
+_MODULES = {
+    "AssemblyError": "errors",
+    "Batch": "integration.batch",
+    "Controller": "control.controller",
+    "ControllerSettings": "control.controller_settings",
+    "Geometry": "mechanism.geometry",
+    "InputError": "errors",
+    "InverseDynamics": "control.inverse_dynamics",
+    "PolynomialTorque": "torque",
+    "ReferenceMotion": "control.reference",
+    "RunStopped": "errors",
+    "Scene": "scene.scene",
+    "Simulation": "simulation",
+    "SineTorque": "scene.loads",
+    "SingularConfiguration": "errors",
+    "SstError": "errors",
+    "State": "simulation",
+    "TorqueTable": "torque",
+    "Trajectory": "trajectory",
+    "arc_inertia": "scene.arcs",
+    "direct_kinematics": "mechanism.kinematics:direct",
+    "inverse_kinematics": "mechanism.kinematics:inverse",
+    "load_scene": "scene.scene:load",
+    "plot_workspace": "plot.workspace",
+    "reference_motion": "control.reference_motions",
+    "simulate": "simulate_motion",
+    "workspace": "mechanism.workspace",
 }
 
 
-def __getattr__(name: str) -> object:
-    if name not in _WHERE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _WHERE[name]
-    value: object = getattr(importlib.import_module(module), attribute)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
+
+    def __getattr__(name: str) -> object:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, attribute = _MODULES[name].partition(":")
+        value: object = getattr(importlib.import_module(f"sst_ros.{module}"), attribute or name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

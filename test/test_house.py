@@ -10,12 +10,12 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"child_process", "errors", "extras", "output_folder", "progress"},
+    {"child_process", "errors", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},
     {"integration"},
-    {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate"},
+    {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate_motion"},
     {"control", "description"},
     {"recording"},
     {"plot", "report", "studies", "view"},

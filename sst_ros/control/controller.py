@@ -37,6 +37,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation import State
 
 __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
@@ -143,6 +144,11 @@ class Controller:
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
+
+    def __call__(self, time: float, state: State) -> Triple:
+        """Torques [N m] for the angles and rates of a state: a function for `simulate`."""
+        joints = state.joints
+        return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
 
     def _command(self, time: float, measured: Measurement) -> Command:
         _refuse_what_is_not_finite((*measured.gamma, *measured.gamma_dot), "measured")

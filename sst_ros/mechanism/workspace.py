@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -136,6 +137,28 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
         geometry.beta_max - beta.max(axis=-1), np.prod(c, axis=-1), det_j2, cond_j,
     )  # fmt: skip
     return _measures(found)
+
+
+def workspace(
+    geometry: Geometry, divisions: int = 40, turns: int = 180, progress: bool = False
+) -> OrientationMap:
+    """Map the workspace: every direction of E on the base triangle, every turn about it.
+
+    Args:
+        geometry: `Geometry.of(scene)`, or `Geometry.build(v, alpha)`.
+        divisions: of an edge of the base triangle, at least 1.
+        turns: values of the third ZYZ angle psi, evenly over a full turn, at least 1.
+        progress: draw a bar on a terminal.
+
+    Raises:
+        InputError: divisions or turns is less than 1.
+
+    """
+    counts = {"divisions": divisions, "turns": turns}
+    problems = [Problem(name, n, "must be at least 1") for name, n in counts.items() if n < 1]
+    if problems:
+        raise InputError("workspace", problems)
+    return over_orientations(geometry, triangle_directions(geometry, divisions)[0], turns, progress)
 
 
 def over_orientations(

@@ -7,6 +7,7 @@ projection of Lambert, so that equal patches are equal solid angles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,12 +20,27 @@ from numpy.typing import NDArray
 
 from sst_ros.mechanism import singularities
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.workspace import OrientationMap
+from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
 
 WORST_COND = 10.0
 """cond J from which on the colour stays the same."""
 
 _INK, _PALE, _ALARM = "#222222", "#ececec", "#d1182b"
+
+
+def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
+    """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
+
+    Args:
+        charts: a row of pictures each.
+        titles: a name for each; by default none.
+
+    """
+    meshes = []
+    for chart in charts:
+        divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
+        meshes.append(triangle_directions(chart.geometry, divisions)[1])
+    return draw(charts, meshes, titles or ["E on the base triangle"] * len(charts))
 
 
 def draw(

@@ -123,5 +123,5 @@ def _library(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        allowed = "is not installed; pip install 'sst_ros[record]', or use CSV"
+        allowed = "is not installed; pip install 'sst_ros[export]', or use CSV"
         raise InputError("export", [Problem(name.partition(".")[0], None, allowed)]) from None

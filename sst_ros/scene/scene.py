@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import InputError, Problem
 from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star, Vector
 from sst_ros.scene.loads import (
     Actuators,
@@ -28,7 +28,8 @@ from sst_ros.scene.loads import (
 )
 from sst_ros.scene.motions import DesiredMotion
 from sst_ros.scene.schema import Section, notes, number, section, sections, specs, text
-from sst_ros.scene.yaml_document import read
+from sst_ros.scene.values import replaced
+from sst_ros.scene.yaml_document import from_values, read, values_of
 
 Matrix = NDArray[np.float64]
 
@@ -94,6 +95,25 @@ class Scene(Section):
     motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
     duration: float | None = number("length of a run", "s", default=None, above=0.0)
     provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
+
+    def with_values(self, values: Mapping[str, Any]) -> Scene:
+        """Return the scene with other values by key, as in {"star.inertia.zz": 0.3}.
+
+        A list without an index means all of its entries: "actuated_links.inertia.xx",
+        "springs[0].rest". A section that the scene does not have is made from the values given;
+        None takes one away.
+
+        Raises:
+            InputError: a key names nothing that a scene has, or the result is refused.
+
+        """
+        try:
+            changed = replaced(values_of(self), values)
+        except KeyError as error:
+            key = error.args[0]
+            problem = Problem(str(key), values[key], "names nothing in this scene")
+            raise InputError(self.name, [problem]) from None
+        return from_values(Scene, changed, self.name)
 
     @property
     def star_inertia(self) -> Matrix:
@@ -177,7 +197,6 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
         return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())} ({error})"
-        allowed += suggestion(str(name_or_path), names())
         raise InputError("scene", [Problem("scene", str(name_or_path), allowed)]) from None
 
 

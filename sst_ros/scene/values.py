@@ -1,65 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes from Python values: a dict, other numbers by key, another initial state."""
+"""Documents as nested dicts: values by their keys, as in "star.inertia.zz" or "springs[0].rest"."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
-
-from sst_ros.errors import InputError, Problem
-from sst_ros.scene.loads import Initial
-from sst_ros.scene.scene import Scene, load
-from sst_ros.scene.yaml_document import read
 
 
-def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
-    """Return a scene as it is, by its name or path, or built from its document as a dict.
+def replaced(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with other values; a list without an index means all of its entries.
+
+    A section that the document does not have is made; None takes a value or a section away.
 
     Raises:
-        InputError: there is no such scene, or its document is refused.
+        KeyError: a key does not fit the document; its argument is the key.
 
     """
-    if isinstance(scene, Scene):
-        return scene
-    if isinstance(scene, Mapping):
-        return read(Scene, yaml.safe_dump(plain(scene), sort_keys=False), "scene")
-    if isinstance(scene, (str, Path)):
-        return load(scene)
-    allowed = "must be a Scene, the name or path of one, or its document as a dict"
-    raise InputError("scene", [Problem("scene", scene, allowed)])
-
-
-def with_initial(scene: Scene, initial: Any) -> Scene:
-    """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
-
-    Raises:
-        InputError: it is none of these, or its numbers are refused.
-
-    """
-    if initial is None:
-        return scene
-    if isinstance(initial, Initial):
-        return replace(scene, initial=initial)
-    names = ("gamma", "gamma_dot", "orientation")
-    if isinstance(initial, Mapping):
-        unknown = [name for name in initial if name not in names]
-        if unknown or "gamma" not in initial:
-            allowed = "must have the key gamma, and may have gamma_dot and orientation"
-            raise InputError("initial", [Problem("initial", list(initial), allowed)])
-        given = dict(initial)
-    else:
+    changed: dict[str, Any] = plain(document)
+    for key, value in values.items():
         try:
-            gamma, gamma_dot = initial
-        except (TypeError, ValueError):
-            allowed = "must be (gamma, gamma_dot), a mapping or Initial"
-            raise InputError("initial", [Problem("initial", initial, allowed)]) from None
-        given = {"gamma": gamma, "gamma_dot": gamma_dot}
-    return replace(scene, initial=Initial(**{name: plain(given[name]) for name in given}))
+            _set(changed, str(key).split("."), plain(value))
+        except (AttributeError, IndexError, TypeError, ValueError):
+            raise KeyError(key) from None
+    return changed
 
 
 def plain(value: Any) -> Any:
@@ -71,3 +37,19 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return value
+
+
+def _set(section: dict[str, Any], words: list[str], value: Any) -> None:
+    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
+    if parts is None:
+        raise ValueError(words[0])
+    name, index = parts.groups()
+    if len(words) == 1 and index is None:
+        section.update({name: value})
+        if value is None:
+            del section[name]
+        return
+    below = section.setdefault(name, {} if index is None else [])
+    entries = below if isinstance(below, list) else [below]
+    for entry in entries if index is None else [entries[int(index)]]:
+        _set(entry, words[1:], value)

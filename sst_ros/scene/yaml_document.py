@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import yaml
@@ -13,6 +13,7 @@ import yaml
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene import partial
 from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
+from sst_ros.scene.values import plain
 
 S = TypeVar("S", bound=Section)
 
@@ -50,6 +51,30 @@ def read(cls: type[S], source: str, origin: str) -> S:
     if problems or result is None:
         raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
     return result
+
+
+def from_values(cls: type[S], values: Mapping[str, Any], origin: str) -> S:
+    """Build `cls` from nested dicts and lists, as YAML text would have them; arrays are allowed.
+
+    Raises:
+        InputError: the values break the schema; lists every fault.
+
+    """
+    try:
+        text = yaml.safe_dump(plain(values), sort_keys=False, allow_unicode=True)
+        return read(cls, text, origin)
+    except yaml.YAMLError as error:
+        allowed = f"must be text, numbers, lists and mappings ({error})"
+        raise InputError(origin, [Problem("", "values", allowed)]) from None
+    except InputError as error:
+        found = [dataclasses.replace(problem, line=None) for problem in error.problems]
+        raise InputError(origin, found) from None
+
+
+def values_of(document: Section) -> dict[str, Any]:
+    """Return a document as nested dicts and lists, which `from_values` takes."""
+    tree: dict[str, Any] = _tree(document)
+    return tree
 
 
 def dump(document: Section) -> str:

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import Diverged, InputError, Problem, RunStopped
 from sst_ros.progress import slices
+from sst_ros.scene.given import scene_of, with_initial
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.values import scene_of, with_initial
 from sst_ros.simulation import INTEGRATORS, NANOSECONDS, Simulation, State
 from sst_ros.torque import (
     FeedbackFunction,

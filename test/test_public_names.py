@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The front door: its names, their documentation and types, and what importing it costs."""
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sst_ros
+
+PAGE = Path(__file__).parents[1] / "docs" / "library.md"
+NAMES = [name for name in sst_ros.__all__ if name != "__version__"]
+SCRIPT = """
+import numpy as np
+import sst_ros
+from sst_ros import Geometry, Scene, Simulation, State, Trajectory, load_scene, simulate
+
+scene: Scene = load_scene("example2")
+run: Trajectory = simulate(scene, lambda t: (1.0, t, 0.0), 0.1)
+held = simulate(scene, lambda t, state: state.joints.gamma, 0.1, control_period=1e-3)
+total: float = float(np.sum(run.gamma)) + run.error_estimate
+state: State = Simulation(scene).step((0.0, 0.0, 0.0), 1_000_000)
+x, y, z, w = state.quaternion
+geometry: Geometry = Geometry.of(scene)
+gamma, mu, beta = sst_ros.inverse_kinematics(geometry, np.eye(3))
+rotation = sst_ros.direct_kinematics(geometry, run.gamma[0])[0].rotation
+torque: tuple[float, float, float] = sst_ros.InverseDynamics(scene).gravity_torque(state.quaternion)
+sst_ros.nothing
+"""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_name_exists_has_a_docstring_and_is_on_the_page(name):
+    value = getattr(sst_ros, name)
+    assert inspect.getdoc(value)
+    target = f"{value.__module__}.{value.__qualname__}"
+    assert f"sst_ros.{name}" in PAGE.read_text(), f"{target} is not on {PAGE.name}"
+
+
+def test_dir_shows_the_public_names_and_nothing_else():
+    assert dir(sst_ros) == sorted(sst_ros.__all__)
+    assert not hasattr(sst_ros, "nothing")
+    assert set(sst_ros._MODULES) == set(NAMES)
+
+
+def test_importing_it_imports_nothing_large():
+    large = "('scipy', 'matplotlib', 'numba', 'rclpy', 'pandas', 'numpy')"
+    code = f"import sys, sst_ros; print([m for m in sys.modules if m.split('.')[0] in {large}])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_script_has_precise_types(tmp_path):
+    pytest.importorskip("mypy", reason="types are checked by mypy")
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(script)],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[1],
+        check=False,
+    )
+    wrong = done.stdout.splitlines()
+    assert len(wrong) == 1, done.stdout
+    assert 'Module has no attribute "nothing"' in wrong[0]
