@@ -60,7 +60,7 @@ setup(
         "export": ["rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
         "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
         "fast": ["numba>=0.57"],
-        "view": ["viser>=1.1"],
+        "view": ["jinja2>=3", "viser>=1.1,<2"],
         "engines": ["mujoco>=4", "pin>=4"],
         "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
         "test": [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the links look like: tubes, balls and boxes in the links' own frames.
+"""What the links look like: arcs, rods, balls and boxes in the links' own frames.
 
 URDF and the view draw these and nothing else. Thicknesses are for the eye; arcs and radii
 are the scene's.
@@ -34,11 +34,40 @@ STEP = np.radians(6.0)
 
 
 @dataclass(frozen=True)
-class Tube:
-    """A round rod along points, shape (n, 3) [m]; `radius` is its thickness [m]."""
+class Arc:
+    """A round bar along a circular arc about O.
 
-    points: Array
+    Attributes:
+        begin: unit vector to its first point, shape (3,).
+        axis: unit vector that it turns about, perpendicular to `begin`, shape (3,).
+        angle: its length [rad].
+        radius: of the arc [m].
+        thickness: radius of the bar [m].
+
+    """
+
+    begin: Array
+    axis: Array
+    angle: float
     radius: float
+    thickness: float
+    colour: Colour
+
+    def points(self) -> Array:
+        """Points along the arc, STEP apart or less, shape (n, 3) [m]."""
+        count = max(2, int(np.ceil(self.angle / STEP)) + 1)
+        angles = np.linspace(0.0, self.angle, count)[:, None]
+        across = np.cross(self.axis, self.begin)
+        return np.asarray(self.radius * (np.cos(angles) * self.begin + np.sin(angles) * across))
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A straight round bar between two points, shape (3,) [m]; `thickness` is its radius [m]."""
+
+    begin: Array
+    end: Array
+    thickness: float
     colour: Colour
 
 
@@ -61,22 +90,7 @@ class Box:
     colour: Colour
 
 
-Shape: TypeAlias = "Tube | Ball | Box"
-
-
-def arc(begin: Array, axis: Array, angle: float, radius: float) -> Array:
-    """Points of a circular arc about O, shape (n, 3) [m].
-
-    Args:
-        begin: unit vector to its first point, shape (3,).
-        axis: unit vector that it turns about, at a right angle to `begin`, shape (3,).
-        angle: its length [rad].
-        radius: [m].
-
-    """
-    angles = np.linspace(0.0, angle, max(2, int(np.ceil(angle / STEP)) + 1))[:, None]
-    across = np.cross(axis, begin)
-    return np.asarray(radius * (np.cos(angles) * begin + np.sin(angles) * across))
+Shape: TypeAlias = "Arc | Rod | Ball | Box"
 
 
 def shapes(scene: Scene) -> dict[str, list[Shape]]:
@@ -91,11 +105,11 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
         # A quarter arc from the motor at w to the carriage at r, just above the base.
         middle = base + 1.5 * thick
         found[actuated(leg)] = [
-            Tube(arc(x, -np.eye(3)[1], np.pi / 2, middle), thick, colour),
-            Tube(np.stack([z * (base - thick), z * (middle + 2.0 * thick)]), 2.4 * thick, colour),
+            Arc(x, -np.eye(3)[1], np.pi / 2, middle, thick, colour),
+            Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
         ]
         found[intermediate(leg)] = [
-            Tube(np.stack([x * (base - thick), x * star]), 0.9 * thick, STEEL),
+            Rod(x * (base - thick), x * star, 0.9 * thick, STEEL),
             Box(star * x, 3.0 * thick * np.array([1.0, 1.3, 1.3]), colour),
         ]
     return found
@@ -107,13 +121,10 @@ def end_point(scene: Scene, star: Array) -> Array:
 
 
 def _base(geometry: Geometry, radius: float, thick: float) -> list[Shape]:
-    sides = [
-        arc(v, w, float(angle), radius)
-        for v, w, angle in zip(geometry.v, geometry.w, geometry.arc, strict=True)
-    ]
+    sides = zip(geometry.v, geometry.w, geometry.arc.tolist(), strict=True)
     return [
         Ball(np.zeros(3), radius - thick, GLOBE, 0.92),
-        *(Tube(side, 0.7 * thick, TRIANGLE) for side in sides),
+        *(Arc(v, w, angle, radius, 0.7 * thick, TRIANGLE) for v, w, angle in sides),
         *(Ball(radius * v, 1.6 * thick, TRIANGLE) for v in geometry.v),
     ]
 
@@ -122,10 +133,10 @@ def _star(scene: Scene, geometry: Geometry, thick: float) -> list[Shape]:
     radius, z = scene.star.radius, np.array([0.0, 0.0, 1.0])
     reach = geometry.beta_max
     # In {E} the carriage k is at s turned about e by +beta.
-    found: list[Shape] = [Tube(arc(z, e, reach, radius), thick, STAR_COLOUR) for e in geometry.e]
+    found: list[Shape] = [Arc(z, e, reach, radius, thick, STAR_COLOUR) for e in geometry.e]
     found.append(Ball(radius * z, 2.2 * thick, STAR_COLOUR))
     if scene.payload is not None:
         centre = np.array(scene.payload.centre)
-        found.append(Tube(np.stack([radius * z, centre]), 0.8 * thick, STEEL))
+        found.append(Rod(radius * z, centre, 0.8 * thick, STEEL))
         found.append(Ball(centre, 2.8 * thick, STEEL))
     return found

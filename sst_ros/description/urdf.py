@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from sst_ros.description.inertials import Body, bodies
-from sst_ros.description.shapes import Ball, Box, Colour, Shape, shapes
+from sst_ros.description.shapes import Arc, Ball, Box, Colour, Shape, shapes
 from sst_ros.description.tree import BASE, Joint, tree
 from sst_ros.dynamics.limits import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -114,13 +114,14 @@ def _draw(link: ET.Element, shape: Shape) -> None:
         geometry = _visual(link, shape.centre, np.zeros(3), shape.colour)
         ET.SubElement(geometry, "box", size=_short(shape.size))
     else:
-        for begin, end in pairwise(shape.points):
+        ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
+        for begin, end in pairwise(ends):
             x, y, z = end - begin
             # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
             turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
             geometry = _visual(link, (begin + end) / 2.0, turn, shape.colour)
-            length = float(np.linalg.norm(end - begin)) + 0.1 * shape.radius
-            size = {"radius": _short([shape.radius]), "length": _short([length])}
+            length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
+            size = {"radius": _short([shape.thickness]), "length": _short([length])}
             ET.SubElement(geometry, "cylinder", size)
 
 

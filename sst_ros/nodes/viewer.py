@@ -4,25 +4,27 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import sys
 import threading
 from array import array
+from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.client import Client
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
+from sst_ros.description.frame_ids import is_idle
 from sst_ros.errors import InputError
 from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import nanoseconds
-from sst_ros.nodes.raw_readers import reader
 from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
@@ -30,43 +32,41 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Triple
 from sst_ros.view.page import Page
-from sst_ros.view.source import Health, Sample
+from sst_ros.view.source import RunStatus, ViewState
 
-_ANSWER_S = 5.0
+_REPLY_S = 5.0
 _REPEAT_S = 0.05
+"""Period of manual commands; the simulator drops commands older than half a second."""
 _LOOK_S = 0.5
 _QUEUE = 64
 
 
 class Viewer:
-    """Worker of the process `viewer`; it is a `Source` of the page and its own `Controls`."""
+    """Worker of the process `viewer`; a `ViewSource` of the page and its own `RunControl`."""
 
     def __init__(self) -> None:
         self.node = Node("sst_viewer")
         self.done = threading.Event()
         self._parameters = given = parameters.declare(self.node, ViewerParameters)
         self.scene: Scene | None = None
-        self._phase, self._status = "", Health()
-        self._start_ns, self._driver = 0, ""
-        self._now: float | None = None
+        self._phase, self._status = "", RunStatus()
+        self._start_ns, self._time_ns = 0, 0
+        self._states: deque[ViewState] = deque(maxlen=_QUEUE)
         self._torque: Triple = ZERO
-        self._driving = False
-        self._commands: Any = None
-        simulator = given.simulator
-        self._names = {
-            one: one.name.replace("~", simulator)
-            for one in (topics.PAUSE, topics.STEP, topics.RESET, topics.COMMANDS)
-        }
-        self._clients = {
-            one: self.node.create_client(one.kind, self._names[one])
+        self._controller, self._driving = "", False
+        self._commands: Publisher[Float64MultiArray] | None = None
+        self._clients: dict[topics.Endpoint, Client[Any, Any]] = {
+            one: self.node.create_client(one.kind, self._name(one))
             for one in (topics.PAUSE, topics.STEP, topics.RESET)
         }
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for one, hear in ((topics.SCENE, self._hear_scene), (topics.PHASE, self._hear_phase)):
-            name = one.name.replace("~", simulator)
-            self.node.create_subscription(one.kind, name, hear, latched)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear_health, 10)
-        self._take = reader(self.node, dataclasses.replace(topics.JOINT_STATES, depth=_QUEUE))
+        for kind, name, callback, qos in (
+            (String, self._name(topics.SCENE), self._take_scene, latched),
+            (String, self._name(topics.PHASE), self._take_phase, latched),
+            (DiagnosticArray, "/diagnostics", self._take_diagnostics, 10),
+            (JointState, topics.JOINT_STATES.name, self._take_state, _QUEUE),
+        ):
+            self.node.create_subscription(kind, name, callback, qos)
         self.node.create_timer(_REPEAT_S, self._repeat, clock=STEADY)
         self.node.create_timer(_LOOK_S, self._look, clock=STEADY)
         self._page = Page(self, given.host, given.port)
@@ -79,117 +79,115 @@ class Viewer:
             self._commands.publish(Float64MultiArray(data=array("d", ZERO)))
 
     def controls(self) -> Viewer:
-        """Give itself: it can be held and driven."""
+        """Return itself: it can be paused and driven."""
         return self
 
-    def samples(self) -> Sequence[Sample]:
-        """Give the joint states that came since the last call, at most a queue full."""
-        found = []
-        while len(found) < _QUEUE and (message := self._take()) is not None:
-            if tuple(message.name) == JOINTS:
-                found.append(self._sample(message))
-        return found
+    def states(self) -> Sequence[ViewState]:
+        """Return the joint states that came since the last call, the last _QUEUE of them."""
+        return [self._states.popleft() for _ in range(len(self._states))]
 
-    def health(self) -> Health:
-        """Give the phase and the last diagnostics."""
-        status = self._status
-        return Health(self._phase, status.level, status.said, status.values)
+    def status(self) -> RunStatus:
+        """Return the phase and the latest diagnostics."""
+        latest = self._status
+        return RunStatus(self._phase, latest.level, latest.message, latest.values)
 
     def pause(self, paused: bool) -> tuple[bool, str]:
-        """Hold the run, or let it go on."""
-        return self._ask(topics.PAUSE, SetBool.Request(data=paused))
+        """Pause or resume the run."""
+        return self._call(topics.PAUSE, SetBool.Request(data=paused))
 
     def step(self) -> tuple[bool, str]:
-        """Advance a held run by one sample."""
-        return self._ask(topics.STEP, Trigger.Request())
+        """Advance a paused run by one sample."""
+        return self._call(topics.STEP, Trigger.Request())
 
     def reset(self) -> tuple[bool, str]:
-        """Go back to the initial state."""
-        reply = self._ask(topics.RESET, Trigger.Request())
+        """Return to the initial state."""
+        reply = self._call(topics.RESET, Trigger.Request())
         if reply[0]:
-            self._begin()
+            self._restart()
         return reply
 
-    def drive(self, torque: Triple) -> None:
-        """Hold torques from now on; the timer sends them."""
+    def apply(self, torque: Triple) -> None:
+        """Hold torques from now on; the timer publishes them."""
         self._torque, self._driving = torque, True
 
-    def driven_by(self) -> str:
-        """Name the other node that publishes commands."""
-        return self._driver
+    def controller(self) -> str:
+        """Name of another node that publishes commands; empty if there is none."""
+        return self._controller
 
-    def _sample(self, message: Any) -> Sample:
+    def _name(self, one: topics.Endpoint) -> str:
+        return one.name.replace("~", self._parameters.simulator)
+
+    def _take_state(self, message: JointState) -> None:
+        """Queue a state; one that is idle keeps the time of the last sample."""
+        if tuple(message.name) != JOINTS:
+            return
         stamp_ns = nanoseconds(message.header.stamp)
-        if stamp_ns and not self._start_ns:
-            self._start_ns = stamp_ns
-        if stamp_ns:  # a state that is held keeps its time
-            self._now = (stamp_ns - self._start_ns) / NANOSECONDS
+        if not is_idle(stamp_ns, message.header.frame_id):
+            self._start_ns, self._time_ns = self._start_ns or stamp_ns, stamp_ns
+        time = (self._time_ns - self._start_ns) / NANOSECONDS if self._start_ns else None
         q, v = message.position, message.velocity
-        return Sample(self._now, q[:3], q[3:6], q[6:9], v[:3], message.effort[:3])
+        self._states.append(ViewState(time, q[:3], q[3:6], q[6:9], v[:3], message.effort[:3]))
 
-    def _hear_scene(self, message: String) -> None:
-        with contextlib.suppress(InputError):  # another version's scene
+    def _take_scene(self, message: String) -> None:
+        with contextlib.suppress(InputError):  # a scene of another version
             self.scene = yaml_document.read(Scene, message.data, self._parameters.simulator)
 
-    def _hear_phase(self, message: String) -> None:
+    def _take_phase(self, message: String) -> None:
         if message.data == "waiting":
-            self._begin()
+            self._restart()
         self._phase = message.data
 
-    def _begin(self) -> None:
+    def _restart(self) -> None:
         """Count time from the next sample."""
-        self._start_ns, self._now = 0, None
+        self._start_ns = 0
 
-    def _hear_health(self, message: DiagnosticArray) -> None:
-        wanted = self.node.resolve_topic_name(self._parameters.simulator)
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+        name = f"{self.node.resolve_topic_name(self._parameters.simulator)}: run"
         for status in message.status:
-            if status.name == f"{wanted}: run":
+            if status.name == name:
                 values = {pair.key: pair.value for pair in status.values}
                 level = min(int.from_bytes(status.level, "little"), 2)
-                self._status = Health("", level, status.message, values)
+                self._status = RunStatus("", level, status.message, values)
 
     def _look(self) -> None:
-        """See whether another node publishes commands; then leave the run to it."""
+        """Look for another node that publishes commands, and leave the run to it."""
         own = self.node.get_fully_qualified_name()
-        found = ""
-        for one in (topics.COMMANDS, topics.COMMANDS_STAMPED):
-            topic = self.node.resolve_topic_name(one.name.replace("~", self._parameters.simulator))
-            for info in self.node.get_publishers_info_by_topic(topic):
-                name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-                found = found or (name if name != own else "")
-        self._driver = found
-        if found:
+        names = (
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for one in (topics.COMMANDS, topics.COMMANDS_STAMPED)
+            for info in self.node.get_publishers_info_by_topic(
+                self.node.resolve_topic_name(self._name(one))
+            )
+        )
+        self._controller = next((name for name in names if name != own), "")
+        if self._controller:
             self._driving = False
             if self._commands is not None:
                 self.node.destroy_publisher(self._commands)
                 self._commands = None
 
     def _repeat(self) -> None:
-        """Send the torque, again and again before the simulator takes it for too old."""
+        """Publish the torque before the simulator drops the last one as too old."""
         if self._driving and self._commands is None:
             self._look()
         if not self._driving:
             return
         if self._commands is None:
-            topic = self._names[topics.COMMANDS]
-            self._commands = self.node.create_publisher(Float64MultiArray, topic, 10)
+            name = self._name(topics.COMMANDS)
+            self._commands = self.node.create_publisher(Float64MultiArray, name, 10)
         self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
 
-    def _ask(self, one: topics.Endpoint, request: Any) -> tuple[bool, str]:
-        """Call a service from a thread of the page; the node's own takes the reply."""
+    def _call(self, one: topics.Endpoint, request: Any) -> tuple[bool, str]:
+        """Call a service from a thread of the page; the node's thread takes the reply."""
         client, answered = self._clients[one], threading.Event()
         if not client.service_is_ready():
-            return False, f"no service {self._names[one]}: is the simulator running?"
+            return False, f"no service {self._name(one)}: is the simulator running?"
         future = client.call_async(request)
-        future.add_done_callback(partial(_set, answered))
-        if not answered.wait(_ANSWER_S):
-            return False, f"no reply within {_ANSWER_S:g} s"
-        reply = future.result()
+        future.add_done_callback(lambda _: answered.set())
+        if not answered.wait(_REPLY_S):
+            return False, f"no reply within {_REPLY_S:g} s"
+        reply: Any = future.result()
         return bool(reply.success), str(reply.message)
-
-
-def _set(event: threading.Event, _: Any) -> None:
-    event.set()
 
 
 def main(args: list[str] | None = None) -> int:

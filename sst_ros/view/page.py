@@ -13,11 +13,11 @@ import numpy as np
 
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.view.buttons import ReelButtons, RunButtons, buttons
-from sst_ros.view.drawing import Drawing
+from sst_ros.view.buttons import PlaybackButtons, RunButtons, buttons
 from sst_ros.view.panel import Panel
+from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import LOCAL, PORT, PageServer
-from sst_ros.view.source import Sample, Source
+from sst_ros.view.source import ViewSource, ViewState
 
 PERIOD_S = 1.0 / 30.0
 _SHOW_EVERY, _DRAW_EVERY = 3, 6
@@ -28,28 +28,28 @@ class Page:
     """One source on one page. `close` ends it.
 
     Attributes:
-        url: where it is.
+        url: its address, with the access token.
 
     Raises:
-        InputError: the host is none of this machine's addresses.
+        InputError: the host is no address of this machine, or no port is free.
 
     """
 
-    def __init__(self, source: Source, host: str = LOCAL, port: int = PORT) -> None:
+    def __init__(self, source: ViewSource, host: str = LOCAL, port: int = PORT) -> None:
         self._source = source
         self._server = PageServer(host, port)
         self.url = self._server.url
         _arrange(self._server)
-        self._parts: tuple[Drawing, Panel, RunButtons | ReelButtons] | None = None
+        self._parts: tuple[SceneDrawing, Panel, RunButtons | PlaybackButtons] | None = None
         self._scene: Scene | None = None
-        self._sample: Sample | None = None
+        self._state: ViewState | None = None
         self._waiting = self._server.gui.add_markdown("Waiting for a simulator ...")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._live, name="page", daemon=True)
         self._thread.start()
 
     def announce(self, *, opened: bool) -> None:
-        """Say where the page is; `opened` also opens it, where there is a desktop."""
+        """Print the URL; `opened` also opens it, where there is a desktop."""
         print(f"the page is at {self.url}", flush=True)
         if opened and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(self.url)
@@ -61,7 +61,7 @@ class Page:
         self._server.stop()
 
     def _live(self) -> None:
-        for count in _beats(self._stop):
+        for count in _frames(self._stop):
             self._update(count)
 
     def _update(self, count: int) -> None:
@@ -72,17 +72,17 @@ class Page:
             return
         drawing, panel, pressed = self._parts
         with self._server.atomic():
-            for sample in self._source.samples():
-                drawing.follow(sample)
-                panel.follow(sample)
-                self._sample = sample
-            if self._sample is not None:
-                drawing.show(self._sample)
+            for state in self._source.states():
+                drawing.add(state)
+                panel.add(state)
+                self._state = state
+            if self._state is not None:
+                drawing.show(self._state)
             if count % _SHOW_EVERY == 0:
-                health = self._source.health()
-                pressed.show(self._sample, health)
-                if self._sample is not None:
-                    panel.show(self._sample, health)
+                status = self._source.status()
+                pressed.show(self._state, status)
+                if self._state is not None:
+                    panel.show(self._state, status)
             if count % _DRAW_EVERY == 0:
                 panel.draw()
 
@@ -91,10 +91,10 @@ class Page:
         for part in self._parts or ():
             part.remove()
         self._waiting.visible = False
-        self._scene, self._sample = scene, None
+        self._scene, self._state = scene, None
         server = self._server
         self._parts = (
-            Drawing(server, scene),
+            SceneDrawing(server, scene),
             Panel(server, scene),
             buttons(server, scene, self._source.controls()),
         )
@@ -122,8 +122,8 @@ def _arrange(server: PageServer) -> None:
     server.scene.set_up_direction("+z")
 
 
-def _beats(stop: threading.Event) -> Iterator[int]:
-    """Count at the rate of the page until it is stopped; beats that are late are dropped."""
+def _frames(stop: threading.Event) -> Iterator[int]:
+    """Count at the rate of the page until it is stopped; late frames are dropped."""
     count, due = 0, time.monotonic()
     while not stop.is_set():
         yield count

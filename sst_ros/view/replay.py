@@ -12,11 +12,11 @@ import numpy as np
 
 from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene
-from sst_ros.view.source import Health, Sample
+from sst_ros.view.source import RunStatus, ViewState
 
 
 class Replay:
-    """Plays a bag; a `Source` and its own `Reel`, for the threads of the page and of its buttons.
+    """Plays a bag; a `ViewSource` and its own `Playback`, used from two threads of the page.
 
     Raises:
         InputError: the bag is no whole recording of a run.
@@ -43,15 +43,15 @@ class Replay:
 
     @property
     def playing(self) -> bool:
-        """Whether it runs."""
+        """Whether it is playing."""
         return self._playing
 
     def controls(self) -> Replay:
-        """Give itself: it can be played."""
+        """Return itself: it can be played."""
         return self
 
     def play(self, playing: bool) -> None:
-        """Run or hold it; from the beginning where it has ended."""
+        """Play or pause; play from the beginning at the end."""
         with self._lock:
             self._advance()
             if playing and self._now >= self.length:
@@ -64,28 +64,28 @@ class Replay:
             self._advance()
             self._now = min(max(time, 0.0), self.length)
 
-    def speed(self, factor: float) -> None:
-        """Set the recorded time per time."""
+    def set_speed(self, factor: float) -> None:
+        """Set recorded time per time."""
         with self._lock:
             self._advance()
             self._factor = factor
 
-    def samples(self) -> Sequence[Sample]:
-        """Give the samples up to now, from the beginning after a jump back."""
+    def states(self) -> Sequence[ViewState]:
+        """Return the states up to now, from the beginning after a jump back."""
         with self._lock:
             self._advance()
             at = int(np.searchsorted(self._seconds, self._now + 1e-9, side="right")) - 1
         at = max(at, 0)
         first = self._shown + 1 if at >= self._shown else 0
         self._shown = at
-        return [self._sample(row) for row in range(first, at + 1)]
+        return [self._state(row) for row in range(first, at + 1)]
 
-    def health(self) -> Health:
-        """Give the last diagnostics of the recording."""
+    def status(self) -> RunStatus:
+        """Return the last diagnostics of the recording."""
         values = self._run.diagnostics
-        said = values.get("fault", "")
-        phase = "recording" if self._playing else "recording, held"
-        return Health(phase, 2 if said else 0, said, values)
+        fault = values.get("fault", "")
+        phase = "recording" if self._playing else "recording, paused"
+        return RunStatus(phase, 2 if fault else 0, fault, values)
 
     def _advance(self) -> None:
         now = time.monotonic()
@@ -95,9 +95,9 @@ class Replay:
                 self._now, self._playing = self.length, False
         self._since = now
 
-    def _sample(self, row: int) -> Sample:
+    def _state(self, row: int) -> ViewState:
         run = self._run
-        return Sample(
+        return ViewState(
             float(self._seconds[row]),
             run.gamma[row],
             run.mu[row],

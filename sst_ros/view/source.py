@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows and what its buttons act on: a running simulator, or a recording."""
+"""What the page shows and what its controls act on: a running simulator, or a recording."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from sst_ros.simulation import Triple
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One instant.
+class ViewState:
+    """The manipulator at one instant.
 
     Attributes:
         time: of the run [s]; None for a state that is shown while there is no run.
-        gamma, mu, beta: angles [rad] by leg.
+        gamma, mu, beta: joint angles [rad], by leg.
         gamma_dot: rates of the actuators [rad/s].
         torque: at the actuators, over the step that ended [N m].
 
@@ -32,56 +32,61 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Health:
-    """What the run says about itself: its phase, the keys of its diagnostics, whether all is well.
+class RunStatus:
+    """Phase and diagnostics of a run.
 
-    `level` is 0 for good, 1 for a warning, 2 for an error, as in diagnostic_msgs; `said` tells why.
+    Attributes:
+        phase: of the run, or of the playback.
+        level: 0 OK, 1 warning, 2 error, as in diagnostic_msgs.
+        message: reason of the level.
+        values: diagnostics by key.
+
     """
 
     phase: str = ""
     level: int = 0
-    said: str = ""
+    message: str = ""
     values: dict[str, str] = field(default_factory=dict)
 
 
-class Source(Protocol):
-    """Where the page takes what it shows; called from the page's thread."""
+class ViewSource(Protocol):
+    """Where the page takes its data from; called from the page's thread."""
 
     @property
     def scene(self) -> Scene | None:
-        """The scene; None as long as it is not known."""
+        """The scene; None while it is unknown."""
 
-    def samples(self) -> Sequence[Sample]:
-        """Give what is new since the last call, in order of time."""
+    def states(self) -> Sequence[ViewState]:
+        """Return the states since the last call, in order of time."""
 
-    def health(self) -> Health:
-        """Give the last word of the run about itself."""
+    def status(self) -> RunStatus:
+        """Return the latest status of the run."""
 
-    def controls(self) -> Controls | Reel:
-        """Give what the buttons act on."""
+    def controls(self) -> RunControl | Playback:
+        """Return what the buttons act on."""
 
 
-class Controls(Protocol):
-    """A run that can be held and driven; each returns what came of it, whether done and words."""
+class RunControl(Protocol):
+    """A run that can be paused and driven; requests return success and a message."""
 
     def pause(self, paused: bool) -> tuple[bool, str]:
-        """Hold the run, or let it go on."""
+        """Pause or resume the run."""
 
     def step(self) -> tuple[bool, str]:
-        """Advance a held run by one sample."""
+        """Advance a paused run by one sample."""
 
     def reset(self) -> tuple[bool, str]:
-        """Go back to the initial state."""
+        """Return to the initial state."""
 
-    def drive(self, torque: Triple) -> None:
+    def apply(self, torque: Triple) -> None:
         """Hold torques [N m] from now on."""
 
-    def driven_by(self) -> str:
-        """Name the controller that drives the run; empty where there is none."""
+    def controller(self) -> str:
+        """Name of another node that commands the run; empty if there is none."""
 
 
 @runtime_checkable
-class Reel(Protocol):
+class Playback(Protocol):
     """A recording that can be played."""
 
     @property
@@ -90,13 +95,13 @@ class Reel(Protocol):
 
     @property
     def playing(self) -> bool:
-        """Whether it runs."""
+        """Whether it is playing."""
 
     def play(self, playing: bool) -> None:
-        """Run or hold it; from the beginning where it has ended."""
+        """Play or pause; play from the beginning at the end."""
 
     def seek(self, time: float) -> None:
         """Go to a time [s]."""
 
-    def speed(self, factor: float) -> None:
-        """Set the recorded time per time."""
+    def set_speed(self, factor: float) -> None:
+        """Set recorded time per time."""

@@ -66,7 +66,7 @@ def test_it_loads_and_moves(viewed):
     page.until(lambda: page.time() > time + 0.3, "later time")
     page.until(lambda: shown(page, "γ1") != gamma, "other angle")
     page.until(lambda: np.abs(canvas(page, "moving_2") - before).max() > 50.0, "other picture")
-    assert "estimated error" in page.text("body")
+    assert "error estimate" in page.text("body")
     assert page.complaints() == []
 
 
@@ -75,7 +75,7 @@ def test_pause_step_and_resume(viewed):
     assert not page.enabled("Step")
     page.press("Pause")
     phase_is(watching, "paused")
-    page.until(lambda: page.text("#sst-phase") == "paused", "word of the pause")
+    page.until(lambda: page.text("#sst-phase") == "paused", "phase paused")
     page.until(lambda: page.enabled("Step"), "button Step")
     held = page.time()
     page.press("Step")
@@ -91,7 +91,7 @@ def test_reset(viewed):
     _, _, page, watching = viewed
     page.until(lambda: page.time() > 1.0, "some time")
     page.press("Pause")
-    page.until(lambda: page.text("#sst-phase") == "paused", "word of the pause")
+    page.until(lambda: page.text("#sst-phase") == "paused", "phase paused")
     before = page.time()
     page.press("Reset")
     watching.told("resets", 1)
@@ -112,7 +112,7 @@ def test_torques_by_hand_until_a_controller_comes(viewed):
     page.press("Zero")
     watching.until(lambda: list(commands[-1].data) == [0.0, 0.0, 0.0], "no torque")
     rival = watching.publisher(Float64MultiArray, "/sst_simulator/commands")
-    page.until(lambda: "drives the run" in page.text("body"), "name of the controller")
+    page.until(lambda: "commands come from" in page.text("body"), "name of the controller")
     assert not page.enabled("Zero")
     watching.node.destroy_publisher(rival)
     page.until(lambda: page.enabled("Zero"), "sliders without the controller")

@@ -32,10 +32,10 @@ class Clock:
 def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
     clock, run = Clock(monkeypatch), read(bag)
     reel = replay.Replay(bag)
-    seen = list(reel.samples())
+    seen = list(reel.states())
     while reel.playing:
         clock.now += 1.0 / 30.0
-        seen += reel.samples()
+        seen += reel.states()
     assert [sample.time for sample in seen] == run.seconds.tolist()
     assert np.array([sample.gamma for sample in seen]) == pytest.approx(run.gamma, abs=0.0)
     assert np.array([sample.torque for sample in seen]) == pytest.approx(run.effort, abs=0.0)
@@ -44,20 +44,20 @@ def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
 def test_hold_seek_and_speed(bag, monkeypatch):
     clock = Clock(monkeypatch)
     reel = replay.Replay(bag)
-    reel.speed(0.5)
+    reel.set_speed(0.5)
     clock.now += 0.2
-    assert reel.samples()[-1].time == pytest.approx(0.1)
+    assert reel.states()[-1].time == pytest.approx(0.1)
     reel.play(False)
     clock.now += 10.0
-    assert not reel.samples()
+    assert not reel.states()
     reel.seek(0.25)
-    assert reel.samples()[-1].time == pytest.approx(0.25)
+    assert reel.states()[-1].time == pytest.approx(0.25)
     reel.seek(0.02)  # back: the path begins anew
-    back = reel.samples()
+    back = reel.states()
     assert back[0].time == 0.0 and back[-1].time == pytest.approx(0.02)
     reel.seek(99.0)
     reel.play(True)  # from the beginning, as it has ended
-    assert reel.samples()[-1].time == 0.0
+    assert reel.states()[-1].time == 0.0
 
 
 @pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
@@ -70,7 +70,7 @@ def test_the_page_of_a_bag(bag):
             assert select.select([process.stdout], [], [], 60)[0]
             url = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline()).group()
             with browse(url, (960, 640)) as page:
-                page.until(lambda: page.text("#sst-phase") == "recording, held", "end of the bag")
+                page.until(lambda: page.text("#sst-phase") == "recording, paused", "end of the bag")
                 assert page.time() == 0.3
                 page.slide("t [s]", HOME)
                 page.until(lambda: page.time() == 0.0, "beginning of the bag")

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The manipulator in viser's scene: seven links that rotate about O, the path of E, s, torques."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+from viser import ViserServer
+
+from sst_ros.description.shapes import (
+    LEG_COLOURS,
+    STAR_COLOUR,
+    Arc,
+    Ball,
+    Box,
+    Shape,
+    end_point,
+    shapes,
+)
+from sst_ros.description.tree import BASE, STAR, rotations, tree
+from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import Scene
+from sst_ros.view.source import ViewState
+
+PATH_POINTS = 400
+_POINT_PERIOD_S = 0.008
+_PATH_S = 4.0
+_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
+"""The path lies a little outside the star, which would hide it; newer parts above older ones."""
+_OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
+_ROOT = "/manipulator"
+_SIDES = 20
+"""Corners of an arc's cross-section."""
+
+
+class SceneDrawing:
+    """One scene as drawn; `remove` takes it off the page."""
+
+    def __init__(self, server: ViserServer, scene: Scene) -> None:
+        self._server, self._scene, self._geometry = server, scene, Geometry.of(scene)
+        self._joints = tree(self._geometry)
+        self._frames = {}
+        for link, drawn in shapes(scene).items():
+            self._frames[link] = server.scene.add_frame(f"{_ROOT}/{link}", show_axes=False)
+            for index, shape in enumerate(drawn):
+                add_shape(server, f"{_ROOT}/{link}/{index}", shape)
+        self._size = size = max(scene.base.radius, scene.star.radius)
+        self._add_labels()
+        self._points: deque[tuple[float, Array]] = deque(maxlen=PATH_POINTS)
+        self._last = -np.inf
+        fade = np.linspace(0.0, 1.0, PATH_POINTS)[:, None]
+        colours = (1.0 - fade) * _OLD + fade * _NEW
+        self._path = server.scene.add_line_segments(
+            f"{_ROOT}/path",
+            np.zeros((PATH_POINTS - 1, 2, 3)),
+            np.stack([colours[:-1], colours[1:]], axis=1),
+            thickness=0.016 * size,
+        )
+        radius = scene.star.radius
+        server.scene.add_arrows(
+            f"{_ROOT}/{STAR}/s",
+            np.array([[[0.0, 0.0, radius], [0.0, 0.0, 1.28 * radius]]]),
+            _linear(STAR_COLOUR),
+            shaft_radius=0.010 * size,
+            head_radius=0.028 * size,
+            head_length=0.075 * size,
+        )
+        self._torques = [
+            server.scene.add_arrows(
+                f"{_ROOT}/torque_{k + 1}",
+                np.zeros((1, 2, 3)),
+                _linear(colour),
+                shaft_radius=0.014 * size,
+                head_radius=0.040 * size,
+                head_length=0.090 * size,
+                visible=False,
+            )
+            for k, colour in enumerate(LEG_COLOURS)
+        ]
+        self._largest_torque = 1.0
+
+    def remove(self) -> None:
+        """Take it off the page."""
+        self._server.scene.remove_by_name(_ROOT)
+
+    def add(self, state: ViewState) -> None:
+        """Add E at a state to the path; a time that goes back begins a new path."""
+        if state.time is None or state.time < self._last:
+            self._points.clear()
+            self._last = -np.inf
+        if state.time is not None and state.time - self._last >= _POINT_PERIOD_S:
+            self._last = state.time
+            star = rotations(self._joints[:3], _angles(state))[STAR]
+            self._points.append((state.time, end_point(self._scene, star)))
+            while self._points[0][0] < state.time - _PATH_S:
+                self._points.popleft()
+
+    def show(self, state: ViewState) -> None:
+        """Move everything to a state."""
+        found = rotations(self._joints, _angles(state))
+        for link, frame in self._frames.items():
+            frame.wxyz = wxyz(found[link])
+        end = end_point(self._scene, found[STAR])
+        points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
+        points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
+        points *= _LIFT
+        self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+        self._show_torques(np.array(state.torque))
+
+    def _show_torques(self, torques: Array) -> None:
+        """Draw tau_k along w_k, outwards where positive; the largest so far has full length."""
+        self._largest_torque = max(self._largest_torque, float(np.abs(torques).max()))
+        for arrow, torque, w in zip(self._torques, torques, self._geometry.w, strict=True):
+            length = 0.45 * self._size * abs(float(torque)) / self._largest_torque
+            visible = length > 0.01 * self._size
+            if visible:
+                foot = 1.17 * self._scene.base.radius
+                ends = np.array([foot * w, (foot + length) * w])
+                arrow.points = (ends if torque > 0.0 else ends[::-1]).astype(np.float32)[None]
+            if visible != arrow.visible:
+                arrow.visible = visible
+
+    def _add_labels(self) -> None:
+        """Name the vertices P_k of the base triangle, on its outer side, and E."""
+        v = self._geometry.v
+        outwards = v - v.mean(axis=0)
+        outwards /= np.linalg.norm(outwards, axis=1)[:, None]
+        places = {
+            f"{BASE}/P{k + 1}": (f"P{'₁₂₃'[k]}", self._scene.base.radius * (v[k] + at))
+            for k, at in enumerate(0.13 * outwards)
+        }
+        places[f"{STAR}/E"] = ("E", self._scene.star.radius * np.array([0.0, 0.0, 1.36]))
+        for name, (text, position) in places.items():
+            self._server.scene.add_label(
+                f"{_ROOT}/{name}", text, position=position, anchor="center-center"
+            )
+
+
+def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
+    """Add a shape to viser's scene under a name."""
+    scene = server.scene
+    if isinstance(shape, Ball):
+        opacity = shape.opacity if shape.opacity < 1.0 else None
+        subdivisions = 3 if shape.radius < 0.1 else 5
+        scene.add_icosphere(
+            name,
+            shape.radius,
+            shape.colour,
+            subdivisions=subdivisions,
+            opacity=opacity,
+            position=shape.centre,
+        )
+    elif isinstance(shape, Box):
+        scene.add_box(name, shape.colour, shape.size, position=shape.centre)
+    elif isinstance(shape, Arc):
+        turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
+        outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.thickness
+        mesh = trimesh.creation.revolve(
+            outline + np.array([shape.radius, 0.0]), angle=shape.angle, sections=len(shape.points())
+        )
+        frame = np.stack([shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1)
+        scene.add_mesh_simple(name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour)
+        for index, end in enumerate(shape.points()[[0, -1]]):
+            add_shape(server, f"{name}/{index}", Ball(end, shape.thickness, shape.colour))
+    else:
+        along = shape.end - shape.begin
+        length = float(np.linalg.norm(along))
+        scene.add_cylinder(
+            name,
+            shape.thickness,
+            length,
+            shape.colour,
+            position=(shape.begin + shape.end) / 2.0,
+            wxyz=wxyz(_z_along(along / length)),
+        )
+
+
+def wxyz(rotation: Array) -> Array:
+    """Quaternion (w, x, y, z), as viser takes it, of a rotation matrix."""
+    return np.roll(quaternion_of(rotation), 1)
+
+
+def _z_along(z: Array) -> Array:
+    """Return a rotation matrix whose third column is a unit vector."""
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _angles(state: ViewState) -> dict[str, float]:
+    return dict(zip(JOINTS, (*state.gamma, *state.mu, *state.beta), strict=True))
+
+
+def _linear(colours: ArrayLike) -> Array:
+    """Convert sRGB to linear colours, which viser takes for arrows only."""
+    return np.asarray(np.asarray(colours, dtype=float) ** 2.2)
