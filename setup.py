@@ -55,9 +55,9 @@ setup(
     extras_require={
         "ros": wheels("kilted"),
         "jazzy": wheels("jazzy"),
-        "record": ["rosbags>=0.11"],
-        "report": ["rosbags>=0.11", "matplotlib>=3.5", "pandas>=2"],
-        "export": ["rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
+        "record": ["mcap>=1.6", "rosbags>=0.11"],
+        "report": ["mcap>=1.6", "rosbags>=0.11", "matplotlib>=3.5", "pandas>=2"],
+        "export": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
         "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
         "fast": ["numba>=0.57"],
         "view": ["jinja2>=3", "viser>=1.1,<2"],

@@ -31,7 +31,7 @@ from sst_ros import scene as scenes
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
-from sst_ros.recording.collector import JOINTS
+from sst_ros.recording.recording import JOINTS
 from sst_ros.report.fixed_step_motion import Course, Motion
 from sst_ros.report.states import by_columns, initial
 from sst_ros.scene import yaml_document

@@ -26,5 +26,5 @@ def _export(options: argparse.Namespace) -> None:
     require_free(out, "export", force=options.force)
     from sst_ros.recording.export import export
 
-    for path in export(options.bag, out, options.form):
+    for path in export(options.bag, out, options.form, force=options.force):
         print(path)

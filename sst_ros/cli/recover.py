@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`recover`: save what a killed recorder has written."""
+"""`recover`: a whole recording of what is intact in a cut or damaged one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sst_ros.cli import Commands
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    recovery = commands.add_parser("recover", help="save what a killed recorder has written")
+    recovery = commands.add_parser("recover", help="make a whole recording of a cut or damaged one")
     recovery.add_argument("bag", type=Path, help="folder of the bag")
     recovery.add_argument("--out", type=Path, help="folder of the new bag; default: beside the old")
     recovery.set_defaults(run=_recover)
@@ -20,6 +20,7 @@ def add(commands: Commands) -> None:
 def _recover(options: argparse.Namespace) -> None:
     from sst_ros.recording.recovery import recover
 
-    bag, messages, cut = recover(options.bag, options.out)
-    said = ", the recording is cut off" if cut else ""
-    print(f"{messages} messages recovered into {bag}{said}")
+    found = recover(options.bag, options.out)
+    print(f"{found.messages} messages recovered into {found.bag}, {found.lost} known to be lost")
+    for line in found.damage:
+        print(f"  {line}")

@@ -30,7 +30,7 @@ from rosbags.interfaces import (
 from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.raw_readers import NeverSpun, take
-from sst_ros.recording.bag_writer import BagFile
+from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
 
 _DEPTH = 10000
@@ -51,7 +51,7 @@ class Recorder:
         self._ready = False
         self._aside = NeverSpun()
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
-        self._bag = BagFile(Path(dated if given.output == "-" else given.output))
+        self._bag = BagWriter(Path(dated if given.output == "-" else given.output))
         self.node.get_logger().info(f"recording to {self._bag.path}")
         self.node.create_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
         self.node.create_timer(_DRAIN_PERIOD_S, self._drain, clock=STEADY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run that followed a reference, on one page: the motion, the error, the torques behind it."""
+"""A run that tracked a reference, on one page: the motion, the error, the torques behind it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.paper_figures import GREY, LINES, STYLE
-from sst_ros.report.tracking import Followed
+from sst_ros.report.tracking import TrackedRun
 
 LEGS = "₁₂₃"
 SMALLEST_SHOWN = 1e-17
 
 
-def draw(followed: Followed, title: str, out: Path) -> Path:
+def draw(tracked: TrackedRun, title: str, out: Path) -> Path:
     """Write the page as one PNG file and return its path."""
-    track = followed.track
+    track = tracked.track
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 7.4))
         (motion, error), (growth, torque) = figure.subplots(2, 2, sharex=True)
@@ -28,7 +28,7 @@ def draw(followed: Followed, title: str, out: Path) -> Path:
         error.set_title("Tracking error", loc="left")
         error.set_ylabel("γ desired − γ [rad]")
         _legs(error, track.time, track.error, "γ")
-        _growth(growth, followed)
+        _growth(growth, tracked)
         torque.set_title("Torques: feedforward, and feedback (thin)", loc="left")
         torque.set_ylabel("torque [N m]")
         _legs(torque, track.time, track.feedforward, "τ")
@@ -51,20 +51,20 @@ def _motion(axes: Axes, time: Array, desired: Array, measured: Array) -> None:
     _legs(axes, time, np.degrees(measured), "γ")
 
 
-def _growth(axes: Axes, followed: Followed) -> None:
+def _growth(axes: Axes, tracked: TrackedRun) -> None:
     """Draw the error against run time, on a logarithmic axis."""
     axes.set_title("Error against run time", loc="left")
     axes.set_ylabel("error [rad]")
-    worst = np.abs(followed.track.error).max(axis=1)
+    worst = np.abs(tracked.track.error).max(axis=1)
     curves = (
         ("largest of γ", worst),
-        ("orientation", followed.orientation_error),
+        ("orientation", tracked.orientation_error),
         ("largest of γ so far", np.maximum.accumulate(worst)),
     )
     for (name, values), line in zip(curves, LINES, strict=True):
         shown = np.where(values > SMALLEST_SHOWN, values, np.nan)
         if np.isfinite(shown).any():
-            axes.plot(followed.track.time, shown, label=name, **line)
+            axes.plot(tracked.track.time, shown, label=name, **line)
     axes.set_yscale("log")
     axes.legend(fontsize=8, loc="best")
 

@@ -1,103 +1,172 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag that is being written: rosbag2 in MCAP, saved as it grows. No rclpy in here."""
+"""Writes a rosbag2 recording in MCAP, with checksums, chunk by chunk."""
 
 from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Final
 
-from rosbags.interfaces import Connection, Qos
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2.enums import CompressionMode
 
 from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.recording.bag_reader import message_types
+from sst_ros.recording.mcap_file import LIBRARY
 
-VERSION = 9
-_SAVE_PERIOD_S = 1.0
+VERSION: Final = 9
+FLUSH_PERIOD_S = 1.0
+"""A process that is killed loses the messages of this time at most."""
 
 
-class BagCut(SstError):
-    """The bag could not be written any further; what is in it can be recovered."""
+class RecordingAborted(SstError):
+    """The recording could not be written any further; what is in it can be recovered."""
 
 
-class BagFile:
+class _McapStorage:
+    """Storage of a rosbags writer: MCAP with checksums and numbered messages."""
+
+    def __init__(self, path: Path, _: CompressionMode) -> None:
+        self.path = path / f"{path.name}.mcap"
+        self._file = self.path.open("xb")
+        self._writer: Any = McapWriter(  # partly untyped
+            self._file, compression=CompressionType.NONE, enable_data_crcs=True
+        )
+        self._writer.start("ros2", LIBRARY)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[int, int] = {}
+        self._sequence: Counter[int] = Counter()
+
+    def add_msgtype(self, connection: Connection) -> None:
+        """Add the definition of a message type."""
+        definition = connection.msgdef
+        encoding = "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
+        self._schemas[connection.msgtype] = self._writer.register_schema(
+            connection.msgtype, encoding, definition.data.encode()
+        )
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        """Add a topic."""
+        self._channels[connection.id] = self._writer.register_channel(
+            connection.topic, "cdr", self._schemas[connection.msgtype],
+            {"offered_qos_profiles": offered_qos_profiles},
+        )  # fmt: skip
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Add a message."""
+        self._sequence[connection.id] += 1
+        channel, sequence = self._channels[connection.id], self._sequence[connection.id]
+        self._writer.add_message(channel, timestamp, bytes(data), timestamp, sequence)
+
+    def flush(self) -> None:
+        """End the chunk and write all to the file."""
+        self._writer.flush()
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write the index."""
+        del version
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        self._writer.finish()
+        self._file.close()
+
+    def abort(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+
+class _McapBagWriter(Writer):
+    """rosbag2 folder with metadata.yaml around `_McapStorage`."""
+
+    STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
+
+    def flush(self) -> None:
+        """Write all messages to the file."""
+        if isinstance(self.storage, _McapStorage):
+            self.storage.flush()
+
+
+class BagWriter:
     """Writes messages; once a second all of them go to the file.
 
-    A bag gets its index when it is closed. If that does not happen (kill -9, a full disk, a power
-    cut) the messages that were saved are in its .mcap file, and `recovery.recover` makes a whole
-    bag of them.
+    A recording gets its index when it is closed. If that does not happen (kill -9, a full disk, a
+    power cut) the messages that were flushed are in its .mcap file, and `recovery.recover` makes a
+    whole recording of them.
+
+    Args:
+        path: folder to be made.
 
     Attributes:
-        messages: how many were written.
+        path: the folder.
+        messages: number of messages written.
 
     Raises:
         InputError: the folder exists, or cannot be made.
-        BagCut: by any method, when the file cannot be written.
+        RecordingAborted: by any method, when the file cannot be written.
 
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.messages = path, 0
-        self._typestore = get_typestore(Stores.ROS2_KILTED)
-        self._saved = time.monotonic()
+        self._typestore = message_types()
+        self._flushed = time.monotonic()
         self._open = True
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = Writer(path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
+            self._writer = _McapBagWriter(path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
             self._writer.open()
         except (WriterError, OSError) as error:
             allowed = f"must be a new folder ({error})"
             raise InputError("recorder", [Problem("output", str(path), allowed)]) from None
 
-    def knows(self, kind: str) -> bool:
-        """Tell whether messages of a type can be written."""
-        return kind in self._typestore.types
+    def knows(self, message_type: str) -> bool:
+        """Return whether messages of a type can be written."""
+        return message_type in self._typestore.types
 
-    def connect(self, topic: str, kind: str, offered: Sequence[Qos]) -> Connection:
-        """Add a topic."""
+    def connect(self, topic: str, message_type: str, offered: Sequence[Qos] = ()) -> Connection:
+        """Add a topic; each only once."""
         return self._writer.add_connection(
-            topic, kind, typestore=self._typestore, offered_qos_profiles=offered
+            topic, message_type, typestore=self._typestore, offered_qos_profiles=offered
         )
 
     def write(self, connection: Connection, received_ns: int, data: bytes) -> None:
-        """Add a message as it came."""
+        """Add a serialized message."""
         if self._open:
             try:
                 self._writer.write(connection, received_ns, data)
             except OSError as error:
-                raise self._cut(error) from None
+                raise self._abort(error) from None
             self.messages += 1
 
     def save(self) -> None:
-        """Once a second: have everything in the file."""
+        """Write all messages to the file, if that was a second ago."""
         now = time.monotonic()
-        if self._open and now - self._saved >= _SAVE_PERIOD_S:
-            self._saved = now
-            # rosbags has no public way to this; McapWriter does the same after 1 MiB.
-            storage = self._writer.storage
+        if self._open and now - self._flushed >= FLUSH_PERIOD_S:
+            self._flushed = now
             try:
-                if storage.chunk.bio.tell():
-                    storage.close_chunk()
-                storage.bio.flush()
+                self._writer.flush()
             except OSError as error:
-                raise self._cut(error) from None
+                raise self._abort(error) from None
 
     def close(self) -> None:
-        """Write the index; does nothing the second time and after a cut."""
+        """Write the index; does nothing the second time and after an abort."""
         if self._open:
             try:
                 self._writer.close()
             except OSError as error:
-                raise self._cut(error) from None
+                raise self._abort(error) from None
             self._open = False
 
-    def _cut(self, error: OSError) -> BagCut:
+    def _abort(self, error: OSError) -> RecordingAborted:
         self._open = False
         with contextlib.suppress(OSError):
             self._writer.abort()
-        return BagCut(
-            f"{self.path} is cut: {error}. Recording has stopped after {self.messages} messages; "
-            f"make a whole bag of those saved by: python -m sst_ros recover {self.path}"
+        return RecordingAborted(
+            f"{self.path} is cut: {error}. Recording stopped after {self.messages} messages; "
+            f"recover those that were written by: python -m sst_ros recover {self.path}"
         )

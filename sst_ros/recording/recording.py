@@ -9,23 +9,49 @@ from pathlib import Path
 
 import numpy as np
 
+from sst_ros.errors import InputError
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording.bag_reader import Bag, refused
-from sst_ros.recording.collector import (
+from sst_ros.recording import signals
+from sst_ros.recording.bag_reader import refused
+from sst_ros.recording.signals import Series, Signals
+from sst_ros.recording.time_series import NANOSECONDS, Integers, aligned, places, usual
+from sst_ros.recording.topic_tables import (
     ACTUATED,
+    COMMANDS,
+    DIAGNOSTICS,
+    EULER,
+    JOINT_STATES,
     JOINTS,
     KINDS,
     MOMENTS,
-    STAMPED,
-    TOPICS,
-    Collector,
-    Commands,
+    ORIENTATION,
+    SCENE,
+    STAMPED_COMMANDS,
+    TICKS,
 )
-from sst_ros.recording.time_series import NANOSECONDS, Integers, aligned, places, usual
-from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 
-__all__ = ["ACTUATED", "JOINTS", "KINDS", "MOMENTS", "Recording", "Ticks", "read"]
+__all__ = ["ACTUATED", "JOINTS", "KINDS", "MOMENTS", "Commands", "Recording", "Ticks", "read"]
+
+ESSENTIAL = (JOINT_STATES.topic.key, ORIENTATION.topic.key, TICKS.topic.key, SCENE.key)
+"""Topics without which a recording is not that of a run."""
+OPTIONAL = (EULER.topic.key, DIAGNOSTICS.key, COMMANDS.topic.key)
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Recorded commands in order of their reception.
+
+    Attributes:
+        received_ns: by the recorder's clock [ns], shape (c,).
+        stamp_ns: stamp of the sample that is answered [ns]; 0 where commands have none, shape (c,).
+        torque: commanded torques [N m], shape (c, 3).
+
+    """
+
+    received_ns: Integers
+    stamp_ns: Integers
+    torque: Array
 
 
 @dataclass(frozen=True)
@@ -73,11 +99,11 @@ class Recording:
         quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where it was lost.
         euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were lost.
         ticks: applied torques.
-        previews: number of samples before the start (stamp zero), which are not in the arrays.
+        idle_states: number of joint states that are no samples, which are not in the arrays.
         commands: recorded commands.
-        reports: what the simulator said about its run: when it was received [ns], key to text.
-        topics: names of the topics by key.
-        missing: keys of the topics that are not in the bag.
+        reports: diagnostics of the simulator's run: when received [ns], text by key.
+        missing: keys of the topics that are not in the recording.
+        signals: all columns of the recording.
 
     """
 
@@ -96,11 +122,11 @@ class Recording:
     quaternion: Array
     euler: Array
     ticks: Ticks
-    previews: int
+    idle_states: int
     commands: Commands
     reports: tuple[tuple[int, dict[str, str]], ...]
-    topics: dict[str, str]
     missing: tuple[str, ...]
+    signals: Signals
 
     @property
     def period_ns(self) -> int:
@@ -122,7 +148,7 @@ class Recording:
 
     @property
     def diagnostics(self) -> dict[str, str]:
-        """The last word of the simulator about its run, key to text; may be empty."""
+        """The last diagnostics of the simulator's run, text by key; may be empty."""
         return self.reports[-1][1] if self.reports else {}
 
     @property
@@ -131,47 +157,64 @@ class Recording:
         return np.asarray(self.time_ns / NANOSECONDS)
 
 
-def read(path: Path) -> Recording:
-    """Read a rosbag2 recording of a run.
+def read(path: str | Path, *, damaged: bool = False) -> Recording:
+    """Read a rosbag2 recording of a run, MCAP or sqlite3.
+
+    Args:
+        path: folder of the recording, or its file.
+        damaged: read what is intact of a damaged recording; `signals.damage` names the rest.
 
     Raises:
-        InputError: it is no recording of a run, or a damaged one; the error names what is wrong.
+        InputError: it is no recording of a run, or a damaged one; the error names the fault.
 
     """
-    found = Collector(path)
-    with Bag(path, (*TOPICS, STAMPED)) as bag:
-        found.collect(bag)
-    stamps, received, rows = found.joints.sorted()
-    if len(stamps) < 2:
-        allowed = f"a run has two samples or more ({found.previews} lie before its start)"
-        if found.reports and (fault := found.reports[-1][1].get("fault")):
-            allowed += f"; the simulator says: {fault}"
-        raise refused(path, "joint_states", len(stamps), allowed)
-    starts, _, ticks = found.ticks.sorted()
-    if not len(starts):
+    return of(signals.read(Path(path), damaged=damaged))
+
+
+def of(found: Signals) -> Recording:
+    """Make arrays of a whole run from the columns of a recording.
+
+    Raises:
+        InputError: a topic is missing, or its numbers are not those of a run.
+
+    """
+    path = found.path
+    absent = [found.absent[key] for key in ESSENTIAL if key in found.absent]
+    if absent:
+        raise InputError(str(path), absent)
+    if found.scene is None:
+        raise refused(path, SCENE.key, 0, "the recording must hold one scene")
+    reports = tuple(
+        (one.received_ns, one.values)
+        for one in found.statuses
+        if one.name.endswith("run") and "phase" in one.values
+    )
+    joints, orientation, euler, ticks = (
+        _finite(found, source.topic.key, len(source.columns))
+        for source in (JOINT_STATES, ORIENTATION, EULER, TICKS)
+    )
+    if len(joints.stamp_ns) < 2:
+        allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
+        if reports and (fault := reports[-1][1].get("fault")):
+            allowed += f"; the simulator reports: {fault}"
+        raise refused(path, "joint_states", len(joints.stamp_ns), allowed)
+    if not len(ticks.stamp_ns):
         raise refused(path, "applied_torques", 0, "the run has no recorded torque")
-    if len(found.scenes) != 1:
-        raise refused(path, "scene", len(found.scenes), "the recording must hold one scene")
-    scene = yaml_document.read(Scene, found.scenes.pop(), f"{path}: {bag.topics['scene']}")
-    begin = min(int(stamps[0]), int(starts[0]))
-    ends = starts + ticks[:, 0].astype(np.int64)
-    if np.any(starts[1:] < ends[:-1]):
-        at = starts[1:][starts[1:] < ends[:-1]][0]
-        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refused(path, "applied_torques", int(at), allowed)
-    quaternion = aligned(stamps, *found.turns.sorted())
+    stamps = joints.stamp_ns
+    start_ns = min(int(stamps[0]), int(ticks.stamp_ns[0]))
+    quaternion = aligned(stamps, orientation.stamp_ns, orientation.values)
     with np.errstate(over="ignore"):  # too long is refused just below
         length = np.sqrt(np.einsum("ij,ij->i", quaternion, quaternion))
     if np.any(np.abs(length - 1.0) > 1e-6):  # nan compares False: lost is not wrong
         worst = float(length[np.abs(length - 1.0) > 1e-6][0])
         raise refused(path, "orientation", worst, "quaternions must have length 1")
-    gamma, mu, beta, gamma_dot, mu_dot, beta_dot, effort = np.split(rows, 7, axis=1)
+    gamma, mu, beta, gamma_dot, mu_dot, beta_dot, effort = np.split(joints.values, 7, axis=1)
     return Recording(
         path=path,
-        scene=scene,
-        start_ns=begin,
-        time_ns=stamps - begin,
-        received_ns=received,
+        scene=found.scene,
+        start_ns=start_ns,
+        time_ns=stamps - start_ns,
+        received_ns=joints.received_ns,
         gamma=gamma,
         mu=mu,
         beta=beta,
@@ -180,16 +223,53 @@ def read(path: Path) -> Recording:
         beta_dot=beta_dot,
         effort=effort,
         quaternion=quaternion,
-        euler=aligned(stamps, *found.angles.sorted()),
-        ticks=Ticks(
-            starts - begin,
-            ends - begin,
-            ticks[:, 1:],
-            found.moments.sorted()[2] if found.moved else None,
-        ),
-        previews=found.previews,
-        commands=found.asked(),
-        reports=tuple(sorted(found.reports, key=lambda report: report[0])),
-        topics=bag.topics,
-        missing=tuple(key for key in bag.missing if key != STAMPED.key),
+        euler=aligned(stamps, euler.stamp_ns, euler.values),
+        ticks=_ticks(path, ticks, start_ns),
+        idle_states=found.idle_states,
+        commands=_commands(found),
+        reports=reports,
+        missing=tuple(key for key in OPTIONAL if key in found.absent),
+        signals=found,
     )
+
+
+def _finite(found: Signals, key: str, width: int) -> Series:
+    """Return the rows of a topic, none where it was not recorded; moments of ticks may be nan."""
+    if key not in found.topic_series:
+        empty = np.empty(0, dtype=np.int64)
+        return Series((), empty, empty, np.empty((0, width)))
+    series = found.topic_series[key]
+    bad = ~np.isfinite(series.values[:, : 4 if key == TICKS.topic.key else None]).all(axis=1)
+    if bad.any():
+        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
+        raise refused(found.path, key, row, f"is not finite at stamp {stamp} ns")
+    return series
+
+
+def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
+    starts = series.stamp_ns
+    ends = starts + series.values[:, 0].astype(np.int64)
+    overlap = starts[1:] < ends[:-1]
+    if overlap.any():
+        at = int(starts[1:][overlap][0])
+        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
+        raise refused(path, "applied_torques", at, allowed)
+    moment = series.values[:, 4:]
+    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+    return Ticks(
+        starts - start_ns, ends - start_ns, series.values[:, 1:4], moment if known else None
+    )
+
+
+def _commands(found: Signals) -> Commands:
+    """Put the commands of both topics in order of their reception."""
+    keys = (COMMANDS.topic.key, STAMPED_COMMANDS.topic.key)
+    parts = [found.topic_series[key] for key in keys if key in found.topic_series]
+    if not parts:
+        none = np.empty(0, dtype=np.int64)
+        return Commands(none, none, np.empty((0, 3)))
+    received = np.concatenate([part.received_ns for part in parts])
+    stamps = np.concatenate([part.stamp_ns for part in parts])
+    torque = np.concatenate([part.values for part in parts])
+    order = np.argsort(received, kind="stable")
+    return Commands(received[order], stamps[order], torque[order])

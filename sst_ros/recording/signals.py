@@ -1,23 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that a bag holds of a run, as columns; what it lacks is left out and named.
+"""All that a recording holds of a run, as columns; what it lacks is left out and named.
 
-`recording.read` is for judging: it refuses what is not a whole run. This is for looking: it takes
-any bag in which some topic of a run is found.
+Any recording in which some topic of a run is found is read; `recording.read` makes a `Recording`
+of it, which refuses what is not a whole run.
 """
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from sst_ros.errors import Problem
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording import cdr_fields
-from sst_ros.recording.bag_reader import Bag, refused
-from sst_ros.recording.mcap_blocks import Block
+from sst_ros.recording.bag_reader import Bag, Message, refused
 from sst_ros.recording.time_series import NANOSECONDS, Integers
-from sst_ros.recording.topic_tables import SAMPLES, SCENE, SOURCES, TABLES, TICKS, Column, Source
+from sst_ros.recording.topic_tables import (
+    DIAGNOSTICS,
+    EULER,
+    JOINT_STATES,
+    ORIENTATION,
+    SCENE,
+    TABLES,
+    TICKS,
+    TOPIC_TABLES,
+    Column,
+    InvalidMessage,
+    TopicTable,
+)
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 
@@ -29,7 +43,7 @@ class Series:
     Attributes:
         columns: what the numbers are.
         stamp_ns: stamps of the messages [ns], shape (n,); 0 where they have none.
-        received_ns: when the recorder got them, by its clock [ns], shape (n,); 0 where it did not.
+        received_ns: reception by the recorder, by its clock [ns], shape (n,); 0 where it failed.
         values: shape (n, number of columns); nan where a message was lost.
 
     """
@@ -41,23 +55,60 @@ class Series:
 
 
 @dataclass(frozen=True)
+class Status:
+    """One diagnostic status: when it was received [ns], its name, its values by key."""
+
+    received_ns: int
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
 class Signals:
-    """A run as tables.
+    """A run as columns.
 
     Attributes:
-        path: where the bag is.
+        path: of the recording.
         scene: what was simulated; None where it was not recorded.
         start_ns: stamp of the start of the run [ns].
-        tables: rows by the names of `contents.TABLES`; only what was recorded.
-        missing: keys of the topics that are not in the bag, or in it without a message of the run.
+        topic_series: rows of each topic that was recorded, by its key.
+        idle_states: number of joint states that are no samples of the run.
+        statuses: diagnostics, in order of reception.
+        topics: full names of the topics found, by key.
+        absent: why a topic is missing, by key.
+        damage: what is damaged or lost, a line for each part; empty unless it was asked for.
+        unverified: number of chunks without a checksum.
 
     """
 
     path: Path
     scene: Scene | None
     start_ns: int
-    tables: dict[str, Series]
-    missing: tuple[str, ...]
+    topic_series: dict[str, Series]
+    idle_states: int
+    statuses: tuple[Status, ...]
+    topics: dict[str, str]
+    absent: dict[str, Problem]
+    damage: tuple[str, ...] = ()
+    unverified: int = 0
+
+    @cached_property
+    def tables(self) -> dict[str, Series]:
+        """Rows by the names of `TABLES`; only what was recorded."""
+        result = {}
+        for name, sources in TABLES.items():
+            keys = [source.topic.key for source in sources]
+            parts = [self.topic_series[key] for key in keys if key in self.topic_series]
+            if parts:
+                result[name] = _side_by_side(parts) if len(parts) > 1 else parts[0]
+        return result
+
+    @cached_property
+    def missing(self) -> tuple[str, ...]:
+        """Keys of the topics that are not in the recording, or without a row of the run."""
+        keys = [source.topic.key for source in TOPIC_TABLES]
+        found = [*self.topic_series, *([SCENE.key] if self.scene else [])]
+        return tuple(key for key in (*keys, SCENE.key) if key not in found)
 
     def time_ns(self, table: str) -> Integers:
         """Time of each row since the start of the run [ns].
@@ -73,7 +124,7 @@ class Signals:
         return np.asarray(self.time_ns(table) / NANOSECONDS)
 
     def has(self, *names: str, table: str = "samples") -> bool:
-        """Tell whether there are columns of these quantities, as in "gamma_1"."""
+        """Return whether there are columns of these quantities, as in "gamma_1"."""
         return all(self._places(name, table) for name in names)
 
     def legs(self, name: str, table: str = "samples") -> Array:
@@ -91,83 +142,100 @@ class Signals:
         return [place for place, column in found if column.quantity == name]
 
 
-def read(path: Path) -> Signals:
-    """Read what there is.
+def read(path: Path, *, damaged: bool = False) -> Signals:
+    """Read a recording in one pass.
+
+    Args:
+        path: a rosbag2 recording, MCAP or sqlite3.
+        damaged: read what is intact of a damaged recording; `Signals.damage` names the rest.
 
     Raises:
-        InputError: there is no bag, it is damaged, or it has nothing of a run.
+        InputError: there is no recording, it is damaged, or it has nothing of a run.
 
     """
-    collected = {source.topic.key: _Collected(source) for source in SOURCES}
+    wanted = [*(source.topic for source in TOPIC_TABLES), SCENE, DIAGNOSTICS]
+    bag = Bag(path, wanted, damaged=damaged)
+    collected = {source.topic.key: _Rows(source) for source in TOPIC_TABLES}
     scenes: set[str] = set()
-    with Bag(path, [*(source.topic for source in SOURCES), SCENE]) as bag:
-        for block in bag.blocks() if bag.topics else ():
-            if block.topic == SCENE.key:
-                scenes |= {message.data for message in bag.content(block)}
-                continue
+    statuses: list[Status] = []
+    for message in bag.messages():
+        if message.key == SCENE.key:
+            scenes.add(message.content.data)
+        elif message.key == DIAGNOSTICS.key:
+            statuses += _statuses(message)
+        else:
             try:
-                collected[block.topic].add(block)
-            except cdr_fields.Malformed as error:
-                raise bag.damaged(error, f" in {block.topic}") from None
-            except (ValueError, IndexError):
-                allowed = "a message lacks joints, or numbers for them"
-                raise refused(path, block.topic, None, allowed) from None
-    found = {key: rows.series(path) for key, rows in collected.items() if rows.count}
+                collected[message.key].add(message)
+            except InvalidMessage as error:
+                raise refused(path, message.key, error.value, str(error)) from None
+    idle = collected[JOINT_STATES.topic.key].skipped
+    series = {key: collected.pop(key).series(path) for key in list(collected)}
+    found = {key: one for key, one in series.items() if len(one.stamp_ns)}
     if not found:
-        allowed = "must have at least one of " + ", ".join(s.topic.ending for s in SOURCES)
+        allowed = "must have at least one of " + ", ".join(s.topic.ending for s in TOPIC_TABLES)
         raise refused(path, "topics", None, allowed)
-    tables = {}
-    for name, sources in TABLES.items():
-        parts = [found[source.topic.key] for source in sources if source.topic.key in found]
-        if parts:
-            tables[name] = _together(parts) if len(parts) > 1 else parts[0]
-    scene = _scene(path, scenes)
-    missing = [source.topic.key for source in SOURCES if source.topic.key not in found]
     return Signals(
         path=path,
-        scene=scene,
-        start_ns=_start(tables),
-        tables=tables,
-        missing=tuple(missing if scene else [*missing, SCENE.key]),
+        scene=_scene(path, scenes, bag.topics.get(SCENE.key, "scene")),
+        start_ns=_start(found),
+        topic_series=found,
+        idle_states=idle,
+        statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
+        topics=bag.topics,
+        absent={one.key: bag.absence(one) for one in wanted if one.key not in bag.topics},
+        damage=bag.damage,
+        unverified=bag.unverified,
     )
 
 
-class _Collected:
-    """The rows of one topic, kept compact."""
+class _Rows:
+    """The rows of one topic, kept compact: an hour at 500 Hz has 1.8 million of them."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: TopicTable) -> None:
         self._source = source
-        self._parts: list[tuple[Integers, Integers, Array]] = []
+        self._stamps, self._received, self._values = array("q"), array("q"), array("d")
+        self.skipped = 0
 
-    @property
-    def count(self) -> int:
-        return sum(len(stamps) for stamps, _, _ in self._parts)
-
-    def add(self, block: Block) -> None:
-        for received, rows in cdr_fields.read(block.received, block.rows, self._source.fields):
-            for stamps, values in rows:
-                # A stamp of zero is a preview, which belongs to no run.
-                kept = stamps != 0 if self._source in (*SAMPLES, TICKS) else stamps >= 0
-                self._parts.append((stamps[kept], received[kept], values[kept]))
+    def add(self, message: Message) -> None:
+        rows = self._source.rows(message.content)
+        self.skipped += not rows
+        for stamp, values in rows:
+            self._stamps.append(stamp)
+            self._received.append(message.received_ns)
+            self._values.extend(values)
 
     def series(self, path: Path) -> Series:
-        told = self._source.columns
-        stamps, received, values = map(np.concatenate, zip(*self._parts, strict=True))
-        stamped = self._source in (*SAMPLES, TICKS)
-        order = np.argsort(stamps if stamped else received, kind="stable")
-        stamps, received, values = stamps[order], received[order], values[order]
-        if stamped:
-            again = stamps[1:] == stamps[:-1]
-            if again.any():
-                twice = int(stamps[1:][again][0])
-                allowed = f"stamp {twice} ns comes twice; record one simulator a bag"
-                raise refused(path, self._source.topic.key, twice, allowed)
+        columns = self._source.columns
+        stamps = np.frombuffer(self._stamps, dtype=np.int64)
+        received = np.frombuffer(self._received, dtype=np.int64)
+        values = np.frombuffer(self._values, dtype=float).reshape(len(stamps), len(columns))
+        key = stamps if self._source.stamped else received
+        if np.any(key[1:] < key[:-1]):
+            order = np.argsort(key, kind="stable")
+            stamps, received, values = stamps[order], received[order], values[order]
+        if self._source.stamped:
+            again = np.flatnonzero(stamps[1:] == stamps[:-1])
+            if self._source in (ORIENTATION, EULER):  # an idle state shows the last sample again
+                again = again[~(values[again] == values[again + 1]).all(axis=1)]
+            if len(again):
+                allowed = f"stamp {stamps[again[0]]} ns comes twice; record one simulator a bag"
+                raise refused(path, self._source.topic.key, len(again), allowed)
+            stays = np.append(True, stamps[1:] != stamps[:-1])[: len(stamps)]
+            if not stays.all():
+                stamps, received, values = stamps[stays], received[stays], values[stays]
         if self._source is TICKS and np.isnan(values[:, -3:]).all():
-            told, values = told[:-3], values[:, :-3]  # no moment was recorded
-        return Series(told, stamps, received, values)
+            columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
+        return Series(columns, stamps, received, values)
 
 
-def _together(parts: list[Series]) -> Series:
+def _statuses(message: Message) -> list[Status]:
+    return [
+        Status(message.received_ns, one.name, {pair.key: pair.value for pair in one.values})
+        for one in message.content.status
+    ]
+
+
+def _side_by_side(parts: Sequence[Series]) -> Series:
     """Put topics side by side at all stamps that any of them has."""
     stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
     received = np.zeros(len(stamps), dtype=np.int64)
@@ -178,17 +246,17 @@ def _together(parts: list[Series]) -> Series:
         whole[at] = part.values
         values.append(whole)
         received[at] = np.where(received[at] > 0, received[at], part.received_ns)
-    told = tuple(column for part in parts for column in part.columns)
-    return Series(told, stamps, received, np.concatenate(values, axis=1))
+    columns = tuple(column for part in parts for column in part.columns)
+    return Series(columns, stamps, received, np.concatenate(values, axis=1))
 
 
-def _start(tables: dict[str, Series]) -> int:
-    firsts = [tables[name].stamp_ns[0] for name in ("samples", "ticks") if name in tables]
-    others = [int(table.received_ns[0]) for table in tables.values()]
-    return int(min(firsts)) if firsts else min(others)
+def _start(found: dict[str, Series]) -> int:
+    stamped = [source.topic.key for source in (*TABLES["samples"], TICKS)]
+    firsts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
+    return min(firsts or [int(series.received_ns[0]) for series in found.values()])
 
 
-def _scene(path: Path, texts: set[str]) -> Scene | None:
+def _scene(path: Path, texts: set[str], topic: str) -> Scene | None:
     if len(texts) > 1:
         raise refused(path, "scene", len(texts), "the recording must hold one scene")
-    return yaml_document.read(Scene, texts.pop(), f"{path}: scene") if texts else None
+    return yaml_document.read(Scene, texts.pop(), f"{path}: {topic}") if texts else None

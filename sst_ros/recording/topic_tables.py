@@ -1,29 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag of a run may hold, topic by topic: the tables and columns that its messages become.
+"""Topics of a run, the numbers in their messages, and the tables that these become.
 
-Columns bear their units. A bag that lacks a topic lacks its columns, and nothing else.
+Columns bear their units. A recording that lacks a topic lacks its columns, and nothing else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.mechanism.geometry import Array
+from sst_ros.description.frame_ids import is_idle
 from sst_ros.recording.bag_reader import Topic
-from sst_ros.recording.cdr_fields import Columns
-from sst_ros.recording.collector import (
-    ACTUATED,
-    JOINTS,
-    KINDS,
-    MOMENTS,
-    joint_state,
-    multi_array,
-    trajectory,
-)
-from sst_ros.recording.time_series import Integers
+from sst_ros.recording.time_series import NANOSECONDS
+
+KINDS = ("gamma", "mu", "beta")
+JOINTS = tuple(f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3))
+ACTUATED = JOINTS[:3]
+MOMENTS = ("moment_x", "moment_y", "moment_z")
 
 
 class Column(NamedTuple):
@@ -41,142 +36,210 @@ class Column(NamedTuple):
             return self.quantity
         return f"{self.quantity}_{self.unit.replace('/', '_per_').replace(' ', '_')}"
 
+    @property
+    def text(self) -> str:
+        """What it is, its unit, its topic."""
+        return f"{self.what} [{self.unit}]" + (f", from {self.topic}" if self.topic else "")
 
-Rows = list[tuple[Integers, Array]]
-"""Stamps [ns], 0 for none, shape (n,), and numbers, shape (n, w), of n messages of one layout."""
 
-Fields = Callable[[Columns], Rows]
+class InvalidMessage(ValueError):
+    """A message has numbers or names that cannot be used; `value` was found."""
+
+    def __init__(self, value: object, allowed: str) -> None:
+        self.value = value
+        super().__init__(allowed)
 
 
-class Source(NamedTuple):
-    """A topic, the columns that it gives, and how its messages are read.
+Rows = list[tuple[int, Sequence[float]]]
+"""Stamps [ns], 0 for none, and the numbers of one message; none for what is no part of a run."""
 
-    Where a message lacks joints, or numbers for them, reading it raises a ValueError.
+
+class TopicTable(NamedTuple):
+    """A topic, the columns of its rows, and the function that reads the rows of a message.
+
+    `stamped`: rows are ordered by stamps, and there is one at each.
     """
 
     topic: Topic
     columns: tuple[Column, ...]
-    fields: Fields
+    rows: Callable[[Any], Rows]
+    stamped: bool = True
 
 
-def _joints(names: Sequence[str], efforts: Sequence[str]) -> Fields:
-    def fields(message: Columns) -> Rows:
-        stamp, found, parts = joint_state(message)
-        wanted = (names, names, efforts)
-        columns = [part[:, _places(found, at)] for part, at in zip(parts, wanted, strict=True)]
-        return [(stamp, np.hstack(columns))]
+class _JointRows:
+    """Reads positions, velocities and efforts of some joints from JointState messages."""
 
-    return fields
+    def __init__(self, joints: Sequence[str], efforts: Sequence[str]) -> None:
+        self._joints, self._efforts = joints, efforts
+        self._names: list[str] = []
+        self._at: list[int] = []
+
+    def __call__(self, message: Any) -> Rows:
+        stamp = nanoseconds(message.header.stamp)
+        if is_idle(stamp, message.header.frame_id):
+            return []
+        if message.name != self._names:
+            self._at, self._names = places_of(self._joints, message.name), list(message.name)
+        parts = message.position, message.velocity, message.effort
+        sizes = {len(self._names), *map(len, parts)}
+        if len(sizes) > 1:
+            allowed = "name, position, velocity and effort must be equally long"
+            raise InvalidMessage(sorted(sizes), allowed)
+        position, velocity, effort = (part[self._at].tolist() for part in parts)
+        return [(stamp, position + velocity + effort[: len(self._efforts)])]
 
 
-def _numbers(count: int, before: int = 0) -> Fields:
-    """Read so many numbers after others that are passed over."""
-
-    def fields(message: Columns) -> Rows:
-        return [(message.stamp(), message.numbers("f8", before + count)[:, before:])]
-
-    return fields
+def _quaternion(message: Any) -> Rows:
+    q = message.quaternion
+    return _stamped(message, (q.x, q.y, q.z, q.w))
 
 
-def _ticks(message: Columns) -> Rows:
-    """Give the length of each tick beside its torques: exact in a double."""
-    found = trajectory(message)
-    names = found.names or ACTUATED
-    at = [*_places(names, ACTUATED), *(names.index(m) for m in MOMENTS if m in names)]
-    start, rows = found.stamp, []
-    for effort, after in zip(found.efforts, found.ends, strict=True):
-        row = np.full((len(start), 7), np.nan)
-        row[:, 1 : 1 + len(at)] = effort[:, at]
-        end = found.stamp + after
-        row[:, 0] = end - start
-        rows.append((start, row))
-        start = end
+def _vector(message: Any) -> Rows:
+    v = message.vector
+    return _stamped(message, (v.x, v.y, v.z))
+
+
+def _moment(message: Any) -> Rows:
+    m = message.wrench.torque
+    return [(nanoseconds(message.header.stamp), (m.x, m.y, m.z))]
+
+
+def _stamped(message: Any, values: Sequence[float]) -> Rows:
+    stamp = nanoseconds(message.header.stamp)
+    return [(stamp, values)] if stamp else []
+
+
+def _ticks(message: Any) -> Rows:
+    """Read the length of each tick [ns], exact in a double, its torques, and moments or nan."""
+    start = nanoseconds(message.header.stamp)
+    if not start:
+        return []
+    names = message.joint_names
+    at, moments = [0, 1, 2], []
+    if names:
+        at = places_of(ACTUATED, names)
+        moments = places_of(MOMENTS, names) if set(MOMENTS) <= set(names) else []
+    rows: Rows = []
+    end = start
+    for point in message.points:
+        effort = point.effort.tolist()
+        if len(effort) != max(3, len(names)):
+            allowed = f"must be a torque for each actuator (stamp {start} ns)"
+            raise InvalidMessage(effort, allowed)
+        begin, end = end, start + nanoseconds(point.time_from_start)
+        if end <= begin:
+            allowed = f"ticks must have a length; one at stamp {begin} ns has none"
+            raise InvalidMessage(end - begin, allowed)
+        moment = [effort[k] for k in moments] or [np.nan] * 3
+        rows.append((begin, [float(end - begin), *(effort[k] for k in at), *moment]))
     return rows
 
 
-def _commands(message: Columns) -> Rows:
-    torque = multi_array(message)
-    # Others are not used by the simulator either.
-    return [(np.zeros(len(torque), np.int64), torque)] if torque.shape[1] == 3 else []
+def _commands(message: Any) -> Rows:
+    # Others are dropped by the simulator too.
+    return [(0, message.data.tolist())] if len(message.data) == 3 else []
 
 
-def _places(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def _stamped_commands(message: Any) -> Rows:
+    if sorted(message.name) != sorted(ACTUATED) or len(message.effort) != 3:
+        return []
+    at = places_of(ACTUATED, message.name)
+    return [(nanoseconds(message.header.stamp), message.effort[at].tolist())]
+
+
+def places_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Find where wanted names stand among others.
+
+    Raises:
+        InvalidMessage: some are missing.
+
+    """
+    absent = [name for name in wanted if name not in names]
+    if absent:
+        raise InvalidMessage(list(names), "joints are missing: " + ", ".join(absent))
     return [list(names).index(name) for name in wanted]
 
 
-def _source(
-    key: str, ending: str, kind: str, fields: Fields, *parts: tuple[Sequence[str], str, str]
-) -> Source:
-    columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
-    return Source(Topic(key, ending, kind, False), tuple(columns), fields)
+def nanoseconds(stamp: Any) -> int:
+    """Return a Time or Duration as one number [ns]."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def _table(
+    topic: Topic, rows: Callable[[Any], Rows], *parts: tuple[Sequence[str], str, str],
+    stamped: bool = True,
+) -> TopicTable:  # fmt: skip
+    columns = [Column(name, unit, what, topic.key) for names, unit, what in parts for name in names]
+    return TopicTable(topic, tuple(columns), rows, stamped)
 
 
 def _legs(name: str) -> list[str]:
     return [f"{name}_{leg}" for leg in (1, 2, 3)]
 
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
+_JOINT_STATE = "sensor_msgs/msg/JointState"
 
-SAMPLES = (
-    _source(
-        "joint_states", "/joint_states", JOINT_STATE, _joints(JOINTS, ACTUATED),
-        *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
-        *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
-        (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
-    ),
-    _source(
-        "orientation", "/orientation", "geometry_msgs/msg/QuaternionStamped", _numbers(4),
-        (("q_x", "q_y", "q_z", "q_w"), "1", "quaternion of {E} in {B}"),
-    ),
-    _source(
-        "euler_zyz", "/euler_zyz", "geometry_msgs/msg/Vector3Stamped", _numbers(3),
-        (("theta", "phi", "psi"), "rad", "ZYZ angle of {E} in {B}"),
-    ),
-    _source(
-        "reference", "/reference", JOINT_STATE, _joints(ACTUATED, ACTUATED),
-        (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
-        (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
-        (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
-    ),
-    _source(
-        "tracking_error", "/tracking_error", JOINT_STATE, _joints(ACTUATED, ACTUATED),
-        (_legs("gamma_error"), "rad", "desired less measured angle"),
-        (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
-        (_legs("tau_feedback"), "N m", "torque of the feedback"),
-    ),
+JOINT_STATES = _table(
+    Topic("joint_states", "/joint_states", _JOINT_STATE), _JointRows(JOINTS, ACTUATED),
+    *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
+    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
+    (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
 )  # fmt: skip
-"""Topics with one row at a sample's stamp."""
-
-TICKS = _source(
-    "applied_torques", "/applied_torques", "trajectory_msgs/msg/JointTrajectory", _ticks,
+ORIENTATION = _table(
+    Topic("orientation", "/orientation", "geometry_msgs/msg/QuaternionStamped"), _quaternion,
+    (("q_x", "q_y", "q_z", "q_w"), "1", "quaternion of {E} in {B}"),
+)  # fmt: skip
+EULER = _table(
+    Topic("euler_zyz", "/euler_zyz", "geometry_msgs/msg/Vector3Stamped"), _vector,
+    (("theta", "phi", "psi"), "rad", "ZYZ angle of {E} in {B}"),
+)  # fmt: skip
+REFERENCE = _table(
+    Topic("reference", "/reference", _JOINT_STATE), _JointRows(ACTUATED, ACTUATED),
+    (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
+    (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
+    (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
+)  # fmt: skip
+TRACKING_ERROR = _table(
+    Topic("tracking_error", "/tracking_error", _JOINT_STATE), _JointRows(ACTUATED, ACTUATED),
+    (_legs("gamma_error"), "rad", "desired less measured angle"),
+    (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
+    (_legs("tau_feedback"), "N m", "torque of the feedback"),
+)  # fmt: skip
+TICKS = _table(
+    Topic("applied_torques", "/applied_torques", "trajectory_msgs/msg/JointTrajectory"), _ticks,
     (("length",), "ns", "length of the tick, which begins at the stamp"),
     (_legs("tau"), "N m", "torque held over the tick"),
     (MOMENTS, "N m", "external moment on the star in {B} over the tick"),
 )  # fmt: skip
-COMMANDS = _source(
-    "commands", "/commands", "std_msgs/msg/Float64MultiArray", _commands,
+COMMANDS = _table(
+    Topic("commands", "/commands", "std_msgs/msg/Float64MultiArray"), _commands,
     (_legs("tau"), "N m", "commanded torque"),
+    stamped=False,
 )  # fmt: skip
-STAMPED = _source(
-    "commands_stamped", "/commands_stamped", JOINT_STATE, _joints((), ACTUATED),
+STAMPED_COMMANDS = _table(
+    Topic("commands_stamped", "/commands_stamped", _JOINT_STATE), _stamped_commands,
     (_legs("tau"), "N m", "commanded torque"),
+    stamped=False,
 )  # fmt: skip
-MOMENT = _source(
-    "external_moment", "/external_moment", "geometry_msgs/msg/WrenchStamped", _numbers(3, 3),
+MOMENT = _table(
+    Topic("external_moment", "/external_moment", "geometry_msgs/msg/WrenchStamped"), _moment,
     (MOMENTS, "N m", "external moment on the star in {B}"),
+    stamped=False,
 )  # fmt: skip
 
-SOURCES = (*SAMPLES, TICKS, COMMANDS, STAMPED, MOMENT)
-SCENE = Topic("scene", "/scene", "std_msgs/msg/String", False)
+SCENE = Topic("scene", "/scene", "std_msgs/msg/String")
+DIAGNOSTICS = Topic("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", False)
 
-TABLES: dict[str, tuple[Source, ...]] = {
-    "samples": SAMPLES,
+TABLES: dict[str, tuple[TopicTable, ...]] = {
+    "samples": (JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
     "ticks": (TICKS,),
     "commands": (COMMANDS,),
-    "commands_stamped": (STAMPED,),
+    "commands_stamped": (STAMPED_COMMANDS,),
     "external_moment": (MOMENT,),
 }
-"""The tables of a run, and the topics in each."""
+"""The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
+
+TOPIC_TABLES = tuple(table for tables in TABLES.values() for table in tables)
 
 TIMES = (
     Column("time", "ns", "time since the start of the run; of reception where there is no stamp"),

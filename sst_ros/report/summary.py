@@ -96,7 +96,7 @@ def _loss(recording: Recording) -> dict[str, Any]:
         # The last sample marks the end of the run, wherever that is.
         "stamps_off_the_period": int(np.count_nonzero(spacing[:-1] % period)),
         "orientations_lost": int(np.count_nonzero(~np.isfinite(recording.quaternion[:, 0]))),
-        "preview_samples": recording.previews,
+        "idle_states": recording.idle_states,
         "tick_period_s": recording.ticks.period_ns / NANOSECONDS,
         "ticks_recorded": len(recording.ticks.start_ns),
         "tick_gaps": recording.ticks.gaps,

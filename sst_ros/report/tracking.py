@@ -10,34 +10,31 @@ from typing import Any
 import numpy as np
 
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
-from sst_ros.errors import SingularConfiguration
+from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording import recording
-from sst_ros.recording.bag_reader import Bag, Topic, refused
-from sst_ros.recording.recording import ACTUATED, Recording
-from sst_ros.recording.time_series import NANOSECONDS, nanoseconds
+from sst_ros.recording.bag_reader import refused
+from sst_ros.recording.recording import Recording
+from sst_ros.recording.time_series import NANOSECONDS, Integers, places
+from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR
 
-TOPICS = (
-    Topic("reference", "/reference", "sensor_msgs/msg/JointState", True),
-    Topic("tracking_error", "/tracking_error", "sensor_msgs/msg/JointState", True),
-    Topic("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", False, False),
-)
+KEYS = (REFERENCE.topic.key, TRACKING_ERROR.topic.key)
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedRun:
     """A recorded run that followed a reference; rows belong to the samples that have one.
 
     Attributes:
         recording: the run.
-        track: what was wanted and what was missing.
+        track: reference, tracking error and torques.
         rows: which samples of the recording these are, shape (n,).
         orientation_error: angle between the orientation and that of the reference [rad], shape
             (n,); nan where it is not known.
-        limited: samples in which a torque was limited, by the companion's last word; None where
-            that was not recorded.
+        limited: samples in which a torque was limited, by the last diagnostics of the controller;
+            None where that was not recorded.
 
     """
 
@@ -48,32 +45,35 @@ class Followed:
     limited: int | None
 
 
-def read(path: Path) -> Followed:
-    """Read a rosbag2 recording of a run with the topics of the companion.
+def read(path: Path) -> TrackedRun:
+    """Read a rosbag2 recording of a run with the topics of the inverse-dynamics controller.
 
     Raises:
         InputError: it is no recording of a run that followed a reference, or a damaged one.
 
     """
     run = recording.read(path)
-    found: dict[str, dict[int, Array]] = {"reference": {}, "tracking_error": {}}
-    limited = None
-    with Bag(path, TOPICS) as bag:
-        for message in bag.messages():
-            if message.key == "diagnostics":
-                limited = _limited(message.content, limited)
-            else:
-                stamp, row = _row(path, message.key, message.content)
-                found[message.key][stamp - run.start_ns] = row
-    wanted = np.array(sorted(found["reference"].keys() & found["tracking_error"].keys()), dtype=int)
-    times, rows, _ = np.intersect1d(run.time_ns, wanted, return_indices=True)
-    if len(times) < 2:
-        said = "two samples or more must have a reference"
-        raise refused(path, "reference", len(times), said)
-    reference, error = (
-        np.array([found[key][time] for time in times.tolist()])
-        for key in ("reference", "tracking_error")
-    )
+    absent = [run.signals.absent[key] for key in KEYS if key in run.signals.absent]
+    if absent:
+        raise InputError(str(path), absent)
+    found = of(run)
+    if found is None:
+        allowed = "two samples or more must have a reference"
+        raise refused(path, KEYS[0], 0, allowed)
+    return found
+
+
+def of(run: Recording) -> TrackedRun | None:
+    """Return reference and tracking error of a run; None where fewer than two samples have one."""
+    if not all(key in run.signals.topic_series for key in KEYS):
+        return None
+    series = [run.signals.topic_series[key] for key in KEYS]
+    at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
+    rows = np.flatnonzero((at[0] >= 0) & (at[1] >= 0))
+    if len(rows) < 2:
+        return None
+    reference, error = (one.values[place[rows]] for one, place in zip(series, at, strict=True))
+    times = run.time_ns[rows]
     gamma, gamma_dot, feedforward = np.split(reference, 3, axis=1)
     off, off_rate, feedback = np.split(error, 3, axis=1)
     track = TrackingRecord(
@@ -86,35 +86,24 @@ def read(path: Path) -> Followed:
         feedback=feedback,
         torque=_applied(run, times, feedforward + feedback),
     )
-    return Followed(run, track, rows, _orientation_error(run, rows, gamma), limited)
+    return TrackedRun(run, track, rows, _orientation_error(run, rows, gamma), _limited(run))
 
 
-def judged(followed: Followed) -> TrackingMetrics:
-    """Put it in numbers."""
-    return evaluate(followed.track, followed.limited)
+def metrics(tracked: TrackedRun) -> TrackingMetrics:
+    """Return the figures of the tracking."""
+    return evaluate(tracked.track, tracked.limited)
 
 
-def _row(path: Path, key: str, message: Any) -> tuple[int, Array]:
-    names = list(message.name)
-    parts = (message.position, message.velocity, message.effort)
-    if sorted(names) != sorted(ACTUATED) or {len(part) for part in parts} != {3}:
-        allowed = "must have position, velocity and effort of " + ", ".join(ACTUATED)
-        raise refused(path, key, names, allowed)
-    order = [names.index(name) for name in ACTUATED]
-    stamp = message.header.stamp
-    row = np.concatenate([np.asarray(part)[order] for part in parts])
-    return nanoseconds(stamp), row
+def _limited(run: Recording) -> int | None:
+    counts = (
+        status.values.get("samples_limited", "")
+        for status in reversed(run.signals.statuses)
+        if status.name.endswith(": control")
+    )
+    return next((int(count) for count in counts if count.isdecimal()), None)
 
 
-def _limited(message: Any, before: int | None) -> int | None:
-    for status in message.status:
-        values = {entry.key: entry.value for entry in status.values}
-        if status.name.endswith(": control") and values.get("samples_limited", "").isdecimal():
-            return int(values["samples_limited"])
-    return before
-
-
-def _applied(run: Recording, times: Array, asked: Array) -> Array:
+def _applied(run: Recording, times: Integers, asked: Array) -> Array:
     """Torque of the tick that begins at each sample; what was lost is what was asked for.
 
     A sample after the last tick has no torque.

@@ -15,22 +15,22 @@ PICTURE, TABLE = "tracking.png", "tracking.txt"
 
 
 def report(bag: Path, out: Path) -> str:
-    """Judge a recorded run; write the table and the picture into `out`, return the table.
+    """Evaluate a recorded run: write the table and the picture into `out`, return the table.
 
     Raises:
         InputError: the bag is no whole recording of a run that followed a reference.
 
     """
-    followed = tracking.read(bag)
-    found = tracking.judged(followed)
+    tracked = tracking.read(bag)
+    found = tracking.metrics(tracked)
     out.mkdir(parents=True, exist_ok=True)
-    name = followed.recording.scene.name
+    name = tracked.recording.scene.name
     lines = [f"Tracking of {name}, from {bag}", "", table(found)]
-    if np.isfinite(followed.orientation_error).any():
-        worst = float(np.nanmax(followed.orientation_error))
+    if np.isfinite(tracked.orientation_error).any():
+        worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
     text = "\n".join(lines)
     (out / TABLE).write_text(text, encoding="utf-8")
     title = f"Tracking of {name}: {found.seconds:g} s, {found.samples} samples"
-    tracking_plot.draw(followed, title, out / PICTURE)
+    tracking_plot.draw(tracked, title, out / PICTURE)
     return text

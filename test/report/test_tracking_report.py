@@ -3,6 +3,7 @@
 
 import dataclasses
 
+import bags
 import numpy as np
 import pytest
 
@@ -11,7 +12,6 @@ from sst_ros.errors import InputError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import tracking, tracking_report
-from test.report import bags
 
 HOME = np.array(scene.load("example2").initial.gamma)
 OFF = np.array([0.01, -0.02, 0.03])
@@ -40,7 +40,7 @@ def test_the_track_is_what_was_written(bag):
     assert np.array_equal(track.torque[:-1], run.ticks.torque[begins])
     assert not track.torque[-1].any()
     largest = np.abs(HOME + OFF - run.gamma).max(axis=0)
-    assert tracking.judged(followed).largest == pytest.approx(largest)
+    assert tracking.metrics(followed).largest == pytest.approx(largest)
 
 
 def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entries, tmp_path):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One recording for all tests of the page."""
 
+import bags
 import pytest
-from report import bags
 
 from sst_ros.scene.scene import load
 

@@ -2,9 +2,12 @@
 """Reading bags: what a whole one gives, and that every broken one is refused in words."""
 
 import copy
+import dataclasses
 
+import lz4.frame
 import numpy as np
 import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sst_ros import scene
 from sst_ros.errors import InputError
@@ -20,9 +23,9 @@ def test_a_run_comes_back_as_it_was_written(written, bags, example2):
     assert np.array_equal(run.ticks.end_ns, run.ticks.start_ns + 1_000_000)
     assert (run.period_ns, run.ticks.period_ns, run.ticks.gaps) == (2_000_000, 1_000_000, 0)
     assert np.array_equal(run.received_ns - run.start_ns, run.time_ns + 50_000)
-    assert (run.previews, len(run.commands.torque), run.missing) == (3, 1, ())
+    assert (run.idle_states, len(run.commands.torque), run.missing) == (3, 1, ())
     assert run.diagnostics["phase"] == "finished"
-    assert run.topics["orientation"] == "/sst_simulator/orientation"
+    assert run.signals.topics["orientation"] == "/sst_simulator/orientation"
     last = next(e.content for e in example2 if (e.topic, e.sample) == (bags.JOINTS, 150))
     sections = [run.gamma, run.mu, run.beta], [run.gamma_dot, run.mu_dot, run.beta_dot]
     assert np.array_equal(np.concatenate([part[150] for part in sections[0]]), last.position)
@@ -51,7 +54,7 @@ def test_sqlite_single_files_and_namespaces_are_read(tmp_path, bags, example2):
     plain = recording.read(bags.write(tmp_path / "a", example2))
     other = recording.read(bags.write(tmp_path / "b", example2, sqlite=True, namespace="/cell_7"))
     assert np.array_equal(plain.gamma, other.gamma)
-    assert other.topics["joint_states"] == "/cell_7/joint_states"
+    assert other.signals.topics["joint_states"] == "/cell_7/joint_states"
     single = recording.read(next((tmp_path / "a").glob("*.mcap")))
     assert np.array_equal(plain.ticks.torque, single.ticks.torque)
 
@@ -180,3 +183,80 @@ def test_a_scene_that_is_refused_names_topic_and_key(written, bags, example2):
     entries = [broken(e) if e.topic == bags.SCENE else e for e in example2]
     with pytest.raises(InputError, match=r"/sst_simulator/scene: .*star.radius.*> 0"):
         recording.read(written(entries))
+
+
+def _compressed(path, entries, bags, mode=None, compressor=None):
+    """Write a bag that is compressed as rosbag2 does it, or in chunks of some other kind."""
+    connections = {}
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        if compressor is not None:
+            writer.storage.compression, writer.storage.compressor = compressor
+        for entry in entries:
+            if entry.topic not in connections:
+                kind = bags.KINDS[entry.topic]
+                connections[entry.topic] = writer.add_connection(
+                    entry.topic, kind, typestore=bags.STORE
+                )
+            raw = bytes(bags.STORE.serialize_cdr(entry.content, entry.content.__msgtype__))
+            writer.write(connections[entry.topic], entry.received_ns, raw)
+    return path
+
+
+def _same(one, other):
+    for field in dataclasses.fields(recording.Recording):
+        mine, its = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(mine, np.ndarray):
+            assert np.array_equal(mine, its, equal_nan=True), field.name
+    assert np.array_equal(one.ticks.torque, other.ticks.torque)
+    assert np.array_equal(one.commands.torque, other.commands.torque)
+    assert one.scene == other.scene and one.reports == other.reports
+
+
+def test_bags_of_every_kind_hold_the_same_run(tmp_path, bags, example2):
+    expected = recording.read(bags.record(tmp_path / "own", example2))
+    _same(recording.read(bags.write(tmp_path / "plain", example2)), expected)
+    _same(recording.read(bags.write(tmp_path / "sqlite", example2, sqlite=True)), expected)
+    packed = ("lz4", lz4.frame.compress)
+    _same(
+        recording.read(_compressed(tmp_path / "lz4", example2, bags, compressor=packed)), expected
+    )
+    for mode in (CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE):
+        path = _compressed(tmp_path / str(mode), example2, bags, mode)
+        _same(recording.read(path), expected)
+
+
+def test_idle_states_are_no_samples(tmp_path, bags, example2):
+    """They are marked in their frame; those of older recordings have the stamp zero."""
+
+    def marked(entry):
+        if entry.topic != bags.JOINTS or entry.sample >= 0:
+            return entry
+        header = bags.make("std_msgs/Header", stamp=bags.time(bags.START_NS - 5), frame_id="idle")
+        content = dataclasses.replace(entry.content, header=header)
+        return dataclasses.replace(entry, content=content)
+
+    plain = recording.read(bags.write(tmp_path / "plain", example2))
+    run = recording.read(bags.write(tmp_path / "marked", [marked(entry) for entry in example2]))
+    _same(run, plain)
+    assert run.idle_states == plain.idle_states == 3
+
+
+def test_a_recording_is_read_in_one_pass(tmp_path, bags, example2, monkeypatch):
+    """All tables, the tracking error and the figures of the report come from one reading."""
+    from sst_ros.recording import bag_reader
+
+    count = 0
+    messages = bag_reader.Bag.messages
+
+    def counted(bag):
+        nonlocal count
+        count += 1
+        return messages(bag)
+
+    monkeypatch.setattr(bag_reader.Bag, "messages", counted)
+    run = recording.read(bags.write(tmp_path / "bag", example2))
+    assert set(run.signals.tables) == {"samples", "ticks", "commands"} and run.ticks.period_ns
+    assert count == 1

@@ -2,17 +2,21 @@
 """Bags of a run as the nodes would record it, without ROS: simulated, edited, written."""
 
 import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from sst_ros import scene as scenes
 from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.scene import yaml_document
 from sst_ros.simulation import Simulation
 
@@ -234,3 +238,40 @@ def edited(entries: list[Entry], topic: str, sample: int, change) -> list[Entry]
         else entry
         for entry in entries
     ]
+
+
+def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:
+    """Write messages as the recorder does; with `flush_every`, a chunk for so many messages."""
+    writer, connections = BagWriter(path), {}
+    for number, entry in enumerate(entries):
+        topic, kind = entry.topic, KINDS[entry.topic]
+        if topic not in connections:
+            connections[topic] = writer.connect(topic, kind)
+        raw = bytes(STORE.serialize_cdr(entry.content, kind))
+        writer.write(connections[topic], entry.received_ns, raw)
+        if flush_every and number % flush_every == flush_every - 1:
+            writer._flushed = -1e9
+            writer.save()
+    writer.close()
+    return path
+
+
+@pytest.fixture(scope="session")
+def bags():
+    return sys.modules[__name__]
+
+
+@pytest.fixture(scope="session")
+def example2(bags):
+    """Messages of 0.3 s of Example 2."""
+    return simulated(scenes.load("example2"), 0.3)
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Write messages and return the path of the bag."""
+
+    def write_bag(entries, **options):
+        return write(tmp_path / "bag", entries, **options)
+
+    return write_bag

@@ -196,5 +196,5 @@ def test_every_column_is_documented():
 
 def test_without_a_library_its_name_is_told(lossy, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"pyarrow .*pip install 'sst_ros\[export\]', or use CSV"):
+    with pytest.raises(InputError, match=r"pyarrow .*pip install 'sst_ros\[record\]'"):
         export(lossy, tmp_path / "out", "parquet")

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged and cut recordings: no silent difference, no traceback, losses counted."""
+
+import random
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+
+from sst_ros import scene
+from sst_ros.errors import InputError
+from sst_ros.recording import recording
+from sst_ros.recording.export import export
+from sst_ros.recording.mcap_file import MAGIC, McapFile
+from sst_ros.recording.recovery import recover
+
+CHUNK = 40
+
+
+@pytest.fixture(scope="module")
+def entries(bags):
+    return bags.simulated(scene.load("example2"), 0.1)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, bags, entries):
+    """A recording of many chunks."""
+    return bags.record(tmp_path_factory.mktemp("whole") / "bag", entries, CHUNK)
+
+
+def content_of(bag):
+    (file,) = bag.glob("*.mcap")
+    return file.read_bytes()
+
+
+def damaged_copy(folder, whole, content):
+    folder.mkdir(parents=True)
+    (folder / "bag.mcap").write_bytes(content)
+    (folder / "metadata.yaml").write_bytes((whole / "metadata.yaml").read_bytes())
+    return folder
+
+
+def messages_of(bag):
+    with Reader(bag) as reader:
+        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
+
+
+def same(one, other):
+    names = ("time_ns", "received_ns", "gamma", "mu", "beta", "gamma_dot", "effort", "quaternion")
+    arrays = [(getattr(one, name), getattr(other, name)) for name in names]
+    arrays += [(one.ticks.torque, other.ticks.torque), (one.euler, other.euler)]
+    return one.reports == other.reports and all(
+        np.array_equal(mine, its, equal_nan=True) for mine, its in arrays
+    )
+
+
+def flips(content, count, seed):
+    """Contents with one byte changed, at random places and in random ways."""
+    generator = random.Random(seed)
+    for _ in range(count):
+        at, bits = generator.randrange(len(content)), generator.randrange(1, 256)
+        changed = bytearray(content)
+        changed[at] ^= bits
+        yield at, bytes(changed)
+
+
+def check_flips(whole, folder, count, seed):
+    expected, messages = recording.read(whole), messages_of(whole)
+    refused = 0
+    for number, (at, content) in enumerate(flips(content_of(whole), count, seed)):
+        bag = damaged_copy(folder / str(number), whole, content)
+        try:
+            assert same(recording.read(bag), expected), f"byte {at}: a silent difference"
+        except InputError as error:
+            refused += 1
+            assert "byte" in str(error) or "ends before" in str(error), str(error)
+        found = recover(bag, folder / f"{number}_recovered")
+        kept = messages_of(found.bag)
+        assert set(kept) <= set(messages), f"byte {at}: an invented message"
+        assert len(messages) - len(kept) == found.lost, f"byte {at}: losses not counted"
+        assert found.lost <= CHUNK and bool(found.damage) >= bool(found.lost)
+    return refused
+
+
+def check_cuts(whole, folder, count, seed):
+    content, messages = content_of(whole), messages_of(whole)
+    generator = random.Random(seed)
+    for number in range(count):
+        size = generator.randrange(len(MAGIC), len(content))
+        bag = damaged_copy(folder / str(number), whole, content[:size])
+        with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
+            recording.read(bag)
+        try:
+            found = recover(bag, folder / f"{number}_recovered")
+        except InputError as error:
+            assert "holds no message" in str(error)
+            continue
+        kept = messages_of(found.bag)
+        assert found.cut and kept == sorted(messages, key=lambda m: m[1])[: len(kept)]
+        assert len(kept) >= sum(1 for _ in McapFile(bag / "bag.mcap").messages())
+
+
+def test_a_changed_byte_is_never_silent(whole, tmp_path):
+    assert check_flips(whole, tmp_path, 100, seed=1) >= 99
+
+
+def test_a_cut_recording_keeps_what_lies_before_the_cut(whole, tmp_path):
+    check_cuts(whole, tmp_path, 30, seed=2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_changed_byte_is_never_silent_in_many(whole, tmp_path):
+    assert check_flips(whole, tmp_path / "flips", 500, seed=3) >= 498
+    check_cuts(whole, tmp_path / "cuts", 100, seed=4)
+
+
+def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_path):
+    content = bytearray(content_of(whole))
+    content[content.index(b"gamma_1", len(content) // 2)] ^= 1
+    bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
+    with pytest.raises(InputError, match=r"byte \d+: chunk with wrong checksum \(40 messages, 0\."):
+        recording.read(bag)
+    run = recording.read(bag, damaged=True)
+    assert 30 < len(run.time_ns) < 51
+    assert any("40 messages are lost" in line for line in run.signals.damage)
+
+
+def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, entries):
+    file = McapFile(next(whole.glob("*.mcap")))
+    assert sum(1 for _ in file.messages()) == len(entries) == len(messages_of(whole))
+    assert file.intact and file.unverified == 0
+
+
+def test_export_of_a_damaged_recording_is_refused(whole, tmp_path):
+    content = bytearray(content_of(whole))
+    content[content.index(b"gamma_1", len(content) // 3)] ^= 4
+    bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
+    with pytest.raises(InputError, match="wrong checksum"):
+        export(bag, tmp_path / "out")
+
+
+def test_recordings_without_checksums_are_read_and_counted(written, example2):
+    assert recording.read(written(example2)).signals.unverified > 0
