@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from sst_ros.mechanism.kinematics import Assembly
     from sst_ros.simulation import State
+
+
+SHOWN_PROBLEMS = 20
+"""Problems of one input that are printed; `InputError.problems` has all of them."""
 
 
 class SstError(Exception):
@@ -31,7 +35,7 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        return f"{where}{self.key or 'document'} = {_shorten(self.value)}: {self.allowed}"
+        return f"{where}{self.key or 'document'} = {shortened(self.value)}: {self.allowed}"
 
 
 class InputError(SstError):
@@ -40,7 +44,10 @@ class InputError(SstError):
     def __init__(self, origin: str, problems: Sequence[Problem]) -> None:
         self.origin = origin
         self.problems = tuple(problems)
-        super().__init__("\n".join(f"{origin}: {problem}" for problem in self.problems))
+        lines = [f"{origin}: {problem}" for problem in self.problems[:SHOWN_PROBLEMS]]
+        if more := len(self.problems) - len(lines):
+            lines.append(f"{origin}: ... and {more} more")
+        super().__init__("\n".join(map(printable, lines)))
 
 
 class MotionRefused(InputError):
@@ -64,6 +71,8 @@ class AmbiguousAssembly(AssemblyError):
 
     def __init__(self, gamma: NDArray[np.float64], candidates: Sequence[Assembly]) -> None:
         self.candidates = tuple(candidates)
+        from scipy.spatial.transform import Rotation  # slow to import
+
         quaternions = (Rotation.from_matrix(one.rotation).as_quat() for one in candidates)
         told = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
         said = f"{len(candidates)} admissible assemblies, with the orientations {told}: name one"
@@ -108,6 +117,21 @@ class Diverged(RunStopped):
     """No step, however small, resolves the motion to the tolerance with finite numbers."""
 
 
-def _shorten(value: object, limit: int = 80) -> str:
+def printable(text: str) -> str:
+    """Return one line of text with all that a terminal would act on written as an escape."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
+
+
+def shortened(value: object, limit: int = 80) -> str:
+    """Return `repr(value)`, cut to `limit` characters."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return "; did you mean NAME?" for the known name nearest to `word`, "" if none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
