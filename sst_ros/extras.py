@@ -9,15 +9,17 @@ from typing import Any
 from sst_ros.errors import SstError
 
 EXTRAS = {
+    "jinja2": "view",
     "lz4": "record",
     "matplotlib": "plot",
-    "mpmath": "test",
+    "mcap": "record",
+    "mpmath": "all",
     "numba": "fast",
     "pandas": "record",
     "pyarrow": "record",
     "rosbags": "record",
     "viser": "view",
-    "xarray": "record",
+    "xarray": "all",
     "zstandard": "record",
 }
 """Extra of this package that installs a module."""

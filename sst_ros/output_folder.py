@@ -19,9 +19,7 @@ def results_folder(bag: Path, kind: str) -> Path:
     return path.with_name(f"{name}_{kind}")
 
 
-def require_free(
-    out: Path, origin: str, *, force: bool = False, option: str = "--out"
-) -> Path:
+def require_free(out: Path, origin: str, *, force: bool = False, option: str = "--out") -> Path:
     """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
 
     Args:

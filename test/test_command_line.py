@@ -4,11 +4,13 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from sst_ros.__main__ import main
 from sst_ros.cli.main import COMMANDS, NODES, parser
+from sst_ros.trajectory import Trajectory
 
 BLOCKED = """
 import sys
@@ -54,7 +56,8 @@ def test_the_version_is_that_of_the_package(capsys):
 @pytest.mark.parametrize(
     ("words", "nearest"),
     [
-        (["simulater"], "simulator"),
+        (["simulater"], "simulate"),
+        (["recoder"], "recorder"),
         (["sceen"], "scene"),
         (["scene", "lst"], "list"),
         (["report", "runn", "bag"], "run"),
@@ -142,9 +145,9 @@ def test_an_interrupt_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "sst-ros: interrupted\n"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_one_line():
-    with open("/dev/full", "w") as full:
+    with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "sst_ros", "scene", "list"],
             stdout=full, stderr=subprocess.PIPE, text=True, timeout=60,
@@ -156,7 +159,7 @@ def test_a_reader_that_leaves_is_no_error():
     ours, theirs = os.pipe()
     os.close(ours)
     done = subprocess.run(
-        [sys.executable, "-m", "sst_ros", "scene", "keys"],
+        [sys.executable, "-m", "sst_ros", "scene", "schema"],
         stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60,
     )  # fmt: skip
     os.close(theirs)
@@ -183,6 +186,8 @@ def test_a_reader_that_leaves_is_no_error():
         (["plot", "bag"], "rosbags|matplotlib", "record|plot"),
         (["plot", "--list"], "rosbags|matplotlib", "record|plot"),
         (["workspace", "example2"], "matplotlib", "plot"),
+        (["simulate", "example2", "--plot"], "matplotlib", "plot"),
+        (["simulate", "example2", "--out", "x.parquet"], "pyarrow", "record"),
         (["view", "bag"], "viser", "view"),
         (["view", "--scene", "swing"], "viser", "view"),
         (["compile"], "numba", "fast"),
@@ -221,7 +226,7 @@ def test_what_needs_no_extra_runs_without_any(words):
 def test_scene_names_are_completed(tmp_path):
     pytest.importorskip("argcomplete", reason="needs argcomplete")
     line = "sst-ros scene show exam"
-    done = subprocess.run(
+    subprocess.run(
         [sys.executable, "-m", "sst_ros"],
         env={**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
              "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "found"), "_ARGCOMPLETE_IFS": "\n"},
@@ -244,3 +249,26 @@ def test_every_command_names_itself(capsys):
         with pytest.raises(SystemExit):
             parser().parse_args([name, "--help"])
         assert capsys.readouterr().out.startswith(f"usage: sst-ros {name} ")
+
+
+def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["simulate", "example2", "--duration", "0.05", "--out", "run.parquet", "--plot"]
+    assert main(words) == 0
+    assert "example2: reached the end\n" in capsys.readouterr().out
+    trajectory = Trajectory.load("run.parquet")
+    assert trajectory.t[-1] == 0.05
+    assert (tmp_path / "run.png").stat().st_size > 10_000
+    assert "exists already" in error_of(words, capsys)
+    assert main(["simulate", "example2", "--duration", "5"]) == 1
+    said = capsys.readouterr()
+    assert "stopped at t = 1.2853" in said.out
+    assert said.err == ""
+
+
+def test_the_workspace_of_a_scene_is_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["workspace", "example2"]) == 0
+    assert "parallel: none inside" in capsys.readouterr().out
+    assert (tmp_path / "example2_workspace.png").stat().st_size > 50_000
+    assert "exists already" in error_of(["workspace", "example2"], capsys)

@@ -10,7 +10,7 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"child_process", "errors", "output_folder", "progress"},
+    {"child_process", "errors", "extras", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},

@@ -85,7 +85,7 @@ def test_every_key_is_described_with_its_unit():
 
 def test_the_reference_of_keys_in_docs_is_up_to_date():
     said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
-    assert said == keys(), "python -m sst_ros scene keys > docs/scenes.md"
+    assert said == keys(), "run python -m tools.scene_keys"
 
 
 def test_the_reference_names_every_key():

@@ -14,6 +14,7 @@ from sst_ros.errors import printable
 
 PROGRAM = "sst-ros"
 COMMANDS = (
+    "simulate",
     "workspace",
     "scene",
     "plan",

@@ -41,8 +41,8 @@ def _run(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     out = require_free(options.out or Path("accuracy_out"), "report", force=options.force)
-    from sst_ros.studies.accuracy_report import report
     from sst_ros.scene.scene import names
+    from sst_ros.studies.accuracy_report import report
     from sst_ros.studies.high_precision import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED

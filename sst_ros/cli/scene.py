@@ -22,8 +22,6 @@ def add(commands: Commands) -> None:
     check.add_argument("files", nargs="+", type=Path, metavar="FILE")
     check.set_defaults(run=_check)
     kinds.add_parser("schema", help="JSON schema for editors").set_defaults(run=_schema)
-    keys = kinds.add_parser("keys", help="reference of all keys, as Markdown")
-    keys.set_defaults(run=_keys)
 
 
 def _list(_: argparse.Namespace) -> None:
@@ -59,9 +57,3 @@ def _schema(_: argparse.Namespace) -> None:
     from sst_ros.scene.scene import Scene
 
     print(json.dumps(json_schema(Scene, "sst_ros scene"), indent=2))
-
-
-def _keys(_: argparse.Namespace) -> None:
-    from tools.scene_keys import keys
-
-    print(keys(), end="")
