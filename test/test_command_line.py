@@ -118,7 +118,7 @@ def test_a_port_that_is_none_is_refused(port, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["view", "bag", "--port", port])
     assert ended.value.code == 2
-    assert "must be a whole number from 1 to 65535" in capsys.readouterr().err
+    assert "must be a whole number from 1024 to 65535" in capsys.readouterr().err
 
 
 def broken(options):

@@ -22,6 +22,7 @@ def _compile(options: argparse.Namespace) -> int:
     from sst_ros.errors import InputError, Problem, SstError, suggestion
     from sst_ros.extras import require
     from sst_ros.integration import code_cache, codegen
+    from sst_ros.integration.cache_folder import cache_folder, configured_folder
     from sst_ros.scene.scene import load
     from sst_ros.simulation import INTEGRATORS
 
@@ -32,9 +33,11 @@ def _compile(options: argparse.Namespace) -> int:
     if codegen.numba_version() is None:
         require("numba")
         raise SstError("numba is switched off by SST_ROS_NUMBA=0")
+    if (folder := cache_folder()) != configured_folder():
+        raise SstError("compiled code would not be kept; see the warning above")
     simulated = load(options.scene)
     for method in code_cache.make(simulated, options.integrator):
-        print(f"{method}: compiled, in {codegen.cache_folder()}", flush=True)
+        print(f"{method}: compiled, in {folder}", flush=True)
     there = code_cache.is_there(simulated, options.integrator)
     if not there:
         raise SstError("another process is compiling: try again when it has ended")

@@ -29,7 +29,10 @@ def add(commands: Commands) -> None:
     view.add_argument("--namespace", default="/", metavar="NS", help="namespace of its nodes")
     view.add_argument("--host", default="127.0.0.1", help="address to serve at (this machine only)")
     view.add_argument(
-        "--port", type=integer_from(1, 65535), default=8080, help="port; the next free one is taken"
+        "--port",
+        type=integer_from(1024, 65535),
+        default=8080,
+        help="port; the next free one is taken",
     )
     view.add_argument("--open", action="store_true", help="open it, where there is a desktop")
     view.set_defaults(run=_view)

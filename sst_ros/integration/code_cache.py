@@ -2,7 +2,7 @@
 """Machine code of a scene before it is needed: is it there, and make it.
 
 Code is made once for each scene and method, which takes from seconds to half a minute, and kept in
-`codegen.cache_folder()`; to load it takes tenths of a second.
+`cache_folder()`; to load it takes tenths of a second.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
+from sst_ros.integration.cache_folder import cache_folder
 from sst_ros.integration.compiled_method import Machine, Method, has_code
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4
 from sst_ros.integration.ode import working
@@ -32,8 +33,7 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
     Where another process makes code this does nothing: it would take the processor from it.
     """
     system = working(Dynamics.of(scene))
-    folder = codegen.cache_folder()
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder = cache_folder()
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
