@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every error that sst_ros raises on purpose; each carries what explains it."""
+"""The errors that sst_ros raises on purpose; each carries the values that explain it."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from sst_ros.mechanism.kinematics import Assembly
-    from sst_ros.simulation import State
-
+from sst_ros.state import Assembly, State
 
 SHOWN_PROBLEMS = 20
 """Problems of one input that are printed; `InputError.problems` has all of them."""
@@ -67,16 +63,23 @@ class NoAdmissibleAssembly(AssemblyError):
 
 
 class AmbiguousAssembly(AssemblyError):
-    """More than one assembly is admissible; `candidates` are all of them."""
+    """More than one assembly is admissible; `candidates` are all of them.
 
-    def __init__(self, gamma: NDArray[np.float64], candidates: Sequence[Assembly]) -> None:
+    `quaternions` (x, y, z, w) are their orientations, shape (n, 4).
+    """
+
+    def __init__(
+        self,
+        gamma: NDArray[np.float64],
+        candidates: Sequence[Assembly],
+        quaternions: NDArray[np.float64],
+    ) -> None:
         self.candidates = tuple(candidates)
-        from scipy.spatial.transform import Rotation  # slow to import
-
-        quaternions = (Rotation.from_matrix(one.rotation).as_quat() for one in candidates)
-        told = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
-        said = f"{len(candidates)} admissible assemblies, with the orientations {told}: name one"
-        super().__init__(said, gamma)
+        listed = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
+        count = len(self.candidates)
+        super().__init__(
+            f"{count} admissible assemblies, with the orientations {listed}: name one", gamma
+        )
 
 
 class SingularConfiguration(SstError):
@@ -109,12 +112,12 @@ class SingularityReached(RunStopped):
     """mu_k reached 0 or pi: the arc of the star lies along the base arc, gamma_k has no value."""
 
 
-class ImpactsAccumulate(RunStopped):
-    """Impacts at an end of the stroke follow each other without coming to rest."""
-
-
 class Diverged(RunStopped):
     """No step, however small, resolves the motion to the tolerance with finite numbers."""
+
+
+class StepBudgetExceeded(Diverged):
+    """A step takes more evaluations of the right-hand side than `step_budget` allows."""
 
 
 def printable(text: str) -> str:

@@ -10,6 +10,7 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
+    {"state"},
     {"child_process", "errors", "extras", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},

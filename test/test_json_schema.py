@@ -56,7 +56,7 @@ LINK = {"inertia": {"xx": 1.0, "yy": 1.0, "zz": 1.0}}
         ("actuated_links", [LINK, LINK], ["actuated_links"]),
         ("intermediate_links", [{"mass": -1}], ["intermediate_links", 0, "mass"]),
         ("stroke", {"at_end": "bounce"}, ["stroke", "at_end"]),
-        ("stroke", {"at_end": "impact", "restitution": 2}, ["stroke", "restitution"]),
+        ("stroke", {"at_end": "elastic", "restitution": 2}, ["stroke", "restitution"]),
         ("moment", {"topic": "yes"}, ["moment", "topic"]),
         ("springs", [{"joint": "mu_1", "stiffness": 0, "rest": 0}], ["springs", 0, "stiffness"]),
         ("friction", {"gamma_1": {}}, ["friction"]),

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
 from sst_ros.integration.cache_folder import cache_folder
-from sst_ros.integration.compiled_method import Machine, Method, has_code
+from sst_ros.integration.compiled_method import CompiledMethod, Method, has_code
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4
-from sst_ros.integration.ode import working
+from sst_ros.integration.ode import ode_with_work
 from sst_ros.scene.scene import Scene
 
 
@@ -23,7 +23,7 @@ def is_there(scene: Scene, integrator: str) -> bool:
     """Tell whether a run of the scene would find all of its code, whatever method it turns to."""
     if codegen.numba_version() is None:
         return False
-    system = working(Dynamics.of(scene))
+    system = ode_with_work(Dynamics.of(scene))
     return all(has_code(system, method) for method in _methods(integrator))
 
 
@@ -32,7 +32,7 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
 
     Where another process makes code this does nothing: it would take the processor from it.
     """
-    system = working(Dynamics.of(scene))
+    system = ode_with_work(Dynamics.of(scene))
     folder = cache_folder()
     with (folder / "lock").open("w") as lock:
         try:
@@ -43,10 +43,10 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
             if not has_code(system, method):
                 size, drive = len(system.state), (0.0,) * len(system.drive)
                 y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
-                machine = Machine(system, method, compiled=True)
+                machine = CompiledMethod(system, method, compiled=True)
                 # What comes out is of no interest: the calls have the code made.
-                machine.pair(0.0, 1e-3, y, y, drive)
-                machine.glide(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
+                machine.step_pair(0.0, 1e-3, y, y, drive)
+                machine.step_many(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
             yield method.name
 
 

@@ -32,10 +32,10 @@ from sst_ros.integration.runge_kutta_source import explicit_step
 _EXPLICIT = (
     step_loops.size_of,
     step_loops.normalise,
-    step_loops.pair,
-    step_loops.march,
+    step_loops.step_pair,
+    step_loops.step_fixed,
     step_loops.all_far,
-    step_loops.glide,
+    step_loops.step_many,
 )
 _IMPLICIT = (
     step_loops.factorise,

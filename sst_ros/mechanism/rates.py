@@ -27,7 +27,7 @@ from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 
 
 @dataclass(frozen=True)
-class Motion:
+class BodyRates:
     """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg.
 
     Attributes:
@@ -55,7 +55,7 @@ class Motion:
 
 def of_actuators(
     at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = (0.0, 0.0, 0.0)
-) -> Motion:
+) -> BodyRates:
     """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
     rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
@@ -72,7 +72,7 @@ def of_star(
     omega: ArrayLike,
     omega_dot: ArrayLike = (0.0, 0.0, 0.0),
     gamma: ArrayLike | None = None,
-) -> Motion:
+) -> BodyRates:
     """Everything from omega [rad/s] and omega_dot [rad/s^2] in {B}, each shape (3,).
 
     Args:
@@ -118,7 +118,7 @@ def _legs(
 
 def _motion(
     r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, joints: tuple[Array, ...]
-) -> Motion:
+) -> BodyRates:
     gamma_dot, mu_dot, _, gamma_ddot, mu_ddot, _ = joints
     zero = np.zeros(3)
     omega_a = np.stack([zero, zero, gamma_dot], axis=1)
@@ -135,4 +135,4 @@ def _motion(
     arrays = (omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
     for array in arrays:
         array.setflags(write=False)
-    return Motion(*arrays)
+    return BodyRates(*arrays)

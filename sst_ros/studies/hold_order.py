@@ -11,7 +11,7 @@ import numpy as np
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import ReferenceMotion, Triple
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.studies.control_loop import Loop, follow, started
 
 EXACT_TOLERANCE = 1e-13
@@ -66,7 +66,9 @@ def exact(scene: Scene, motion: ReferenceMotion) -> Exact:
         now = motion.at(time)
         return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
 
-    simulation = Simulation(started(scene, motion), "dop853", tolerance=EXACT_TOLERANCE)
+    simulation = Simulation(
+        started(scene, motion), "dop853", tolerance=EXACT_TOLERANCE, step_budget=WHOLE_MOTION_BUDGET
+    )
     worst, step = 0.0, round(motion.duration * NANOSECONDS / _SAMPLES)
     for _ in range(_SAMPLES):
         state = simulation.step(torque, step)

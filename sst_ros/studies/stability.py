@@ -17,8 +17,8 @@ import numpy as np
 
 from sst_ros import scene as scenes
 from sst_ros.errors import RunStopped
-from sst_ros.integration.adaptive_stepper import Walk
-from sst_ros.integration.compiled_method import Machine, Method
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper
+from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS
 from sst_ros.progress import slices
 from sst_ros.report import states
@@ -129,12 +129,12 @@ def _stored(simulation: Simulation, y: Vector) -> float:
 
 def largest_step(problem: InitialValueProblem, method: Method) -> float:
     """Find by bisection the longest step [s] with which rates do not run away."""
-    machine = Machine(problem.system, method, compiled=False)
+    machine = CompiledMethod(problem.system, method, compiled=False)
 
     def stable(h: float) -> bool:
         try:
             with np.errstate(all="ignore"):
-                y = machine.march(0.0, h, _STEPS, list(problem.start), problem.drive)
+                y = machine.step_fixed(0.0, h, _STEPS, list(problem.start), problem.drive)
         except (ArithmeticError, ValueError):
             return False
         return all(map(math.isfinite, y)) and math.hypot(*y[4:7]) < _RUNAWAY
@@ -161,8 +161,8 @@ def family(*, shown: bool = False) -> list[Stable]:
     for part in slices(len(VISCOSITIES), 1, "largest steps  ", shown):
         viscosity = VISCOSITIES[part.start]
         problem = InitialValueProblem(viscous(stiff, viscosity))
-        walk = Walk(problem.system, "dopri5", 1e-6, compiled=False)
-        spectrum = walk.spectrum(0.0, problem.start, problem.drive)
+        stepper = AdaptiveStepper(problem.system, "dopri5", 1e-6, compiled=False)
+        spectrum = stepper.spectrum(0.0, problem.start, problem.drive)
         decay = float(-spectrum.real.min())
         for method in METHODS.values():
             found.append(Stable(method.name, viscosity, decay, largest_step(problem, method)))
