@@ -11,9 +11,9 @@ from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.panels import lines, span, stack
 from sst_ros.plot.paper_figures import BLUE, GREY, LINES
+from sst_ros.recording.body_rates import body_rates
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import Integers
-from sst_ros.report.states import body_rates
 from sst_ros.scene.scene import Scene
 
 
