@@ -4,47 +4,45 @@ VENV ?= .venv
 RUN = $(VENV)/bin/python
 # The ROS wheels: kilted (extra `ros`) or jazzy.
 ROS ?= ros
-EXTRAS = $(ROS),record,plot,fast
+EXTRAS = $(ROS),record,report,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: help demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
+.PHONY: demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
 
-help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
-
-demo: $(VENV)/.demo  ## run the paper's examples through the nodes; results in demo_out
+demo: $(VENV)/.demo
 	$(RUN) -m sst_ros demo --force
 
-demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results in demo_out/feedforward
+demo-feedforward: $(VENV)/.demo
 	$(RUN) -m sst_ros demo feedforward --force
 
-docs: $(VENV)/.docs  ## build the documentation into site
+docs: $(VENV)/.docs
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs site
 
-view: $(VENV)/.view  ## show a simulation in the browser
+view: $(VENV)/.view
 	@$(RUN) -m sst_ros view --scene swing --open
 
-test: $(VENV)/.test lint  ## run the tests, without the slow ones
+test: $(VENV)/.test lint
 	$(PYTEST) $(PARALLEL) -m "not slow" --ignore test/ros
 	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
 
-test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment of their own
+# The nodes with the wheels of ROS 2 Jazzy, in an environment of their own.
+test-jazzy:
 	$(MAKE) test-ros VENV=.venv-jazzy ROS=jazzy
 
-test-ros: $(VENV)/.ros  ## run the tests of the nodes
+test-ros: $(VENV)/.ros
 	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
 
-test-all: $(VENV)/.test lint test-jazzy  ## run all tests, the slow ones too
+test-all: $(VENV)/.test lint test-jazzy
 	$(PYTEST) $(PARALLEL) --ignore test/ros --timeout 600
 	$(PYTEST) test/ros --timeout 600
 
-lint: $(VENV)/.test  ## check style and types
+lint: $(VENV)/.test
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-format: $(VENV)/.test  ## format the source
+format: $(VENV)/.test
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
@@ -64,16 +62,16 @@ $(VENV)/.view: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.ros: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,plot,view,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,report,view,test]"
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),docs]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),export,docs]"
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,docs,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,export,docs,test]"
 	@touch $@
 
-clean:  ## remove environments and results
+clean:
 	rm -rf $(VENV) .venv-jazzy demo_out view_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

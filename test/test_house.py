@@ -10,8 +10,7 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"state"},
-    {"child_process", "errors", "extras", "output_folder", "progress"},
+    {"child_process", "errors", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},
@@ -19,7 +18,9 @@ FLOORS = (
     {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate_motion"},
     {"control", "description"},
     {"recording"},
-    {"plot", "report", "studies", "view"},
+    {"plot", "view"},
+    {"report"},
+    {"studies"},
     {"runtime"},
     {"nodes"},
     {"demo"},

@@ -13,7 +13,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.scene.scene import SineTorque
 
 
-class ODE:
+class System:
     """Derivative of a scene's state, as programs with the inputs t, state, drive.
 
     Args:
@@ -76,6 +76,6 @@ class ODE:
 
 
 @lru_cache(maxsize=32)
-def ode_with_work(dynamics: Dynamics) -> ODE:
+def working(dynamics: Dynamics) -> System:
     """Give the system that counts work: traced once for all runs of the same dynamics."""
-    return ODE(dynamics, work=True)
+    return System(dynamics, work=True)

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Attempts to break sst_ros, counted: `python -m benchmark.campaign`."""
