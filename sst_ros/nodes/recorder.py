@@ -10,9 +10,12 @@ from __future__ import annotations
 import importlib
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -27,15 +30,68 @@ from rosbags.interfaces import (
     QosTime,
 )
 
+from sst_ros.errors import SstError
 from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.raw_readers import NeverSpun, take
+from sst_ros.nodes.topics import Endpoint
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
 
 _DEPTH = 10000
-_DRAIN_PERIOD_S = 0.02
+_TAKE_PERIOD_S = 0.02
 _LOOK_PERIOD_S = 0.2
+_LOG_PERIOD_S = 5.0
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+_DECLARED = {
+    _last(one.name): one
+    for one in (*topics.SIMULATOR, topics.REFERENCE, topics.TRACKING_ERROR, topics.JOINT_TRAJECTORY)
+    if one.use in (topics.PUBLISHES, topics.SUBSCRIBES)
+}
+_ALWAYS = {
+    _last(one.name) for one in topics.SIMULATOR if one.use == topics.PUBLISHES and not one.when
+}
+"""Topics that a simulator publishes in every run."""
+
+
+class RecordingIncomplete(SstError):
+    """Topics that belong to the recording have no message in it, or not all."""
+
+
+@dataclass
+class RecordedTopic:
+    """A topic that is recorded.
+
+    Attributes:
+        subscription: reads it; no executor does.
+        connection: where its messages go in the bag.
+        counted: whether a gap in the sequence numbers is a loss; a latched topic, of which only
+            the last message matters, and /diagnostics may have gaps.
+        messages: number of messages recorded.
+        lost: number of messages that the publisher sent and that did not arrive.
+
+    """
+
+    subscription: Subscription[Any]
+    connection: Connection
+    counted: bool
+    messages: int = 0
+    lost: int = 0
+    _last: dict[bytes, int] = field(default_factory=dict)
+
+    def count(self, info: dict[str, Any]) -> None:
+        """Count a message; sequence numbers are those of its publisher, None on some middleware."""
+        self.messages += 1
+        number, publisher = info.get("publication_sequence_number"), info.get("publisher_gid")
+        if self.counted and number and publisher:
+            last = self._last.get(publisher["data"], number - 1)
+            self.lost += max(0, number - last - 1)
+            self._last[publisher["data"]] = number
 
 
 class Recorder:
@@ -45,95 +101,144 @@ class Recorder:
         self.node = Node("sst_recorder")
         self.done = threading.Event()
         given = parameters.declare(self.node, RecorderParameters)
-        self._wanted = {self.node.resolve_topic_name(topic) for topic in given.topics}
-        self._readers: dict[str, tuple[Subscription, Connection]] = {}
-        self._heard: dict[str, int] = {}
+        self._wanted = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
+        self._foreign = {topic for topic in self._wanted if _last(topic) not in _DECLARED}
+        self._required = {topic for topic in self._wanted if _last(topic) in _ALWAYS}
+        self._recorded: dict[str, RecordedTopic] = {}
+        self._unknown: set[str] = set()
         self._ready = False
-        self._aside = NeverSpun()
+        self._failure: SstError | None = None
+        self._timeout_s, self._began_s = given.timeout, time.monotonic()
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
         self._bag = BagWriter(Path(dated if given.output == "-" else given.output))
         self.node.get_logger().info(f"recording to {self._bag.path}")
         self.node.create_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
-        self.node.create_timer(_DRAIN_PERIOD_S, self._drain, clock=STEADY)
+        self.node.create_timer(_TAKE_PERIOD_S, self._take, clock=STEADY)
 
     def close(self) -> None:
-        """Take what has arrived and close the bag."""
-        self._drain()
+        """Take what has arrived and close the bag.
+
+        Raises:
+            RecordingIncomplete: names the topics without messages, and those that lost some.
+            SstError: the bag could not be written.
+
+        """
+        self._take()
+        if self._failure is not None:
+            raise self._failure
         self._bag.close()
-        said = f"{self._bag.messages} messages of {len(self._heard)} topics recorded"
-        self.node.get_logger().info(said)
+        heard = [topic for topic in self._recorded.values() if topic.messages]
+        text = f"{self._bag.messages} messages of {len(heard)} topics recorded"
+        self.node.get_logger().info(text)
+        lost = [f"{one.lost} of {name}" for name, one in self._recorded.items() if one.lost]
+        faults = [f"no message of {_listed(self._missing())}"] if self._missing() else []
+        faults += [f"lost messages: {_listed(lost)}"] if lost else []
+        if faults:
+            raise RecordingIncomplete(
+                f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})"
+            )
+
+    def _missing(self) -> set[str]:
+        """Topics that belong to the recording and have no message yet."""
+        heard = {topic for topic, recorded in self._recorded.items() if recorded.messages}
+        return (self._required | self._foreign) - heard
 
     def _look(self) -> None:
-        """Subscribe to wanted topics as they appear; say once when all that speak were heard.
+        """Subscribe to wanted topics as they appear; print once that all of them are recorded.
 
-        DDS finds the topics of a node one after the other: none may have come since the last look.
-        Commands have to wait until a simulator is heard on all of its own, see `_heard_first`.
+        Discovery finds the topics of a node one after the other: none may be new in the last look.
+        Commands come last: a player may wait for their subscribers, and then expects that the run
+        is recorded. So they are subscribed to when the simulator's own topics have been heard.
         """
-        settled = True
-        for topic, kinds in self.node.get_topic_names_and_types():
-            if topic in self._wanted and topic not in self._readers:
-                settled = False
-                if self._heard_first(topic) <= self._heard.keys():
-                    self._subscribe(topic, kinds[0])
-        speaking = {topic for topic in self._readers if self.node.count_publishers(topic)}
-        if not self._ready and settled and speaking and speaking <= self._heard.keys():
-            self._ready = True
-            print(f"ready: {len(self._readers)} topics", flush=True)
+        silent, new = self._missing() & self._required, False
+        for topic, types in self.node.get_topic_names_and_types():
+            if topic in self._wanted and topic not in self._recorded.keys() | self._unknown:
+                new = True
+                own = _declared(topic, types)
+                if not (silent and own and own.use == topics.SUBSCRIBES):
+                    self._subscribe(topic, own.type_name if own else types[0], own)
+        if not self._ready:
+            waiting = silent | (self._foreign - self._recorded.keys())
+            if self._recorded and not (new or waiting):
+                self._ready = True
+                print(f"ready: {len(self._recorded)} topics", flush=True)
+            else:
+                self._wait_for(waiting or self._wanted)
 
-    def _heard_first(self, topic: str) -> set[str]:
-        """Wanted topics that a simulator always publishes, if the topic is one of its commands.
+    def _wait_for(self, names: set[str]) -> None:
+        text, log = f"waiting for {_listed(names)}", self.node.get_logger()
+        if self._timeout_s and time.monotonic() - self._began_s > self._timeout_s:
+            log.error(f"{text}: given up after {self._timeout_s:g} s")
+            self.done.set()
+        else:
+            log.info(text, throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
-        Who commands may wait for readers of the commands, and then expects the run to be recorded.
-        """
-        node = topic.rpartition("/")[0]
-        if topic not in _names(node, topics.SUBSCRIBES):
-            return set()
-        return _names(node, topics.PUBLISHES) & self._wanted
-
-    def _subscribe(self, topic: str, kind: str) -> None:
-        if not self._bag.knows(kind):  # also keeps names that others chose away from the import
-            self.node.get_logger().error(f"{topic} is not recorded: its type {kind} is unknown")
-            self._wanted.discard(topic)
+    def _subscribe(self, topic: str, type_name: str, own: Endpoint | None) -> None:
+        if not self._bag.knows(type_name):  # a name that others chose must not get to the import
+            self.node.get_logger().error(
+                f"{topic} is not recorded: its type {type_name} is unknown"
+            )
+            self._unknown.add(topic)
             return
-        package, _, name = kind.split("/")
-        message_type = getattr(importlib.import_module(f"{package}.msg"), name)
         offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
-        latched = bool(offers) and all(
-            offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers
+        if own is None and not offers:
+            return
+        qos = _declared_qos(own) if own else _offered_qos(offers)
+        package, _, name = type_name.split("/")
+        subscription = self.node.create_subscription(
+            getattr(importlib.import_module(f"{package}.msg"), name),
+            topic,
+            lambda _: None,
+            qos,
+            callback_group=NeverSpun(),
+            raw=True,
         )
-        reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
-        asked = QoSProfile(
-            depth=_DEPTH,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        )
-        connection = self._bag.connect(topic, kind, [_offered(asked)])
-        reader = self.node.create_subscription(
-            message_type, topic, lambda _: None, asked, callback_group=self._aside, raw=True
-        )
-        self._readers[topic] = (reader, connection)
+        counted = own is not None and not (own.latched or own.name.startswith("/"))
+        connection = self._bag.connect(topic, type_name, [_bag_qos(qos)])
+        self._recorded[topic] = RecordedTopic(subscription, connection, counted)
 
-    def _drain(self) -> None:
-        for topic, (reader, connection) in self._readers.items():
-            for data, received_ns in _taken(reader):
-                self._bag.write(connection, received_ns, data)
-                self._heard[topic] = self._heard.get(topic, 0) + 1
-        self._bag.save()
+    def _take(self) -> None:
+        try:
+            for topic in self._recorded.values():
+                while (taken := take(topic.subscription, raw=True)) is not None:
+                    data, info = taken
+                    self._bag.write(topic.connection, info["received_timestamp"], data)
+                    topic.count(info)
+            self._bag.save()
+        except SstError as error:
+            self._failure = error
+            self.done.set()
 
 
-def _names(node: str, use: str) -> set[str]:
-    """Topics of a simulator's node that are always there."""
-    return {one.at(node) for one in topics.SIMULATOR if one.use == use and not one.when}
+def _declared(topic: str, types: Iterable[str]) -> Endpoint | None:
+    """Return our own topic of this name and one of these types."""
+    own = _DECLARED.get(_last(topic))
+    return own if own is not None and own.type_name in types else None
 
 
-def _taken(reader: Subscription) -> Iterator[tuple[bytes, int]]:
-    while (result := take(reader, raw=True)) is not None:
-        data, info = result
-        yield data, info["received_timestamp"]
+def _declared_qos(own: Endpoint) -> QoSProfile:
+    """QoS of a topic of ours, whoever has been discovered first: a subscriber or the publisher."""
+    return _qos(latched=own.latched, reliable=True)
 
 
-def _offered(asked: QoSProfile) -> Qos:
-    """QoS that a player of the bag offers: what the reader asked for."""
+def _offered_qos(offers: list[QoSProfile]) -> QoSProfile:
+    """QoS that all publishers can serve."""
+    return _qos(
+        latched=all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers),
+        reliable=all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers),
+    )
+
+
+def _qos(*, latched: bool, reliable: bool) -> QoSProfile:
+    return QoSProfile(
+        depth=_DEPTH,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+    )
+
+
+def _bag_qos(asked: QoSProfile) -> Qos:
+    """QoS that a player of the bag offers: that of the subscription."""
     never = QosTime(2147483647, 4294967295)
     return Qos(
         QosHistory.KEEP_LAST,
@@ -146,6 +251,10 @@ def _offered(asked: QoSProfile) -> Qos:
         never,
         False,
     )
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
 
 
 def main(args: list[str] | None = None) -> int:

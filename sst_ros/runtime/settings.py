@@ -154,6 +154,14 @@ class RecorderParameters(Section):
         "folder of the bag, which must not exist yet; - for a dated name", default="-"
     )
     topics: tuple[str, ...] = texts("topics to record", default=default_topics())
+    timeout: float = number(
+        "longest wait until they are recorded, after which the node ends with an error; 0 for no "
+        "end",
+        "s",
+        default=60.0,
+        least=0.0,
+        most=1e6,
+    )
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+import re
 import signal
 from functools import partial
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
@@ -50,7 +52,12 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
         f"{node}/phase": String,
         "/diagnostics": DiagnosticArray,
     }
-    make = observer.node.create_publisher
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def make(kind, topic, depth):
+        is_latched = topic in (f"{node}/scene", f"{node}/phase")
+        return observer.node.create_publisher(kind, topic, latched if is_latched else depth)
+
     speak = [(make(kind, topic, 10), kind()) for topic, kind in kinds.items() if "ori" not in topic]
     observer.node.create_subscription(Float64MultiArray, f"{node}/commands", print, 10)
     recorder = nodes.run("recorder", output=tmp_path / "bag")
@@ -69,6 +76,68 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
     speak.append((make(QuaternionStamped, f"{node}/orientation", 10), QuaternionStamped()))
     observer.until(lambda: say_all(0) and commanded() == 2, "reader of the commands")
     assert nodes.line(recorder) == "ready: 8 topics\n"
+
+
+def test_a_latched_topic_is_heard_though_its_subscriber_is_seen_first(
+    nodes, observer, domain, tmp_path
+):
+    """As where a player starts before the simulator."""
+    phase = "/sst_simulator/phase"
+    observer.listen(String, phase, latched=True)
+    recorder = nodes.run("recorder", output=tmp_path / "bag", topics=f"[{phase}]")
+    observer.until(lambda: observer.node.count_subscribers(phase) == 2, "the recorder")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    simulator = type(observer)(domain)  # that nobody has discovered yet
+    try:
+        simulator.node.create_publisher(String, phase, latched).publish(String(data="waiting"))
+        assert nodes.line(recorder) == "ready: 1 topics\n"
+        assert nodes.stop(recorder)[0] == 0
+    finally:
+        simulator.close()
+
+
+@pytest.mark.parametrize("ending", ["timeout", "signal"])
+def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, observer, tmp_path, ending):
+    timeout = 0.5 if ending == "timeout" else 0.0
+    recorder = nodes.run("recorder", output=tmp_path / "bag", timeout=timeout)
+    if ending == "timeout":
+        _, err = recorder.communicate(timeout=20)
+        assert "given up after 0.5 s" in err
+    else:
+        assert "recording to" in recorder.stderr.readline()
+        _, _, err = nodes.stop(recorder)
+    assert recorder.returncode == 1
+    assert "is incomplete: no message of /diagnostics, /joint_states, /sst_simulator/app" in err
+    assert "/sst_simulator/commands" not in err  # no run needs it
+    assert "Traceback" not in err
+
+
+def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, tmp_path):
+    wanted = "[/joint_states, /sst_simulator/orientation]"
+    recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
+    states = observer.publisher(JointState, "/joint_states")
+    states.publish(JointState())
+    assert states.wait_for_all_acked()
+    status, _, err = nodes.stop(recorder)
+    assert status == 1
+    assert "no message of /sst_simulator/orientation (1 messages of 1 topics recorded)" in err
+
+
+def test_lost_messages_are_counted(nodes, observer, tmp_path):
+    recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
+    states = observer.node.create_publisher(JointState, "/joint_states", 1)
+    observer.until(states.get_subscription_count, "the recorder")
+    states.publish(JointState())
+    assert nodes.line(recorder) == "ready: 1 topics\n"
+    recorder.send_signal(signal.SIGSTOP)
+    for _ in range(100):  # more than the transport holds for a reader that is away
+        states.publish(JointState(effort=[0.0] * 10_000))
+    recorder.send_signal(signal.SIGCONT)
+    states.publish(JointState())
+    assert states.wait_for_all_acked()
+    status, _, err = nodes.stop(recorder)
+    assert status == 1
+    assert re.search(r"lost messages: \d+ of /joint_states", err), err
 
 
 def test_an_existing_folder_is_refused(nodes, tmp_path):
