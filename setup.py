@@ -14,7 +14,6 @@ ROS_MESSAGES = (
     "trajectory",
     "diagnostic",
     "rosgraph",
-    "visualization",
 )
 
 
