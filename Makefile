@@ -4,45 +4,47 @@ VENV ?= .venv
 RUN = $(VENV)/bin/python
 # The ROS wheels: kilted (extra `ros`) or jazzy.
 ROS ?= ros
-EXTRAS = $(ROS),record,report,fast
+EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
+.PHONY: help demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
 
-demo: $(VENV)/.demo
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.demo  ## run the paper's examples through the nodes; results in demo_out
 	$(RUN) -m sst_ros demo --force
 
-demo-feedforward: $(VENV)/.demo
+demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results in demo_out/feedforward
 	$(RUN) -m sst_ros demo feedforward --force
 
-docs: $(VENV)/.docs
+docs: $(VENV)/.docs  ## build the documentation into site
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs site
 
-view: $(VENV)/.view
+view: $(VENV)/.view  ## show a simulation in the browser
 	@$(RUN) -m sst_ros view --scene swing --open
 
-test: $(VENV)/.test lint
+test: $(VENV)/.test lint  ## run the tests, without the slow ones
 	$(PYTEST) $(PARALLEL) -m "not slow" --ignore test/ros
 	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
 
-# The nodes with the wheels of ROS 2 Jazzy, in an environment of their own.
-test-jazzy:
+test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment of their own
 	$(MAKE) test-ros VENV=.venv-jazzy ROS=jazzy
 
-test-ros: $(VENV)/.ros
+test-ros: $(VENV)/.ros  ## run the tests of the nodes
 	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
 
-test-all: $(VENV)/.test lint test-jazzy
+test-all: $(VENV)/.test lint test-jazzy  ## run all tests, the slow ones too
 	$(PYTEST) $(PARALLEL) --ignore test/ros --timeout 600
 	$(PYTEST) test/ros --timeout 600
 
-lint: $(VENV)/.test
+lint: $(VENV)/.test  ## check style and types
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-format: $(VENV)/.test
+format: $(VENV)/.test  ## format the source
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
@@ -62,16 +64,16 @@ $(VENV)/.view: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.ros: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,report,view,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,plot,view,test]"
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),export,docs]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),docs]"
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,export,docs,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,docs,test]"
 	@touch $@
 
-clean:
+clean:  ## remove environments and results
 	rm -rf $(VENV) .venv-jazzy demo_out view_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

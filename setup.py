@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packaging for colcon (ament_python) and for pip."""
 
+import re
+from itertools import chain
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "sst_ros"
-NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
+INIT = Path(__file__).parent / NAME / "__init__.py"
+(VERSION,) = re.findall(r'^__version__ = "(.+)"$', INIT.read_text(encoding="utf-8"), re.M)
 ROS_MESSAGES = (
     "std",
     "sensor",
@@ -27,6 +30,39 @@ def wheels(distribution: str) -> list[str]:
     ]
 
 
+EXTRAS = {
+    "ros": wheels("kilted"),
+    "record": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
+    "plot": ["matplotlib>=3.5", "pandas>=2"],
+    "fast": ["numba>=0.57"],
+    "view": ["jinja2>=3", "viser>=1.1,<2"],
+}
+EXTRAS["all"] = ["argcomplete", "mpmath", "xarray", *chain.from_iterable(EXTRAS.values())]
+EXTRAS |= {
+    "jazzy": wheels("jazzy"),
+    # For developers.
+    "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
+    "engines": ["mujoco>=4", "pin>=4"],
+    "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
+    "test": [
+        "argcomplete",
+        "build",
+        "colcon-common-extensions",
+        "hypothesis",
+        "jsonschema",
+        "mpmath",
+        "mypy",
+        "pytest",
+        "pytest-timeout",
+        "pytest-xdist",
+        "ruff",
+        "selenium",
+        "types-PyYAML",
+        "xarray",
+    ],
+}
+
+
 def files(pattern: str) -> list[str]:
     """List the data files that match, relative to here as setuptools wants them."""
     return sorted(str(path) for path in Path().glob(pattern))
@@ -34,7 +70,7 @@ def files(pattern: str) -> list[str]:
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=VERSION,
     description="ROS 2 simulator of the 3-RRP spherical star-triangle manipulator",
     license="Apache-2.0",
     maintainer="sst_ros founders",
@@ -49,35 +85,11 @@ setup(
         (f"share/{NAME}/config/scenes", files("config/scenes/*.yaml")),
         (f"share/{NAME}/config/sros2", files("config/sros2/*.xml")),
         (f"share/{NAME}/launch", files("launch/*.launch.py")),
+        # `ros2 run` looks here; pip would put the node executables into bin/.
+        (f"lib/{NAME}", files("executables/*")),
     ],
     install_requires=["numpy>=1.21", "scipy>=1.8", "PyYAML>=5.4"],
-    extras_require={
-        "ros": wheels("kilted"),
-        "jazzy": wheels("jazzy"),
-        "record": ["mcap>=1.6", "rosbags>=0.11"],
-        "report": ["mcap>=1.6", "rosbags>=0.11", "matplotlib>=3.5", "pandas>=2"],
-        "export": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
-        "docs": ["furo", "latex2mathml", "myst-parser>=3", "sphinx>=7.2"],
-        "fast": ["numba>=0.57"],
-        "view": ["jinja2>=3", "viser>=1.1,<2"],
-        "engines": ["mujoco>=4", "pin>=4"],
-        "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
-        "test": [
-            "colcon-common-extensions",
-            "hypothesis",
-            "jsonschema",
-            "mpmath",
-            "mypy",
-            "pytest",
-            "pytest-timeout",
-            "pytest-xdist",
-            "ruff",
-            "selenium",
-            "types-PyYAML",
-        ],
-    },
-    entry_points={
-        "console_scripts": [f"{node} = {NAME}.nodes.{node}:main" for node in NODES],
-    },
+    extras_require=EXTRAS,
+    entry_points={"console_scripts": [f"sst-ros = {NAME}.__main__:main"]},
     zip_safe=True,
 )

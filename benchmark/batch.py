@@ -27,7 +27,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import LANES
 from sst_ros.integration.methods import DOP853, RK4, Tableau
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
 
 METHODS = {"rk4": RK4, "dop853": DOP853}
@@ -113,7 +113,7 @@ class _Work:
             self._add_c(name, method, batch, start, folder)
         columns = tuple(y.copy())
         dynamics = Dynamics.of(self._scene)
-        system = System(dynamics, self._scene.torque)
+        system = ODE(dynamics, self._scene.torque)
         slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
         for who, slope in slopes.items():
             self.calls[name, who] = lambda slope=slope: _step(method, slope, 0.0, columns)
@@ -184,7 +184,7 @@ def _columns(dynamics: Dynamics, scene: Scene) -> Callable[..., State]:
     return slope
 
 
-def _traced(system: System) -> Callable[..., State]:
+def _traced(system: ODE) -> Callable[..., State]:
     names: dict[str, Any] = {}
     head = "from numpy import arctan2 as atan2, cos, exp, sin, sqrt, tanh\n"
     exec(head + system.program.source("rhs"), names)

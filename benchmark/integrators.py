@@ -22,9 +22,9 @@ import numpy as np
 from benchmark import machine as described
 from benchmark.timing import interleaved
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
@@ -64,7 +64,7 @@ def counts_for(machine, arguments, truth, wanted, most):
     count = 4
     while count <= most:
         try:
-            end = machine.march(0.0, span / count, count, y, drive)
+            end = machine.step_fixed(0.0, span / count, count, y, drive)
         except (ArithmeticError, ValueError):
             end = [math.nan] * 4
         if away(end, truth) <= wanted:
@@ -75,18 +75,18 @@ def counts_for(machine, arguments, truth, wanted, most):
 
 def compare(name, scene, span, wanted, compiled):
     dynamics = Dynamics.of(scene)
-    system = System(dynamics, scene.torque)
+    system = ODE(dynamics, scene.torque)
     state = Simulation(replace(scene, torque=None)).state
     y = [*state.quaternion, *state.body_rate]
     drive = (0.0, 0.0, 0.0)[: len(system.drive)]
     arguments = (y, drive, span)
-    best = Machine(system, RODAS4, compiled=True)
-    truth = best.march(0.0, span / 2**15, 2**15, y, drive)
-    machines = {m.name: Machine(system, m, compiled=compiled) for m in METHODS.values()}
+    best = CompiledMethod(system, RODAS4, compiled=True)
+    truth = best.step_fixed(0.0, span / 2**15, 2**15, y, drive)
+    machines = {m.name: CompiledMethod(system, m, compiled=compiled) for m in METHODS.values()}
     most = MOST_STEPS if compiled else 2**13
     counts = {k: counts_for(m, arguments, truth, wanted, most) for k, m in machines.items()}
     runs = {
-        k: lambda m=machines[k], n=n: m.march(0.0, span / n, n, y, drive)
+        k: lambda m=machines[k], n=n: m.step_fixed(0.0, span / n, n, y, drive)
         for k, n in counts.items()
         if n is not None
     }

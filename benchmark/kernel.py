@@ -24,9 +24,9 @@ from benchmark.timing import interleaved, ratio
 from sst_ros import scene as scenes
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.simulation import Simulation
 
 METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     scene = scenes.load(options.scene)
-    system = System(Dynamics.of(scene), scene.torque)
+    system = ODE(Dynamics.of(scene), scene.torque)
     start = Simulation(scene).state
     y = [*start.quaternion, *start.body_rate]
     if len(system.state) != 7 or system.drive:
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _calls(
-    system: System, y: list[float], folder: Path | None
+    system: ODE, y: list[float], folder: Path | None
 ) -> dict[tuple[str, str], Callable[[], Any]]:
     """What is timed, by (work, who): STEPS evaluations or steps each."""
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
@@ -85,19 +85,21 @@ def _calls(
     plain_slopes = _plain_slopes(system.program)
     calls["evaluation", PLAIN] = lambda: plain_slopes(STEPS, list(y))
     for name, method in METHODS.items():
-        fast = Machine(system, method, compiled=True)
-        plain = Machine(system, method, compiled=False)
+        fast = CompiledMethod(system, method, compiled=True)
+        plain = CompiledMethod(system, method, compiled=False)
         work = f"{name} step"
-        calls[work, NUMBA] = lambda fast=fast: fast.march(0.0, STEP, STEPS, y, [])
-        calls[work, PLAIN] = lambda plain=plain: plain.march(0.0, STEP, STEPS // 10, y, [])
+        calls[work, NUMBA] = lambda fast=fast: fast.step_fixed(0.0, STEP, STEPS, y, [])
+        calls[work, PLAIN] = lambda plain=plain: plain.step_fixed(0.0, STEP, STEPS // 10, y, [])
         if folder is not None:
             _add_c(calls, c_floor.source(system.program, method), y, folder, name, fast)
     return calls
 
 
-def _add_c(calls: Any, text: str, y: list[float], folder: Path, name: str, fast: Machine) -> None:
+def _add_c(
+    calls: Any, text: str, y: list[float], folder: Path, name: str, fast: CompiledMethod
+) -> None:
     array = ctypes.c_double * len(y)
-    expected = fast.march(0.0, STEP, STEPS, y, [])
+    expected = fast.step_fixed(0.0, STEP, STEPS, y, [])
     for index, (who, flags) in enumerate(FLAGS.items()):
         library = c_floor.built(text, folder, f"{name}_{index}", *flags)
         state, error = array(*y), array()

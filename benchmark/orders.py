@@ -21,10 +21,10 @@ from sst_ros import scene as scenes
 from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, RODAS4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.simulation import Simulation
 
 SPAN = 0.4
@@ -56,7 +56,7 @@ def _orders() -> None:
         lambda t, y: kernel.derivative(model, tuple(y), torque(t)),
         (0.0, SPAN), start, method="DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.002,
     ).y[:, -1]  # fmt: skip
-    system = System(Dynamics.of(scene), scene.torque)
+    system = ODE(Dynamics.of(scene), scene.torque)
     print(f"Orders on example2, {SPAN} s: error with n steps and with 2 n")
 
     def told(name: str, order: int, n: int, errors: list[float]) -> None:
@@ -66,8 +66,8 @@ def _orders() -> None:
               f", target +-{WITHIN}: {met}")  # fmt: skip
 
     for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4):
-        runner, n = Machine(system, method, compiled=False), STEPS[method.name]
-        ends = [runner.march(0.0, SPAN / k, k, start, []) for k in (n, 2 * n)]
+        runner, n = CompiledMethod(system, method, compiled=False), STEPS[method.name]
+        ends = [runner.step_fixed(0.0, SPAN / k, k, start, []) for k in (n, 2 * n)]
         told(method.name, method.order, n, [math.dist(end, truth) for end in ends])
     for nodes, n in ((2, 64), (4, 12)):
         gauss = Collocation(system, nodes, compiled=False)
@@ -115,9 +115,9 @@ def _between() -> None:
     whole = solve_ivp(slope, (0.0, 0.05), start, method="DOP853", rtol=1.0, atol=1.0,
                       first_step=0.05, dense_output=True)  # fmt: skip
     inside = solve_ivp(slope, (0.0, 0.02), start, method="DOP853", rtol=2.3e-14, atol=1e-15)
-    system = System(Dynamics.of(scene))
-    runner = Machine(system, DOP853, compiled=False)
-    again = runner.march(0.0, 0.02, 1, start, list(PUSH))
+    system = ODE(Dynamics.of(scene))
+    runner = CompiledMethod(system, DOP853, compiled=False)
+    again = runner.step_fixed(0.0, 0.02, 1, start, list(PUSH))
     truth = inside.y[:, -1]
     off = math.dist(whole.sol(0.02), truth), math.dist(again, truth)
     print("In a step of 50 ms, 20 ms after its begin: "

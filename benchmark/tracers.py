@@ -18,7 +18,7 @@ from benchmark import machine
 from benchmark.timing import interleaved
 from sst_ros import scene as scenes
 from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.simulation import Simulation
 
 SCENES = ("example2", "general", "gravity_payload", "friction")
@@ -51,7 +51,7 @@ def _row(casadi: Any, name: str, rounds: int) -> str:
     import numba
 
     scene = scenes.load(name)
-    system = System(Dynamics.of(scene), scene.torque)
+    system = ODE(Dynamics.of(scene), scene.torque)
     start = Simulation(scene).state
     drive = len(system.drive)
     given = [0.0, *start.quaternion, *start.body_rate, *(0.0,) * drive]

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from sst_ros.mechanism.kinematics import inverse as inverse_kinematics
     from sst_ros.mechanism.workspace import workspace
     from sst_ros.plot.workspace import plot_workspace
+    from sst_ros.recording.recording import Recording
+    from sst_ros.recording.recording import read as read_bag
     from sst_ros.scene.arcs import arc_inertia
     from sst_ros.scene.loads import SineTorque
     from sst_ros.scene.scene import Scene
@@ -49,6 +51,7 @@ __all__ = [
     "InputError",
     "InverseDynamics",
     "PolynomialTorque",
+    "Recording",
     "ReferenceMotion",
     "RunStopped",
     "Scene",
@@ -65,6 +68,7 @@ __all__ = [
     "inverse_kinematics",
     "load_scene",
     "plot_workspace",
+    "read_bag",
     "reference_motion",
     "simulate",
     "workspace",
@@ -80,6 +84,7 @@ _MODULES = {
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
     "PolynomialTorque": "torque",
+    "Recording": "recording.recording",
     "ReferenceMotion": "control.reference",
     "RunStopped": "errors",
     "Scene": "scene.scene",
@@ -95,6 +100,7 @@ _MODULES = {
     "inverse_kinematics": "mechanism.kinematics:inverse",
     "load_scene": "scene.scene:load",
     "plot_workspace": "plot.workspace",
+    "read_bag": "recording.recording:read",
     "reference_motion": "control.reference_motions",
     "simulate": "simulate_motion",
     "workspace": "mechanism.workspace",

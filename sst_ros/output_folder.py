@@ -19,13 +19,14 @@ def results_folder(bag: Path, kind: str) -> Path:
     return path.with_name(f"{name}_{kind}")
 
 
-def require_free(out: Path, origin: str, *, force: bool = False) -> Path:
+def require_free(out: Path, origin: str, *, force: bool = False, option: str = "--out") -> Path:
     """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
 
     Args:
         out: path of a file, or of a folder.
         origin: command that writes, for the message.
         force: allow files of the same names to be replaced.
+        option: option that gave `out`, for the message.
 
     Raises:
         InputError: `out` is a file, or a folder that is not empty, and `force` is not set; or it
@@ -36,10 +37,10 @@ def require_free(out: Path, origin: str, *, force: bool = False) -> Path:
         taken = any(out.iterdir()) if out.is_dir() else out.exists()
     except OSError as error:
         allowed = f"must be a path that can be written ({error})"
-        raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
+        raise InputError(origin, [Problem(option, str(out), allowed)]) from None
     if taken and not force:
-        allowed = "exists already: choose another --out, or overwrite it with --force"
-        raise InputError(origin, [Problem("--out", str(out), allowed)])
+        allowed = f"exists already: choose another {option}, or overwrite it with --force"
+        raise InputError(origin, [Problem(option, str(out), allowed)])
     return out
 
 

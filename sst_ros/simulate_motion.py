@@ -16,7 +16,7 @@ from sst_ros.progress import slices
 from sst_ros.scene.given import scene_of, with_initial
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import INTEGRATORS, NANOSECONDS, Simulation, State
+from sst_ros.simulation import INTEGRATORS, NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
 from sst_ros.torque import (
     FeedbackFunction,
     FunctionTorque,
@@ -108,7 +108,9 @@ class _Stepper:
         period: int | None,
     ) -> None:
         self._scene, self._law, self._span, self._period = scene, law, span, period
-        self._simulation = Simulation(scene, method, tolerance=tolerance)
+        self._simulation = Simulation(
+            scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
+        )
         self._samples: list[State] = []
         self._held: list[tuple[int, Triple]] = []
 

@@ -1,14 +1,90 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The command `sst-ros`: help, names, one line for each error, and its exit status."""
+
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from sst_ros.__main__ import main
+from sst_ros.cli.main import COMMANDS, NODES, parser
+from sst_ros.trajectory import Trajectory
 
-def run(*words):
+BLOCKED = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocker())
+from sst_ros.__main__ import main
+sys.exit(main({words!r}))
+"""
+OPTIONAL = (
+    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba", "mpmath",
+)  # fmt: skip
+
+
+def run(*words, **options):
     return subprocess.run(
-        [sys.executable, "-m", "sst_ros", *words], capture_output=True, text=True, timeout=60
-    )
+        [sys.executable, "-m", "sst_ros", *words],
+        capture_output=True, text=True, timeout=60, **options,
+    )  # fmt: skip
+
+
+def test_alone_it_prints_help_with_every_command_and_node(capsys):
+    assert main([]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("usage: sst-ros ")
+    for name in (*COMMANDS, *NODES):
+        assert f"\n    {name}" in said
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    import sst_ros
+
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"sst-ros {sst_ros.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "nearest"),
+    [
+        (["simulater"], "simulate"),
+        (["recoder"], "recorder"),
+        (["sceen"], "scene"),
+        (["scene", "lst"], "list"),
+        (["report", "runn", "bag"], "run"),
+        (["export", "bag", "--fromat", "csv"], "--format"),
+        (["plot", "bag", "--froce"], "--force"),
+        (["export", "bag", "--format", "parket"], "parquet"),
+    ],
+)
+def test_a_wrong_name_gets_the_nearest(words, nearest, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert f"did you mean {nearest!r}?" in capsys.readouterr().err
+
+
+def test_a_wrong_scene_gets_the_nearest(capsys):
+    assert main(["scene", "show", "exmple2"]) == 1
+    assert "did you mean 'example2'?" in capsys.readouterr().err
+
+
+def error_of(words, capsys):
+    """Run a command that fails; return its one line."""
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("sst-ros: ")
+    assert said.count("\n") == 1
+    return said
 
 
 @pytest.mark.parametrize(
@@ -16,19 +92,183 @@ def run(*words):
     [
         (["recover", "nowhere"], "nowhere"),
         (["report", "run", "nowhere"], "nowhere"),
+        (["export", "nowhere"], "does not exist"),
         (["scene", "show", "nowhere"], "must be a readable .yaml file or one of"),
         (["report", "accuracy", "--scene", "nowhere"], "must be a readable .yaml file or one of"),
+        (["plan", "check", "spiral", "--csv", "{here}"], "--csv"),
+        (["plan", "check", "spiral", "--force", "--csv", "{here}"], "Is a directory"),
+        (["plan", "check", "spiral", "--csv", "/proc/torques.csv"], "/proc/torques.csv"),
+        (["demo", "--out", "/etc/passwd"], "exists already"),
+        (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
+        (["demo", "--scene", "swing"], "demo feedforward"),
+        (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'"),
+        (["compile", "--integrator", "nope"], "must be one of auto, rk4"),
+        (["scene", "show", "{here}/latin.yaml"], "latin.yaml"),
     ],
 )
-def test_what_is_not_there_is_named_without_a_traceback(words, said):
-    done = run(*words)
-    assert done.returncode == 1
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
+def test_an_error_is_one_line(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "latin.yaml").write_bytes("name: é".encode("latin-1"))
+    assert said in error_of([word.format(here=tmp_path) for word in words], capsys)
 
 
-def test_an_unknown_command_is_refused_with_the_known_ones():
-    done = run("simulat")
-    assert done.returncode == 2
-    assert "demo" in done.stderr
-    assert "recover" in done.stderr
+@pytest.mark.parametrize("port", ["-1", "0", "65536", "http"])
+def test_a_port_that_is_none_is_refused(port, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["view", "bag", "--port", port])
+    assert ended.value.code == 2
+    assert "must be a whole number from 1024 to 65535" in capsys.readouterr().err
+
+
+def broken(options):
+    raise ValueError("a bug\nwith two lines")
+
+
+def test_a_bug_is_one_line_and_a_traceback_only_on_demand(monkeypatch, capsys):
+    monkeypatch.setattr("sst_ros.cli.scene._list", broken)
+    assert main(["scene", "list"]) == 3
+    said = capsys.readouterr().err
+    assert said.startswith("sst-ros: internal error, please report it with the output of --debug: ")
+    assert said.endswith("ValueError: a bug with two lines\n")
+    assert main(["scene", "list", "--debug"]) == 3
+    assert "Traceback" in capsys.readouterr().err
+
+
+def interrupted(options):
+    raise KeyboardInterrupt
+
+
+def test_an_interrupt_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr("sst_ros.cli.scene._list", interrupted)
+    assert main(["scene", "list"]) == 130
+    assert capsys.readouterr().err == "sst-ros: interrupted\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_one_line():
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "sst_ros", "scene", "list"],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "sst-ros: No space left on device\n")
+
+
+def test_a_reader_that_leaves_is_no_error():
+    ours, theirs = os.pipe()
+    os.close(ours)
+    done = subprocess.run(
+        [sys.executable, "-m", "sst_ros", "scene", "schema"],
+        stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60,
+    )  # fmt: skip
+    os.close(theirs)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "module", "extra"),
+    [
+        (["simulator"], "rclpy", "ros"),
+        (["torque_player"], "rclpy", "ros"),
+        (["inverse_dynamics"], "rclpy", "ros"),
+        (["recorder"], "rclpy", "ros"),
+        (["viewer"], "rclpy", "ros"),
+        (["demo"], "rclpy", "ros"),
+        (["demo", "feedforward"], "rclpy", "ros"),
+        (["export", "bag"], "rosbags", "record"),
+        (["export", "bag", "--format", "parquet"], "rosbags", "record"),
+        (["recover", "bag"], "rosbags", "record"),
+        (["report", "run", "bag"], "rosbags|matplotlib", "record|plot"),
+        (["report", "accuracy"], "rosbags|matplotlib", "record|plot"),
+        (["report", "stability"], "rosbags|matplotlib", "record|plot"),
+        (["study", "feedforward"], "rosbags|matplotlib", "record|plot"),
+        (["plot", "bag"], "rosbags|matplotlib", "record|plot"),
+        (["plot", "--list"], "rosbags|matplotlib", "record|plot"),
+        (["workspace", "example2"], "matplotlib", "plot"),
+        (["simulate", "example2", "--plot"], "matplotlib", "plot"),
+        (["simulate", "example2", "--out", "x.parquet"], "pyarrow", "record"),
+        (["view", "bag"], "viser", "view"),
+        (["view", "--scene", "swing"], "viser", "view"),
+        (["compile"], "numba", "fast"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
+    """After a plain installation, every path ends in the line that says what to install."""
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, words=words)],
+        capture_output=True, text=True, timeout=60, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    found = [
+        name
+        for name, brings in zip(module.split("|"), extra.split("|"), strict=True)
+        if f"{name} is not installed: " in done.stderr and f"sst_ros[{brings}]'" in done.stderr
+    ]
+    assert found, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
+              ["describe"], ["--version"], []], ids=" ".join,
+)  # fmt: skip
+def test_what_needs_no_extra_runs_without_any(words):
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, words=words)],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_scene_names_are_completed(tmp_path):
+    pytest.importorskip("argcomplete", reason="needs argcomplete")
+    line = "sst-ros scene show exam"
+    subprocess.run(
+        [sys.executable, "-m", "sst_ros"],
+        env={**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
+             "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "found"), "_ARGCOMPLETE_IFS": "\n"},
+        timeout=60, check=True,
+    )  # fmt: skip
+    assert (tmp_path / "found").read_text().split() == ["example1", "example2", "example2_thin"]
+
+
+def test_importing_the_package_imports_nothing_slow():
+    code = "import sys, sst_ros; print([m for m in {!r} if m in sys.modules])"
+    slow = ("numpy", "scipy", "matplotlib", "numba", "rclpy", "yaml")
+    done = subprocess.run(
+        [sys.executable, "-c", code.format(slow)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
+
+
+def test_every_command_names_itself(capsys):
+    for name in COMMANDS:
+        with pytest.raises(SystemExit):
+            parser().parse_args([name, "--help"])
+        assert capsys.readouterr().out.startswith(f"usage: sst-ros {name} ")
+
+
+def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["simulate", "example2", "--duration", "0.05", "--out", "run.parquet", "--plot"]
+    assert main(words) == 0
+    assert "example2: reached the end\n" in capsys.readouterr().out
+    trajectory = Trajectory.load("run.parquet")
+    assert trajectory.t[-1] == 0.05
+    assert (tmp_path / "run.png").stat().st_size > 10_000
+    assert "exists already" in error_of(words, capsys)
+    assert main(["simulate", "example2", "--duration", "5"]) == 1
+    said = capsys.readouterr()
+    assert "stopped at t = 1.2853" in said.out
+    assert said.err == ""
+
+
+def test_the_workspace_of_a_scene_is_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["workspace", "example2"]) == 0
+    assert "parallel: none inside" in capsys.readouterr().out
+    assert (tmp_path / "example2_workspace.png").stat().st_size > 50_000
+    assert "exists already" in error_of(["workspace", "example2"], capsys)

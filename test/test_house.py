@@ -10,7 +10,8 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"child_process", "errors", "output_folder", "progress"},
+    {"state"},
+    {"child_process", "errors", "extras", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},
@@ -18,9 +19,7 @@ FLOORS = (
     {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate_motion"},
     {"control", "description"},
     {"recording"},
-    {"plot", "view"},
-    {"report"},
-    {"studies"},
+    {"plot", "report", "studies", "view"},
     {"runtime"},
     {"nodes"},
     {"demo"},

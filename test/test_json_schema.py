@@ -56,7 +56,7 @@ LINK = {"inertia": {"xx": 1.0, "yy": 1.0, "zz": 1.0}}
         ("actuated_links", [LINK, LINK], ["actuated_links"]),
         ("intermediate_links", [{"mass": -1}], ["intermediate_links", 0, "mass"]),
         ("stroke", {"at_end": "bounce"}, ["stroke", "at_end"]),
-        ("stroke", {"at_end": "impact", "restitution": 2}, ["stroke", "restitution"]),
+        ("stroke", {"at_end": "elastic", "restitution": 2}, ["stroke", "restitution"]),
         ("moment", {"topic": "yes"}, ["moment", "topic"]),
         ("springs", [{"joint": "mu_1", "stiffness": 0, "rest": 0}], ["springs", 0, "stiffness"]),
         ("friction", {"gamma_1": {}}, ["friction"]),
@@ -85,7 +85,7 @@ def test_every_key_is_described_with_its_unit():
 
 def test_the_reference_of_keys_in_docs_is_up_to_date():
     said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
-    assert said == keys(), "python -m sst_ros scene keys > docs/scenes.md"
+    assert said == keys(), "run python -m tools.scene_keys"
 
 
 def test_the_reference_names_every_key():

@@ -83,15 +83,20 @@ REFUSED = {
     ),
     "soft stop": ("stroke: {stiffness: 10}", r"stroke\.stiffness = 10\.0: is given with at_end: e"),
     "damped stop": ("stroke: {damping: 1}", r"stroke\.damping = 1\.0: is given with at_end: elast"),
-    "impact without restitution": (
-        "stroke: {at_end: impact}", r"stroke\.restitution = None: is given with at_end: impact, an"
+    "rigid impact": (
+        "stroke: {at_end: impact}", r"stroke\.at_end = 'impact': must be one of stop, ignore, elast"
     ),
     "impact that drives": (
-        "stroke: {at_end: impact, restitution: 1.1}", r"restitution = '1\.1': .* >= 0 <= 1 \[1\]"
+        "stroke: {at_end: elastic, stiffness: 1, restitution: 1.1, impact_rate: 1}",
+        r"restitution = '1\.1': .* >= 0\.01 <= 1 \[1\]",
     ),
-    "elastic with restitution": (
+    "restitution at no rate": (
         "stroke: {at_end: elastic, stiffness: 1, restitution: 0.5}",
-        r"restitution = 0\.5: is given with at_end: impact, and only there",
+        r"impact_rate = None: is given with restitution, both or none",
+    ),
+    "restitution and damping": (
+        "stroke: {at_end: elastic, stiffness: 1, damping: 1, restitution: 0.5, impact_rate: 1}",
+        r"damping = 1\.0: give either damping or restitution",
     ),
     "negative damping": (
         "stroke: {at_end: elastic, stiffness: 1, damping: -1}", r"damping = '-1': .*>= 0 \[s/rad\]"

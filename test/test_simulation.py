@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from models import seeded_samples
 
 from sst_ros.control.torque_profiles import sine
@@ -21,8 +24,10 @@ from sst_ros.errors import (
     StrokeExceeded,
     WorkspaceLeft,
 )
+from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Initial, Stroke, Workspace, load
+from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation import Simulation
 
 MILLISECOND = 1_000_000
@@ -280,3 +285,26 @@ def test_what_the_same_constants_move_is_traced_once():
     again = Simulation(replace(scene, initial=Initial(gamma=(0.7, 0.7, 0.7))))
     assert again.dynamics is Simulation(scene).dynamics
     assert Simulation(load("swing")).dynamics is not again.dynamics
+
+
+@pytest.mark.parametrize("scene", ["example2", EXAMPLE2, yaml.safe_load(dump(EXAMPLE2))])
+def test_a_scene_is_given_as_it_is_or_by_name_or_as_a_document(scene):
+    assert Simulation(scene).scene == EXAMPLE2
+
+
+@pytest.mark.parametrize("torque", [1.0, None, "abc", (1.0, 2.0), (1.0, 2.0, math.nan)])
+def test_a_torque_that_is_no_vector_is_refused(torque):
+    with pytest.raises(InputError, match=r"torque = .*: must be three finite numbers"):
+        Simulation(EXAMPLE2).step(torque, 1_000_000)
+
+
+@pytest.mark.skipif(numba_version() is None, reason="needs numba")
+def test_a_torque_function_in_a_compiled_simulation_warns_once():
+    simulation, plain = Simulation(EXAMPLE2, compiled=True), Simulation(EXAMPLE2)
+    with pytest.warns(RuntimeWarning, match="a torque function runs in plain Python"):
+        simulation.step(lambda t: (t, 0.0, 1.0), 1_000_000)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulation.step(lambda t: (t, 0.0, 1.0), 1_000_000)
+        plain.steps(lambda t: (t, 0.0, 1.0), 1_000_000, 2)
+    assert simulation.state == plain.state

@@ -11,7 +11,7 @@ from loaded_scenes import loaded, viscous
 
 from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Workspace, load
 from sst_ros.simulation import Simulation
 
@@ -41,14 +41,14 @@ BY_NUMBA = [
 @pytest.fixture
 def glided(monkeypatch):
     """Count the ticks that were done without a look at each."""
-    counts, glide = [], Machine.glide
+    counts, step_many = [], CompiledMethod.step_many
 
     def counted(self, h, count, *more):
-        found = glide(self, h, count, *more)
+        found = step_many(self, h, count, *more)
         counts.append((count, found[0]))
         return found
 
-    monkeypatch.setattr(Machine, "glide", counted)
+    monkeypatch.setattr(CompiledMethod, "step_many", counted)
     return counts
 
 
@@ -61,7 +61,7 @@ def told(simulation):
         simulation.energy_residual,
         simulation.changes,
         simulation.method,
-        simulation._journey._mark()[:3],
+        simulation.accepted_steps,
     )
 
 

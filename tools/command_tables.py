@@ -11,28 +11,33 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from sst_ros.__main__ import NODES, parser
+from sst_ros.cli.main import NODES, parser
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 
 _COMMANDS = """# The command line
 
-What `python -m tools.command_tables` writes; do not edit it here.
+<!-- Written by `python -m tools.command_tables`. -->
 
-    python -m sst_ros COMMAND ...
+    sst-ros COMMAND ...
 
-Status 0 is success, 1 an error that is told in one line on stderr, 2 a command that is not
-understood. `python -m sst_ros COMMAND --help` says the same as this page.
+`python -m sst_ros COMMAND ...` is the same without an installation. Exit status 0 is success, 1 an
+error, reported in one line on stderr (or what the command says below), 2 a command that is not
+understood, 3 an internal error; `--debug` prints the traceback. No command overwrites earlier
+results without `--force`. `sst-ros COMMAND --help` describes a command.
 
-Nodes are started in the same way and take what ROS nodes take, `--ros-args -p name:=value`:
+Where [argcomplete](https://pypi.org/project/argcomplete/) is installed,
+`eval "$(register-python-argcomplete sst-ros)"` completes commands, options and names of scenes.
+
+Nodes are started in the same way and take the arguments of ROS nodes, `--ros-args -p name:=value`:
 {nodes}.
 Their parameters are in [the reference of nodes](nodes.md).
 """
 
 _COLUMNS = """# Columns of exported tables
 
-What `python -m tools.command_tables` writes; do not edit it here.
+<!-- Written by `python -m tools.command_tables`. -->
 
-`python -m sst_ros export BAG` and `sst_ros.recording.export.frame` give a table for what has rows
+`sst-ros export BAG` and `sst_ros.recording.export.frame` give a table for what has rows
 of its own. A table, or a column, whose topic is not in the bag is left out; a lost message is
 an empty cell (CSV) or NaN. Columns in ns are whole numbers, all others doubles with all their bits.
 
@@ -62,6 +67,8 @@ def _commands(of: argparse.ArgumentParser, path: str) -> Iterator[str]:
             continue
         helps = {choice.dest: choice.help or "" for choice in action._choices_actions}
         for name, command in action.choices.items():
+            if name in NODES:
+                continue
             below = list(_commands(command, f"{path}{name} "))
             if not below:
                 said = helps[name][:1].upper() + helps[name][1:]

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference of all keys of a scene, from the declarations that check them.
 
-`python -m sst_ros scene keys` prints it; docs/scenes.md is its output, held so by a test.
+`python -m tools.scene_keys` writes docs/scenes.md; a test compares the two.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from sst_ros.scene.scene import Scene
@@ -16,17 +18,17 @@ from sst_ros.scene.schema import Section, Spec
 
 _HEAD = """# Scenes
 
-What `python -m sst_ros scene keys` prints; do not edit it here.
+<!-- Written by `python -m tools.scene_keys`. -->
 
 A scene is one YAML file. What it does not name does not exist: no operation in its dynamics, no
 parameter, no topic. Units are SI and angles radians; keys in degrees end in `_deg`. Frames are the
 paper's: {B} is fixed in the base, {E} in the star, {1k} = [r, w x r, w] in actuated link k and
 {2k} = [r, t x r, t] in intermediate link k.
 
-    python -m sst_ros scene list           # the scenes that come with sst_ros
-    python -m sst_ros scene show example2  # what a scene is made of and what it costs
-    python -m sst_ros scene check my.yaml  # every fault, with its line
-    python -m sst_ros scene schema > scene.schema.json   # for editors
+    sst-ros scene list           # the scenes that come with sst_ros
+    sst-ros scene show example2  # what a scene is made of and what it costs
+    sst-ros scene check my.yaml  # every fault, with its line
+    sst-ros scene schema > scene.schema.json   # for editors
 
 With the schema beside a scene, editors that know the YAML language server complete and check it
 by this first line: `# yaml-language-server: $schema=scene.schema.json`.
@@ -74,3 +76,14 @@ def _default(value: Any) -> str:
     if isinstance(value, tuple) and value:
         return "[" + ", ".join(f"{entry:g}" for entry in value) + "]"
     return "none" if value is None or value == () else str(value)
+
+
+def main() -> int:
+    """Write the page into the source tree."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "scenes.md"
+    page.write_text(keys(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -23,7 +23,7 @@ from numpy.polynomial import legendre
 from benchmark import c_floor
 from benchmark.peers.task import DURATION, Task
 from benchmark.timing import interleaved
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, RK4
 from sst_ros.mechanism.frames import rotation_matrix
 
@@ -46,7 +46,7 @@ def found(task: Task, targets: tuple[float, ...]) -> Floor:
 
 def _needed(task: Task, target: float) -> int:
     """Fewest nodes whose polynomial of W_dot turns the star to within the error."""
-    machine = Machine(task.system, DOP853, compiled=True)
+    machine = CompiledMethod(task.system, DOP853, compiled=True)
     names: dict[str, Any] = {}
     exec("from math import cos, sin, sqrt, tanh\n" + task.system.program.source("rhs"), names)
     x, weights = legendre.leggauss(_MOST)
@@ -69,11 +69,11 @@ def _needed(task: Task, target: float) -> int:
     return _MOST
 
 
-def _states(machine: Machine, start: list[float], times: np.ndarray) -> np.ndarray:
+def _states(machine: CompiledMethod, start: list[float], times: np.ndarray) -> np.ndarray:
     found, t, y = [], 0.0, start
     for time_ in times:
         steps = max(1, math.ceil((time_ - t) * _STEPS))
-        y = machine.march(t, (time_ - t) / steps, steps, y, [])
+        y = machine.step_fixed(t, (time_ - t) / steps, steps, y, [])
         t = time_
         found.append(y)
     return np.array(found)

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmark.peers.series import Run, Series, Setting, ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, Tableau
 
@@ -62,19 +62,19 @@ def _collocation(task: Task, nodes: int) -> Series:
 
 
 def _series(task: Task, name: str, tableau: Tableau, compiled: bool, counts: list[int]) -> Series:
-    machine = Machine(task.system, tableau, compiled=compiled)
+    machine = CompiledMethod(task.system, tableau, compiled=compiled)
 
     def acceleration(at: Moving) -> np.ndarray:
         return task.kernel_answer(at.y, at.torque)
 
     def setting(steps: int) -> Setting:
         def whole() -> list[float]:
-            return machine.march(0.0, DURATION / steps, steps, task.start, [])
+            return machine.step_fixed(0.0, DURATION / steps, steps, task.start, [])
 
         def poses(pieces: int) -> list[Pose]:
             y, found = task.start, []
             for piece in range(pieces):
-                y = machine.march(
+                y = machine.step_fixed(
                     piece * DURATION / pieces, DURATION / steps, steps // pieces, y, []
                 )
                 found.append(task.pose_of(y))

@@ -11,9 +11,9 @@ import numpy as np
 
 from sst_ros import scene as scenes
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -68,7 +68,7 @@ class Task:
         assert self.scene.torque is not None
         self.torque = self.scene.torque
         self.dynamics = Dynamics.of(self.scene)
-        self.system = System(self.dynamics, self.torque)
+        self.system = ODE(self.dynamics, self.torque)
         self.geometry = geometry = Geometry.of(self.scene)
         start = Simulation(self.scene).state
         self.start = [*start.quaternion, *start.body_rate]
@@ -117,18 +117,18 @@ class Task:
         For engines that only make steps: what the true mean differs from the true acceleration
         is taken off.
         """
-        machine = Machine(self.system, DOP853, compiled=False)
+        machine = CompiledMethod(self.system, DOP853, compiled=False)
         rates = []
         for time in (begin, end):
-            y = machine.march(at.time, time, 1, at.y, []) if time else at.y
+            y = machine.step_fixed(at.time, time, 1, at.y, []) if time else at.y
             rates.append(np.array(self.dynamics.joints(*y)[9:12]))
         return np.asarray(mean - (rates[1] - rates[0]) / (end - begin) + at.answer)
 
     @cached_property
     def moving(self) -> list[Moving]:
         """States of the motion itself, well after its start."""
-        machine = Machine(self.system, DOP853, compiled=False)
-        return [self._moving(time, machine.march(0.0, time / 50, 50, self.start, []))
+        machine = CompiledMethod(self.system, DOP853, compiled=False)
+        return [self._moving(time, machine.step_fixed(0.0, time / 50, 50, self.start, []))
                 for time in (0.21, 0.53, 0.87)]  # fmt: skip
 
     def _moving(self, time: float, y: list[float]) -> Moving:

@@ -6,9 +6,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands, add_out
-from sst_ros.control.controller_settings import MODES
-from sst_ros.errors import InputError, Problem
+from sst_ros.cli.parsing import Commands, add_out, add_scene
+from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.extras import require
 from sst_ros.output_folder import require_free
 
 
@@ -20,11 +20,11 @@ def add(commands: Commands) -> None:
         nargs="?",
         choices=("examples", "feedforward"),
         default="examples",
-        help="the paper's examples, or the companion that follows a scene's motion",
+        help="the paper's examples, or the node inverse_dynamics following a scene's motion",
     )
     add_out(demo, "folder of the results", "demo_out, or demo_out/feedforward")
-    demo.add_argument("--scene", help="with feedforward: name, or path of a .yaml file")
-    demo.add_argument("--mode", nargs="+", choices=MODES, help="with feedforward: controllers")
+    add_scene(demo, "--scene", help="with feedforward: name of a scene, or path of a .yaml file")
+    demo.add_argument("--mode", nargs="+", metavar="MODE", help="with feedforward: control modes")
     demo.set_defaults(run=_demo)
 
 
@@ -34,8 +34,16 @@ def _demo(options: argparse.Namespace) -> int:
         allowed = "is an option of `demo feedforward`; `demo` runs example1 and example2"
         if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
             raise InputError("demo", wrong)
+    from sst_ros.control.controller_settings import MODES
+
+    for mode in options.mode or ():
+        if mode not in MODES:
+            allowed = f"must be one of {', '.join(MODES)}{suggestion(mode, MODES)}"
+            raise InputError("demo", [Problem("--mode", mode, allowed)])
     default = "demo_out" if options.kind == "examples" else "demo_out/feedforward"
     out = require_free(options.out or Path(default), "demo", force=options.force)
+    for module in ("rclpy", "rosbags", "matplotlib"):
+        require(module)  # the nodes, which need the first two, are processes of their own
     from sst_ros import demo
 
     if options.kind == "examples":

@@ -5,20 +5,18 @@ from __future__ import annotations
 
 import argparse
 
-from sst_ros import scene
-from sst_ros.cli import Commands
+from sst_ros.cli.parsing import Commands, add_scene
 
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
     describe = commands.add_parser("describe", help="write a scene as URDF")
-    describe.add_argument(
-        "--scene", default="example2", metavar="S", help="name, or path of a .yaml file"
-    )
+    add_scene(describe, "--scene", default="example2", metavar="S")
     describe.set_defaults(run=_describe)
 
 
 def _describe(options: argparse.Namespace) -> None:
     from sst_ros.description.urdf import urdf
+    from sst_ros.scene.scene import load
 
-    print(urdf(scene.load(options.scene)), end="")
+    print(urdf(load(options.scene)), end="")

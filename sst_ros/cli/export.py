@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands, add_out
+from sst_ros.cli.parsing import Commands, add_out
 from sst_ros.output_folder import require_free, results_folder
 
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros import scene
-from sst_ros.cli import Commands, group
+from sst_ros.cli.parsing import Commands, add_scene, group
 from sst_ros.errors import InputError, Problem
 from sst_ros.output_folder import require_free
 
@@ -18,7 +17,7 @@ def add(commands: Commands) -> None:
     check = kinds.add_parser(
         "check", help="can the actuators do it, and how fast; exit status 0 if they can"
     )
-    check.add_argument("scene", metavar="FILE", help="scene with a motion: name, or .yaml file")
+    add_scene(check, "scene", metavar="SCENE", help="scene with a motion: name, or .yaml file")
     check.add_argument("--json", action="store_true", help="print JSON instead of a table")
     check.add_argument("--csv", type=Path, metavar="OUT", help="write the torques to play")
     check.add_argument("--force", action="store_true", help="overwrite the file of --csv")
@@ -34,13 +33,14 @@ def _check(options: argparse.Namespace) -> int:
     from sst_ros.control.reference_motions import reference_motion
     from sst_ros.control.time_scaling import time_scaling
     from sst_ros.recording.recorded_motion import samples
+    from sst_ros.scene.scene import load
 
     if not 1e-9 <= options.period < float("inf"):
         problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
         raise InputError("plan check", [problem])
     if options.csv is not None:
-        require_free(options.csv, "plan check", force=options.force)
-    held = scene.load(options.scene)
+        require_free(options.csv, "plan check", force=options.force, option="--csv")
+    held = load(options.scene)
     plan = examine(reference_motion(held, samples), held)
     write = as_json if options.json else table
     print(write(plan, time_scaling(plan)).rstrip())

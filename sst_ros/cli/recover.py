@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli import Commands
+from sst_ros.cli.parsing import Commands
 
 
 def add(commands: Commands) -> None:

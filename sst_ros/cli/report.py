@@ -6,8 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros import scene
-from sst_ros.cli import Commands, add_out, group
+from sst_ros.cli.parsing import Commands, add_out, add_scene, group
 from sst_ros.output_folder import require_free, results_folder
 
 
@@ -19,9 +18,10 @@ def add(commands: Commands) -> None:
     add_out(run, "folder of the results", "BAG_report, beside the bag")
     run.set_defaults(run=_run)
     accuracy = kinds.add_parser("accuracy", help="error against cost of every method and step")
-    accuracy.add_argument(
-        "--scene", nargs="+", metavar="S", help="names, or paths of .yaml files; default: all"
-    )
+    add_scene(
+        accuracy, "--scene", nargs="+", metavar="S",
+        help="names, or paths of .yaml files; default: all",
+    )  # fmt: skip
     add_out(accuracy, "folder of the results", "accuracy_out")
     accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
     accuracy.set_defaults(run=_accuracy)
@@ -41,11 +41,12 @@ def _run(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     out = require_free(options.out or Path("accuracy_out"), "report", force=options.force)
+    from sst_ros.scene.scene import names
     from sst_ros.studies.accuracy_report import report
     from sst_ros.studies.high_precision import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
-    report(options.scene or scene.names(), out, kind=kind)
+    report(options.scene or names(), out, kind=kind)
 
 
 def _stability(options: argparse.Namespace) -> int:

@@ -7,10 +7,8 @@ import argparse
 import json
 from pathlib import Path
 
-from sst_ros import scene
-from sst_ros.cli import Commands, group
+from sst_ros.cli.parsing import Commands, add_scene, group
 from sst_ros.errors import SstError
-from sst_ros.scene.json_schema import json_schema
 
 
 def add(commands: Commands) -> None:
@@ -18,25 +16,26 @@ def add(commands: Commands) -> None:
     kinds = group(commands.add_parser("scene", help="look at scenes"))
     kinds.add_parser("list", help="the scenes that come with sst_ros").set_defaults(run=_list)
     show = kinds.add_parser("show", help="what a scene is made of and what it costs")
-    show.add_argument("scene", help="name, or path of a .yaml file")
+    add_scene(show, "scene", metavar="SCENE")
     show.set_defaults(run=_show)
-    check = kinds.add_parser("check", help="tell every fault of scene files")
+    check = kinds.add_parser("check", help="report every fault of scene files")
     check.add_argument("files", nargs="+", type=Path, metavar="FILE")
     check.set_defaults(run=_check)
     kinds.add_parser("schema", help="JSON schema for editors").set_defaults(run=_schema)
-    keys = kinds.add_parser("keys", help="reference of all keys, as Markdown")
-    keys.set_defaults(run=_keys)
 
 
 def _list(_: argparse.Namespace) -> None:
-    for name in scene.names():
-        print(f"{name:<18}{scene.load(name).description}")
+    from sst_ros.scene.scene import load, names
+
+    for name in names():
+        print(f"{name:<18}{load(name).description}")
 
 
 def _show(options: argparse.Namespace) -> None:
+    from sst_ros.scene.scene import load
     from sst_ros.studies.scene_summary import summary
 
-    print(summary(scene.load(options.scene)), end="")
+    print(summary(load(options.scene)), end="")
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -54,10 +53,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _schema(_: argparse.Namespace) -> None:
-    print(json.dumps(json_schema(scene.Scene, "sst_ros scene"), indent=2))
+    from sst_ros.scene.json_schema import json_schema
+    from sst_ros.scene.scene import Scene
 
-
-def _keys(_: argparse.Namespace) -> None:
-    from tools.scene_keys import keys
-
-    print(keys(), end="")
+    print(json.dumps(json_schema(Scene, "sst_ros scene"), indent=2))

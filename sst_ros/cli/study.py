@@ -6,8 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros import scene
-from sst_ros.cli import Commands, add_out, group
+from sst_ros.cli.parsing import Commands, add_out, add_scene, group
 from sst_ros.errors import InputError, Problem
 from sst_ros.output_folder import require_free
 
@@ -22,20 +21,21 @@ def add(commands: Commands) -> None:
         "noise; the order of the hold; the largest stable bandwidth. On all cores; the same bits "
         "on any number of them.",
     )
+    add_scene(
+        feedforward, "--scene", default="reach",
+        help="scene with a motion: name, or path of a .yaml file; default: reach",
+    )  # fmt: skip
     feedforward.add_argument(
-        "--scene", default="reach", help="name, or path of a .yaml file, with a motion: %(default)s"
-    )
-    feedforward.add_argument(
-        "--period", type=float, default=1e-3, help="control period [s]: %(default)s"
+        "--period", type=float, default=1e-3, help="control period [s]; default: 0.001"
     )
     feedforward.add_argument(
         "--bandwidths", type=float, nargs="+", default=[20.0, 60.0, 180.0], metavar="W",
-        help="of the feedback [rad/s]: 20 60 180",
+        help="of the feedback [rad/s]; default: 20 60 180",
     )  # fmt: skip
     feedforward.add_argument(
-        "--damping-ratio", type=float, default=1.0, help="of the feedback: %(default)s"
+        "--damping-ratio", type=float, default=1.0, help="of the feedback; default: 1"
     )
-    feedforward.add_argument("--seed", type=int, default=8, help="of the noise: %(default)s")
+    feedforward.add_argument("--seed", type=int, default=8, help="of the noise; default: 8")
     feedforward.add_argument("--workers", type=int, help="processes; default: one a core")
     add_out(feedforward, "folder of feedforward.csv, .json, .md and .png", "feedforward_out")
     feedforward.set_defaults(run=_feedforward)
@@ -52,11 +52,12 @@ def _feedforward(options: argparse.Namespace) -> None:
     if problems:
         raise InputError("study", problems)
     out = require_free(options.out or Path("feedforward_out"), "study", force=options.force)
-    from sst_ros.studies.feedforward import FeedforwardPlan
+    from sst_ros.scene.scene import load
+    from sst_ros.studies.feedforward import Plan
     from sst_ros.studies.feedforward_report import report
 
-    plan = FeedforwardPlan(
-        scene.load(options.scene),
+    plan = Plan(
+        load(options.scene),
         period_ns=round(options.period * 1e9),
         bandwidths=tuple(dict.fromkeys(options.bandwidths)),
         damping_ratio=options.damping_ratio,

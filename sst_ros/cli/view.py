@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import signal
 import threading
 from pathlib import Path
 
-from sst_ros import child_process, scene
-from sst_ros.cli import Commands
+from sst_ros import child_process
+from sst_ros.cli.parsing import Commands, add_scene, integer_from
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 
 
 def add(commands: Commands) -> None:
@@ -22,13 +22,18 @@ def add(commands: Commands) -> None:
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
     )
     view.add_argument("bag", nargs="?", type=Path, help="folder of a bag to play")
-    view.add_argument("--scene", metavar="S", help="start a simulator of this scene to look at")
+    add_scene(view, "--scene", metavar="S", help="start a simulator of this scene to look at")
     view.add_argument(
         "--simulator", default="sst_simulator", metavar="NAME", help="node of the simulator"
     )
     view.add_argument("--namespace", default="/", metavar="NS", help="namespace of its nodes")
     view.add_argument("--host", default="127.0.0.1", help="address to serve at (this machine only)")
-    view.add_argument("--port", type=int, default=8080, help="port; the next free one is taken")
+    view.add_argument(
+        "--port",
+        type=integer_from(1024, 65535),
+        default=8080,
+        help="port; the next free one is taken",
+    )
     view.add_argument("--open", action="store_true", help="open it, where there is a desktop")
     view.set_defaults(run=_view)
 
@@ -37,13 +42,15 @@ def _view(options: argparse.Namespace) -> int:
     if options.bag is not None and options.scene is not None:
         allowed = "give a bag or a scene, not both"
         raise InputError("view", [Problem("--scene", options.scene, allowed)])
-    _needed("viser", "view")
+    require("viser")
     if options.bag is not None:
         return _replay(options)
-    _needed("rclpy", "ros")
+    require("rclpy")
     if options.scene is None:
         return _live(options)
-    scene.load(options.scene)
+    from sst_ros.scene.scene import load
+
+    load(options.scene)
     from sst_ros.view.live import simulator
 
     with simulator(options.scene):
@@ -71,11 +78,3 @@ def _replay(options: argparse.Namespace) -> int:
         pass
     page.close()
     return 0
-
-
-def _needed(module: str, extra: str) -> None:
-    try:
-        importlib.import_module(module)
-    except ImportError:
-        allowed = f"is not installed: pip install 'sst_ros[{extra}]'"
-        raise InputError("view", [Problem(module, None, allowed)]) from None

@@ -39,6 +39,7 @@ from sst_ros.mechanism.vec3 import (
     solve_symmetric,
     turned_back,
 )
+from sst_ros.state import Joints
 
 __all__ = [
     "Balance",
@@ -55,17 +56,6 @@ __all__ = [
 
 Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 State = tuple[Scalar, ...]
-
-
-class Joints(NamedTuple):
-    """Angles [rad] and rates [rad/s] of all nine joints, by kind and leg."""
-
-    gamma: Triple
-    mu: Triple
-    beta: Triple
-    gamma_dot: Triple
-    mu_dot: Triple
-    beta_dot: Triple
 
 
 class Balance(NamedTuple):

@@ -20,7 +20,7 @@ class Limit(NamedTuple):
 
     Attributes:
         reason: what is said when the run stops here.
-        error: what is raised then; None where the scene answers with an impact.
+        error: what is raised then; None for a contact event.
         joint: number of the joint in (gamma_1..3, mu_1..3, beta_1..3), from 0.
         sign: +1 for a lower end, -1 for an upper one.
         end: angle [rad].
@@ -62,16 +62,15 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
 
 
 def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield serial singularities, and the ends that the scene neither ignores nor makes elastic."""
-    stroke: type[RunStopped] | None = StrokeExceeded if scene.stroke.at_end == "stop" else None
+    """Yield serial singularities, and the ends at which the scene stops."""
     for k in range(3):
         name = f"serial singularity, mu_{k + 1}"
         yield Limit(f"{name} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
         yield Limit(f"{name} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
-        if scene.stroke.at_end in ("stop", "impact"):
+        if scene.stroke.at_end == "stop":
             arc, name = float(geometry.arc[k]), f"gamma_{k + 1}"
-            yield Limit(f"{name} < 0", stroke, k, 1.0, 0.0)
-            yield Limit(f"{name} > {arc:.6f} rad", stroke, k, -1.0, arc)
+            yield Limit(f"{name} < 0", StrokeExceeded, k, 1.0, 0.0)
+            yield Limit(f"{name} > {arc:.6f} rad", StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
             most, name = geometry.beta_max, f"beta_{k + 1}"
             yield Limit(f"{name} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)

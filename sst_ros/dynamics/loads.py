@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads of a scene as torques at joints: gravity, friction, springs, elastic stroke ends.
+"""Loads of a scene as torques at joints: gravity, friction, springs, compliant stops.
 
 Every function is for one leg and returns Python's 0.0 for what the scene does not have, which
 leaves nothing behind in a traced program (`trace`).
@@ -7,23 +7,24 @@ leaves nothing behind in a traced program (`trace`).
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross, dot
-from sst_ros.scene.scene import Friction, Link, Scene
+from sst_ros.scene.scene import Friction, Link, Scene, Stroke
 
 
-class Spring(NamedTuple):
+class JointSpring(NamedTuple):
     """All springs of one joint as one: torque -stiffness (angle - rest)."""
 
     stiffness: float
     rest: float
 
 
-class Ends(NamedTuple):
-    """Elastic ends of the stroke, 0 and arc."""
+class CompliantStops(NamedTuple):
+    """Compliant stops at the ends of the stroke, 0 and arc."""
 
     arc: float
     stiffness: float
@@ -38,15 +39,15 @@ class LegLoads(NamedTuple):
         springs: at the joints gamma, mu, beta.
         drive: mass times centre of the actuated link in {1k} [kg m].
         link: mass times centre of the intermediate link in {2k} [kg m].
-        ends: elastic ends of the stroke.
+        stops: compliant stops of the stroke.
 
     """
 
     friction: tuple[Friction | None, Friction | None, Friction | None]
-    springs: tuple[Spring | None, Spring | None, Spring | None]
+    springs: tuple[JointSpring | None, JointSpring | None, JointSpring | None]
     drive: Triple
     link: Triple
-    ends: Ends | None
+    stops: CompliantStops | None
 
 
 class LegMotion(NamedTuple):
@@ -84,12 +85,47 @@ def of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     drive = link = ZERO
     if scene.gravity is not None:
         drive, link = _moment(scene.actuated_links[k]), _moment(scene.intermediate_links[k])
-    ends = None
+    stops = None
     if scene.stroke.stiffness is not None:
-        ends = Ends(float(geometry.arc[k]), scene.stroke.stiffness, scene.stroke.damping)
-    if not (any(friction) or any(by_joint) or any(drive) or any(link) or ends):
+        damping = damping_of(scene.stroke)
+        stops = CompliantStops(float(geometry.arc[k]), scene.stroke.stiffness, damping)
+    if not (any(friction) or any(by_joint) or any(drive) or any(link) or stops):
         return None
-    return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, ends)
+    return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)
+
+
+def damping_of(stroke: Stroke) -> float:
+    """Damping of compliant stops [s/rad], as given or from the restitution at the impact rate.
+
+    For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v into the
+    stop to e v out of it, with d = c v,
+
+        d (1 + e) = ln((1 + d) / (1 - d e)),
+
+    whatever m and k (Gonthier, McPhee, Lange & Piedboeuf, Multibody Syst. Dyn. 11 (2004) 209-233;
+    the force is that of Hunt & Crossley, J. Appl. Mech. 42 (1975) 440-445). With s = d (1 + e) it
+    reads L(s/2) = (1 - e) / (1 + e), where L(x) = coth x - 1/x is Langevin's function.
+    """
+    if stroke.restitution is None or stroke.impact_rate is None:
+        return stroke.damping
+    e = stroke.restitution
+    return 2.0 * _inverse_langevin((1.0 - e) / (1.0 + e)) / ((1.0 + e) * stroke.impact_rate)
+
+
+def _inverse_langevin(y: float) -> float:
+    """Solve coth x - 1/x = y for x >= 0, 0 <= y < 1."""
+    if y < 0.05:  # coth x - 1/x would cancel; the next term of the series is 2.1 y^13
+        coefficients = (3.0, 9 / 5, 297 / 175, 1539 / 875, 126117 / 67375, 43733439 / 21896875)
+        return sum(c * y ** (2 * i + 1) for i, c in enumerate(coefficients))
+    low, high = 3.0 * y, 1.0 / (1.0 - y) + 3.0 * y
+    while True:  # at most some sixty bisections
+        x = 0.5 * (low + high)
+        if not low < x < high:
+            return x
+        if 1.0 / math.tanh(x) - 1.0 / x < y:
+            low = x
+        else:
+            high = x
 
 
 def joint_torques(
@@ -105,8 +141,8 @@ def joint_torques(
         for kind, spring in enumerate(loads.springs)
     )
     at_gamma, at_mu = _weight(loads, leg, field)
-    if loads.ends is not None:
-        at_gamma = at_gamma + _push(loads.ends, angle(leg, 0, across, v), leg.gamma_dot)
+    if loads.stops is not None:
+        at_gamma = at_gamma + _push(loads.stops, angle(leg, 0, across, v), leg.gamma_dot)
     return (
         rubbing[0] + pulling[0] + at_gamma,
         rubbing[1] + pulling[1] + at_mu,
@@ -117,16 +153,16 @@ def joint_torques(
 def potential_energy(
     loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
 ) -> Scalar:
-    """Energy [J] in springs, elastic ends and the weight of the links."""
+    """Energy [J] in springs, compliant stops and the weight of the links."""
     total: Scalar = 0.0
     for kind, spring in enumerate(loads.springs):
         if spring is not None:
             stretch = angle(leg, kind, across, v) - spring.rest
             total = total + 0.5 * spring.stiffness * stretch * stretch
-    if loads.ends is not None:
+    if loads.stops is not None:
         gamma = angle(leg, 0, across, v)
-        for depth in (positive(-gamma), positive(gamma - loads.ends.arc)):
-            total = total + 0.5 * loads.ends.stiffness * depth * depth
+        for depth in (positive(-gamma), positive(gamma - loads.stops.arc)):
+            total = total + 0.5 * loads.stops.stiffness * depth * depth
     if any(loads.drive) or any(loads.link):
         first, second = _directions(leg)
         total = total - dot(_combined(loads.drive, *first), field)
@@ -135,15 +171,15 @@ def potential_energy(
 
 
 def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> Scalar:
-    """Power [W] that friction and the damping of elastic ends take out."""
+    """Power [W] that friction and the damping of compliant stops take out."""
     total: Scalar = 0.0
     for kind, friction in enumerate(loads.friction):
         if friction is not None:
             total = total + resistance(friction, rate(leg, kind)) * rate(leg, kind)
-    if loads.ends is not None and loads.ends.damping:
+    if loads.stops is not None and loads.stops.damping:
         gamma, speed = angle(leg, 0, across, v), leg.gamma_dot
-        elastic = loads.ends._replace(damping=0.0)
-        excess = _push(elastic, gamma, speed) - _push(loads.ends, gamma, speed)
+        elastic = loads.stops._replace(damping=0.0)
+        excess = _push(elastic, gamma, speed) - _push(loads.stops, gamma, speed)
         total = total + excess * speed
     return total
 
@@ -197,13 +233,13 @@ def _directions(
     return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
 
 
-def _push(ends: Ends, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
-    """Torque of the elastic ends; the damping grows from zero with the depth (Hunt-Crossley)."""
-    low, high = positive(-gamma), positive(gamma - ends.arc)
-    if not ends.damping:
-        return ends.stiffness * (low - high)
-    inward = ends.damping * gamma_dot
-    return ends.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
+def _push(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+    """Torque of compliant stops; the damping grows from zero with the depth (Hunt-Crossley)."""
+    low, high = positive(-gamma), positive(gamma - stops.arc)
+    if not stops.damping:
+        return stops.stiffness * (low - high)
+    inward = stops.damping * gamma_dot
+    return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
 
 
 def _combined(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
@@ -211,11 +247,11 @@ def _combined(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
     return (first, second, third)
 
 
-def _joined(springs: list[Any]) -> Spring | None:
+def _joined(springs: list[Any]) -> JointSpring | None:
     stiffness = sum(spring.stiffness for spring in springs)
     if not springs:
         return None
-    return Spring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
+    return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
 
 
 def _moment(link: Link) -> Triple:

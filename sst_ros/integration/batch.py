@@ -60,7 +60,7 @@ class Batch:
     """A scene compiled for many scenarios, by an explicit method with fixed steps.
 
     Args:
-        scene: what is simulated; its ends must not be rigid (impact).
+        scene: what is simulated.
         method: explicit method.
         profile: apply the scene's own torques over time on top of none given to `run`.
         parameters: numbers of the scene that differ between scenarios, by their keys in the
@@ -69,7 +69,7 @@ class Batch:
         progress: draw a bar on a terminal while scenarios are prepared.
 
     Raises:
-        InputError: numba is not installed, the scene has impacts or no torque to apply, or the
+        InputError: numba is not installed, the scene has no torque to apply, or the
             numbers of a scenario make no scene; says which, and what is allowed.
 
     """
@@ -86,8 +86,6 @@ class Batch:
         problems = []
         if codegen.numba_version() is None:
             problems.append(Problem("numba", None, "must be installed: pip install sst_ros[fast]"))
-        if scene.stroke.at_end == "impact":
-            problems.append(Problem("stroke.at_end", "impact", "must not be impact in a batch"))
         if profile and scene.torque is None:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}

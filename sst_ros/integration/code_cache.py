@@ -2,7 +2,7 @@
 """Machine code of a scene before it is needed: is it there, and make it.
 
 Code is made once for each scene and method, which takes from seconds to half a minute, and kept in
-`codegen.cache_folder()`; to load it takes tenths of a second.
+`cache_folder()`; to load it takes tenths of a second.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from collections.abc import Iterator
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
-from sst_ros.integration.compiled_method import Machine, Method, has_code
+from sst_ros.integration.cache_folder import cache_folder
+from sst_ros.integration.compiled_method import CompiledMethod, Method, has_code
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4
-from sst_ros.integration.ode import working
+from sst_ros.integration.ode import ode_with_work
 from sst_ros.scene.scene import Scene
 
 
@@ -22,7 +23,7 @@ def is_there(scene: Scene, integrator: str) -> bool:
     """Tell whether a run of the scene would find all of its code, whatever method it turns to."""
     if codegen.numba_version() is None:
         return False
-    system = working(Dynamics.of(scene))
+    system = ode_with_work(Dynamics.of(scene))
     return all(has_code(system, method) for method in _methods(integrator))
 
 
@@ -31,9 +32,8 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
 
     Where another process makes code this does nothing: it would take the processor from it.
     """
-    system = working(Dynamics.of(scene))
-    folder = codegen.cache_folder()
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    system = ode_with_work(Dynamics.of(scene))
+    folder = cache_folder()
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -43,10 +43,10 @@ def make(scene: Scene, integrator: str) -> Iterator[str]:
             if not has_code(system, method):
                 size, drive = len(system.state), (0.0,) * len(system.drive)
                 y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
-                machine = Machine(system, method, compiled=True)
+                machine = CompiledMethod(system, method, compiled=True)
                 # What comes out is of no interest: the calls have the code made.
-                machine.pair(0.0, 1e-3, y, y, drive)
-                machine.glide(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
+                machine.step_pair(0.0, 1e-3, y, y, drive)
+                machine.step_many(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
             yield method.name
 
 

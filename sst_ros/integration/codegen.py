@@ -16,6 +16,7 @@ import pickletools
 import platform
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -24,16 +25,17 @@ from typing import Any
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration import step_loops
+from sst_ros.integration.cache_folder import cache_folder, is_safe_file
 from sst_ros.integration.methods import Rosenbrock, Tableau
 from sst_ros.integration.runge_kutta_source import explicit_step
 
 _EXPLICIT = (
     step_loops.size_of,
     step_loops.normalise,
-    step_loops.pair,
-    step_loops.march,
+    step_loops.step_pair,
+    step_loops.step_fixed,
     step_loops.all_far,
-    step_loops.glide,
+    step_loops.step_many,
 )
 _IMPLICIT = (
     step_loops.factorise,
@@ -175,12 +177,35 @@ def _imported(path: Path) -> ModuleType:
     # numba finds the module again when it loads from its cache.
     sys.modules[path.stem] = module
     spec.loader.exec_module(module)
+    for function in vars(module).values():
+        _bear_a_full_disk(function)
     return module
 
 
+def _bear_a_full_disk(function: Any) -> None:
+    """Have a compiled function run although numba cannot write it to its cache."""
+    cache = getattr(function, "_cache", None)  # numba has no public name for it
+    save = getattr(cache, "save_overload", None)
+    if cache is None or save is None:
+        return
+
+    def save_or_warn(signature: Any, result: Any) -> None:
+        try:
+            save(signature, result)
+        except OSError as error:
+            warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)
+            cache.disable()
+
+    cache.save_overload = save_or_warn
+
+
 def _drop_damaged(path: Path) -> None:
-    """Remove what numba has cached for a module if any of it is cut off: it would not load."""
+    """Remove what numba has cached for a module if any of it is cut off or of another user."""
     cached = list((path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"))
+    if not all(map(is_safe_file, cached)):
+        for file in cached:
+            file.unlink(missing_ok=True)
+        return
     try:
         for file in cached:
             with file.open("rb") as stream:
@@ -206,7 +231,10 @@ def _code(text: str, name: str) -> CodeType:
 
 def has_code(texts: list[str], constants: dict[str, Any], functions: Sequence[str]) -> bool:
     """Tell whether machine code of these functions of the module is there to be loaded."""
-    path = _path_of(_for_numba(texts, constants))
+    try:
+        path = _path_of(_for_numba(texts, constants))
+    except OSError:
+        return False
     cached = path.parent / "__pycache__"
     return all(any(cached.glob(f"{path.stem}.{name}-*.nbi")) for name in functions)
 
@@ -230,18 +258,11 @@ def _path_of(text: str) -> Path:
     return cache_folder() / f"sst_{digest}.py"
 
 
-def cache_folder() -> Path:
-    """Folder of machine code: SST_ROS_CACHE, or sst_ros in the user's cache."""
-    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sst_ros"
-    return Path(os.environ.get("SST_ROS_CACHE") or default)
-
-
 def _cached_file(text: str) -> Path | None:
     """File that holds `text`; None where no folder for it can be written."""
     try:
         path = _path_of(text)
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
+        if not path.exists() or not is_safe_file(path) or path.read_text(encoding="utf-8") != text:
             # Two processes may write at once: each its own file, then one atomic rename.
             with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
                 file.write(text)
@@ -250,7 +271,7 @@ def _cached_file(text: str) -> Path | None:
             Path(file.name).replace(path)
         with tempfile.TemporaryFile(dir=path.parent):
             return path
-    except (OSError, RuntimeError):
+    except OSError:
         return None
 
 

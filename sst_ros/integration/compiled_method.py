@@ -14,58 +14,58 @@ import numpy as np
 from sst_ros.dynamics.traced_dynamics import LAG
 from sst_ros.integration import codegen
 from sst_ros.integration.methods import Rosenbrock, Tableau
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 
 Method = Tableau | Rosenbrock
 Vector = Sequence[float]
-Slope = Callable[..., tuple[float, ...]]
-Ranges = Sequence[tuple[int, float, float]]
-Stretch = tuple[list[float], list[float], tuple[float, ...]]
-"""State, companion, and the joints' nine angles and nine rates."""
+Function = Callable[..., tuple[float, ...]]
+JointRanges = Sequence[tuple[int, float, float]]
+StepPoint = tuple[list[float], list[float], tuple[float, ...]]
+"""Solution, coarse solution, and the joints' nine angles and nine rates."""
 
 
-class Machine:
+class CompiledMethod:
     """Steps of a system by a method.
 
     Args:
         system: what is integrated.
         method: how.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
-        slope: rhs(t, state.., drive..) to use instead of the system's, plain and explicit only.
-        ranges: joints that `glide` looks at, see `limits.ranges_of`.
+        derivative: rhs(t, state.., drive..) to use instead of the ODE's, plain and explicit only.
+        ranges: joints that `step_many` looks at, see `limits.ranges_of`.
 
     """
 
     def __init__(
         self,
-        system: System,
+        system: ODE,
         method: Method,
         *,
         compiled: bool,
-        slope: Slope | None = None,
-        ranges: Ranges = (),
+        derivative: Function | None = None,
+        ranges: JointRanges = (),
     ) -> None:
         self.system = system
         self.method = method
         self.compiled = compiled = compiled and codegen.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
-        if slope is not None and (implicit or compiled):
-            raise ValueError("a slope of its own needs an explicit method and plain Python")
+        if derivative is not None and (implicit or compiled):
+            raise ValueError("a derivative of its own needs an explicit method and plain Python")
         texts, constants = _source(system, method)
         self._module: ModuleType = codegen.load(texts, constants, numba=compiled)
-        if slope is not None:
-            self._module.__dict__["rhs"] = slope
+        if derivative is not None:
+            self._module.__dict__["rhs"] = derivative
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._error = self._vector([0.0] * len(system.state))
         self.sizes: Any = self._vector([])
-        self._at: Stretch = ([], [], ())
+        self._at: StepPoint = ([], [], ())
         self._place: list[Any] = []
         self._ranges = np.array(ranges, dtype=float).reshape(-1, 3) if compiled else ranges
 
-    def pair(
+    def step_pair(
         self, t: float, h: float, y: Vector, z: Vector, d: Vector
     ) -> tuple[list[float], list[float], float]:
-        """Two steps of h / 2 for y, one of h for its companion z.
+        """Two steps of h / 2 for y, one of h for its coarse solution z.
 
         Returns:
             New y, new z, and the local error estimate of y in units of the tolerance; infinite
@@ -74,16 +74,16 @@ class Machine:
         """
         new_y, new_z = self._vector(y), self._vector(z)
         try:
-            size = self._module.pair(
+            size = self._module.step_pair(
                 t, h, self._vector(y), self._vector(z), self._vector(d), new_y, new_z, self._error
             )
         except (ArithmeticError, ValueError):
             return list(y), list(z), float("inf")
         return self._listed(new_y), self._listed(new_z), float(size)
 
-    def glide(
-        self, h: float, count: int, tolerance: float, at: Stretch, d: Vector
-    ) -> tuple[int, Stretch]:
+    def step_many(
+        self, h: float, count: int, tolerance: float, at: StepPoint, d: Vector
+    ) -> tuple[int, StepPoint]:
         """Go on by up to `count` periods of h, each one pair of steps; stop before what asks more.
 
         Args:
@@ -104,7 +104,7 @@ class Machine:
             self.sizes = self._vector([-1.0] * count)
         y, z, joints = self._place
         try:
-            done = self._module.glide(
+            done = self._module.step_many(
                 count, h, tolerance, y, z, self._vector(d), self._ranges, joints, self.sizes
             )
         except (ArithmeticError, ValueError):
@@ -112,7 +112,7 @@ class Machine:
         self._at = (self._listed(y), self._listed(z), tuple(self._listed(joints)))
         return done, self._at
 
-    def march(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
+    def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.
 
         Raises:
@@ -120,7 +120,7 @@ class Machine:
 
         """
         new = self._vector(y)
-        self._module.march(t, h, count, self._vector(y), self._vector(d), new)
+        self._module.step_fixed(t, h, count, self._vector(y), self._vector(d), new)
         return self._listed(new)
 
     def _listed(self, y: Any) -> list[float]:
@@ -128,13 +128,13 @@ class Machine:
         return listed
 
 
-def has_code(system: System, method: Method) -> bool:
+def has_code(system: ODE, method: Method) -> bool:
     """Tell whether machine code of what a run calls is there, to be loaded in no time."""
-    return codegen.has_code(*_source(system, method), ("pair", "glide"))
+    return codegen.has_code(*_source(system, method), ("step_pair", "step_many"))
 
 
 @lru_cache(maxsize=64)
-def _source(system: System, method: Method) -> tuple[list[str], dict[str, Any]]:
+def _source(system: ODE, method: Method) -> tuple[list[str], dict[str, Any]]:
     """Functions of the machine's module, and its constants."""
     implicit, size = isinstance(method, Rosenbrock), len(system.state)
     jacobian = system.jacobian if implicit else None

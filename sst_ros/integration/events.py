@@ -1,22 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where inside a step a distance, or the push of an end, runs out."""
+"""Events inside a step: when a joint reaches a limit, or meets or leaves a compliant stop.
+
+The force of a compliant stop has a kink where contact begins and ends, so steps end there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-
-from scipy.optimize import brentq
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from sst_ros.dynamics.limits import Limit
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
 
 Signal = Callable[[float], float]
-Meeting = tuple[Limit, Signal, Signal]
-"""What is met, a signal that becomes negative there, and the rate of the signal."""
 
 TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 
 GRAZING = 1e-12
+"""A margin below this [rad] counts as zero: closure and rounding reach 1e-15."""
+
+CONTACT_BAND = 1e-9
+"""Farther beyond than this [rad], an actuator has not just reached the contact."""
+
+
+def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
+    """Yield begin and end of contact at the compliant stops of a scene, one limit each."""
+    if scene.stroke.at_end == "elastic":
+        for k in range(3):
+            for end in (0.0, float(geometry.arc[k])):
+                for sign in (1.0, -1.0):
+                    yield Limit(f"gamma_{k + 1} = {end:.6f} rad", None, k, sign, end)
+
+
+def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
+    """Test cheaply whether a contact may begin or end in a step, given the joints at both ends.
+
+    A contact event that the step starts on does not count again.
+    """
+    if event.margin(begin) <= GRAZING and not (
+        event.margin(begin) > -CONTACT_BAND and event.slope(begin) > 0.0
+    ):
+        return False
+    return event.margin(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
+
+
+def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> float:
+    """Time just after an event at x, where the Jacobian is that of the side beyond the kink."""
+    return min(x + min(1e-14 / max(abs(event.slope(joints)), 1e-200), 1e-3 * h), h)
+
+
+def free_range(events: Sequence[Limit]) -> list[Limit]:
+    """Return limits of the range in which no compliant stop can be in contact."""
+    inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
+    return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]
 
 
 def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
@@ -34,7 +71,7 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
             return 0.0 if margin(0.0) < -GRAZING or leaves else None
         if margin(h) >= 0.0 or (margin(h) >= -GRAZING and not falling):
             return None
-        # It grew first: the crossing lies behind the top.
+        # It grew first: the crossing lies behind the maximum.
         begin = _root(slope, 0.0, h) if falling else 0.0
     elif margin(h) >= 0.0:
         if rising or falling:
@@ -45,26 +82,25 @@ def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
     return _root(margin, begin, end)
 
 
-def meetings(limits: Iterable[Limit], joints: Callable[[float], Sequence[float]]) -> list[Meeting]:
-    """Distances to limits, and their rates, where `joints` are those at a time."""
-
-    def meeting(limit: Limit) -> Meeting:
-        return limit, lambda x: limit.margin(joints(x)), lambda x: limit.slope(joints(x))
-
-    return [meeting(limit) for limit in limits]
-
-
-def first_met(signals: Iterable[Meeting], h: float) -> tuple[float, Limit] | None:
-    """Return when in [0, h] the first signal becomes negative, and its limit."""
-    met = []
-    for limit, margin, slope in signals:
-        x = first_crossing(margin, slope, h)
+def first_event(
+    limits: Iterable[Limit], joints: Callable[[float], Sequence[float]], h: float
+) -> tuple[float, Limit] | None:
+    """Return time in [0, h] and limit of the first event; `joints` are those at a time."""
+    found = []
+    for limit in limits:
+        x = first_crossing(
+            lambda x, at=limit: at.margin(joints(x)),  # type: ignore[misc]
+            lambda x, at=limit: at.slope(joints(x)),  # type: ignore[misc]
+            h,
+        )
         if x is not None:
-            met.append((x, limit))
-    return min(met, key=lambda pair: pair[0]) if met else None
+            found.append((x, limit))
+    return min(found, key=lambda pair: pair[0]) if found else None
 
 
 def _root(signal: Signal, begin: float, end: float) -> float:
     if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
         return begin
+    from scipy.optimize import brentq  # takes 0.2 s to import, and many runs have no event
+
     return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))

@@ -23,7 +23,7 @@ from numpy.polynomial import legendre
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen, gauss_source
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array
 
 NODES = 8
@@ -90,7 +90,7 @@ class Collocation:
 
     """
 
-    def __init__(self, system: System, nodes: int = NODES, *, compiled: bool = True) -> None:
+    def __init__(self, system: ODE, nodes: int = NODES, *, compiled: bool = True) -> None:
         _refuse(nodes=nodes)
         self._compiled = compiled and codegen.numba_version() is not None
         self._nodes = nodes

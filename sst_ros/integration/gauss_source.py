@@ -12,7 +12,7 @@ import inspect
 import re
 from typing import NamedTuple
 
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.integration.simd_source import Layout, indented, loop, split
 from sst_ros.integration.sine_source import flat_sin
 
@@ -30,7 +30,7 @@ class Places(NamedTuple):
     tables: slice
 
 
-def places(system: System, nodes: int) -> Places:
+def places(system: ODE, nodes: int) -> Places:
     """Lay out what `march` reads and writes."""
     at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
     begin, end, table = (at.first(group) for group in ("begin", "end", "node"))
@@ -43,12 +43,12 @@ def places(system: System, nodes: int) -> Places:
     )
 
 
-def source(system: System, nodes: int) -> list[str]:
+def source(system: ODE, nodes: int) -> list[str]:
     """Texts of flat_sin and of `march(block)`, which returns the change of `collocation.Flight`."""
     return [inspect.getsource(flat_sin), _march(system, nodes)]
 
 
-def _layout(system: System, nodes: int) -> Layout:
+def _layout(system: ODE, nodes: int) -> Layout:
     size, inputs = len(system.state), len(system.program.inputs)
 
     def rows(numbers: int) -> int:
@@ -60,18 +60,18 @@ def _layout(system: System, nodes: int) -> Layout:
     )  # fmt: skip
 
 
-def _known(system: System) -> list[str]:
+def _known(system: ODE) -> list[str]:
     """Names of what is known from time alone, and is needed where the state is known too."""
     before, after, results = split(system.program, _time_only(system))
     needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
     return [name for line in before if (name := line.split(" = ")[0]) in needed]
 
 
-def _time_only(system: System) -> list[bool]:
+def _time_only(system: ODE) -> list[bool]:
     return [True, *(False,) * len(system.state), *(True,) * len(system.drive)]
 
 
-def _march(system: System, nodes: int) -> str:
+def _march(system: ODE, nodes: int) -> str:
     at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
     everything, quaternion, rates = range(size), range(4), range(4, size)
     known = _known(system)

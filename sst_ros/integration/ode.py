@@ -13,7 +13,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.scene.scene import SineTorque
 
 
-class System:
+class ODE:
     """Derivative of a scene's state, as programs with the inputs t, state, drive.
 
     Args:
@@ -76,6 +76,6 @@ class System:
 
 
 @lru_cache(maxsize=32)
-def working(dynamics: Dynamics) -> System:
+def ode_with_work(dynamics: Dynamics) -> ODE:
     """Give the system that counts work: traced once for all runs of the same dynamics."""
-    return System(dynamics, work=True)
+    return ODE(dynamics, work=True)

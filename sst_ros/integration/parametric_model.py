@@ -20,7 +20,7 @@ from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_source import margins
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.integration.scenario_constants import (
     Constants,
     Member,
@@ -82,7 +82,7 @@ class Family:
             self.scene = scene
         torque = self.scene.torque if profile else None
         dynamics = Dynamics.of(self.scene)
-        self.system, self._moved = System(dynamics, torque), dynamics.moved
+        self.system, self._moved = ODE(dynamics, torque), dynamics.moved
         self.geometry: NDArray[np.intp] = np.array(which)
         self.torque_limit: Array = np.array(limits)
         self._tree: Constants = reduce(joined, [constants for constants, _ in kinds.values()])
@@ -107,7 +107,7 @@ class Family:
 
         def slope(*inputs: Expression) -> tuple[Any, ...]:
             at = self._constants(inputs[len(known) :])
-            system = System(Dynamics(at.model, moved=self._moved), at.torque)
+            system = ODE(Dynamics(at.model, moved=self._moved), at.torque)
             return system.derivative(*inputs[: len(known)])
 
         return trace(slope, (*known, *self._names))

@@ -1,36 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way of a scene's state through one control period: steps, limits, impacts, rest at ends."""
+"""Propagation of a scene's state through one period: steps, limits, contact at compliant stops."""
 
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import ImpactsAccumulate
 from sst_ros.integration import coarse_solution, step_loops
-from sst_ros.integration.adaptive_stepper import CannotStep, Change, Leg, Mark, Walk
-from sst_ros.integration.applied_torque import Driven
-from sst_ros.integration.contact_events import clear_of, just_beyond, may_touch, touches_of
-from sst_ros.integration.events import first_met, meetings
+from sst_ros.integration.adaptive_stepper import (
+    AcceptedStep,
+    AdaptiveStepper,
+    EvaluationBudget,
+    MethodChange,
+    StepperCheckpoint,
+)
+from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.events import (
+    contact_events_of,
+    first_event,
+    free_range,
+    just_beyond,
+    may_occur,
+)
 from sst_ros.integration.methods import METHODS, Rosenbrock
-from sst_ros.integration.ode import working
-from sst_ros.integration.rigid_stops import Ends
+from sst_ros.integration.ode import ode_with_work
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.state import State, TorqueFunction, Vector3
 
-if TYPE_CHECKING:
-    from sst_ros.simulation import State, Torque, Triple
-
-_IMPACTS_PER_PERIOD = 1000
-_ENDS_PER_PERIOD = 100_000
-
-Book = tuple[tuple[Limit, ...], float, int, Mark, Mark]
+Torque = Vector3 | TorqueFunction
+Checkpoint = tuple[int, StepperCheckpoint, StepperCheckpoint]
 
 
 class Point(NamedTuple):
-    """State y, its companion z by a method of that order, joints: nine angles, nine rates."""
+    """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
 
     y: list[float]
     z: list[float]
@@ -38,8 +43,18 @@ class Point(NamedTuple):
     order: int
 
 
-class Journey:
-    """Travels through control periods; between them it keeps what rests against an end."""
+class Propagator:
+    """Advances a scene through periods of constant drive, or of torques that are a function.
+
+    Args:
+        scene: what is simulated.
+        geometry, dynamics: of the scene.
+        integrator: a method of `methods.METHODS`, or auto.
+        tolerance: largest local error estimate of a step.
+        compiled: by numba.
+        budget: evaluations that a period may take.
+
+    """
 
     def __init__(
         self,
@@ -50,202 +65,174 @@ class Journey:
         tolerance: float,
         *,
         compiled: bool,
+        budget: EvaluationBudget,
     ) -> None:
-        self._scene = scene
         self._dynamics = dynamics
-        self._system = working(dynamics)
+        self._ode = ode_with_work(dynamics)
         self._limits = tuple(limits_of(scene, geometry))
-        self._kinks = tuple(touches_of(scene, geometry))
-        self._ranges = ranges_of([*self._limits, *clear_of(self._kinks)])
-        self._ends = Ends(dynamics, scene.stroke.restitution or 0.0)
+        self._contacts = tuple(contact_events_of(scene, geometry))
+        self._ranges = ranges_of([*self._limits, *free_range(self._contacts)])
         limit = scene.actuators.torque_limit if scene.actuators else None
-        self._driven = Driven(self._system, limit)
-        self._walk = Walk(
-            self._system, integrator, tolerance, compiled=compiled, ranges=self._ranges
+        self._torque = AppliedTorque(self._ode, limit)
+        self._budget = budget
+        self._stepper = AdaptiveStepper(
+            self._ode,
+            integrator,
+            tolerance,
+            compiled=compiled,
+            ranges=self._ranges,
+            budget=budget,
         )
-        explicit = integrator if not isinstance(METHODS.get(integrator), Rosenbrock) else "auto"
-        # Torques that are functions, and ends that hold: the slope is put together in Python.
-        self._slow = Walk(self._system, explicit, tolerance, compiled=False, slope=self._slope)
-        self._legs, self._lost = 0, 0.0
-        self._first = self._book = self._mark()
+        # Torque functions are evaluated in Python, and have no Jacobian.
+        self._plain_stepper = AdaptiveStepper(
+            self._ode,
+            "auto" if isinstance(METHODS.get(integrator), Rosenbrock) else integrator,
+            tolerance,
+            compiled=False,
+            derivative=self._torque.derivative,
+            budget=budget,
+        )
+        self.accepted_steps = 0
+        self._first = self._before = self._checkpoint()
 
     def reset(self) -> None:
         """Forget what has happened."""
-        self._go_back(self._first)
-        self._book = self._first
+        self._restore(self._first)
+        self._before = self._first
 
-    def _mark(self) -> Book:
+    def _checkpoint(self) -> Checkpoint:
         """All that the next steps depend on beside the point at which they begin."""
-        return self._ends.resting, self._lost, self._legs, self._walk.mark(), self._slow.mark()
+        return self.accepted_steps, self._stepper.checkpoint(), self._plain_stepper.checkpoint()
 
-    def _go_back(self, mark: Book) -> None:
-        self._ends.resting, self._lost, self._legs, fast, slow = mark
-        self._walk.go_back(fast)
-        self._slow.go_back(slow)
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        self.accepted_steps, compiled, plain = checkpoint
+        self._stepper.restore(compiled)
+        self._plain_stepper.restore(plain)
 
     @property
     def method(self) -> str:
         """Name of the method in use."""
-        return self._walk.method.name
+        return self._stepper.method.name
 
     @property
-    def changes(self) -> list[Change]:
+    def changes(self) -> list[MethodChange]:
         """Changes of method."""
-        return self._walk.history
+        return self._stepper.history
 
     def begin(self, y: list[float]) -> Point:
         """Complete quaternion and body rate to a state; no torque yet, no work done."""
-        full = [*y, *(0.0,) * (len(self._system.state) - 7)]
-        return Point(full, list(full), self._dynamics.joints(*full[:7]), self._walk.method.order)
+        full = [*y, *(0.0,) * (len(self._ode.state) - 7)]
+        return Point(full, list(full), self._dynamics.joints(*full[:7]), self._stepper.method.order)
 
-    def limited(self, torque: Triple) -> Triple:
+    def limited(self, torque: Vector3) -> Vector3:
         """Clamp torques to the limit of the actuators."""
-        return self._driven.limited(torque)
+        return self._torque.limited(torque)
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
-        return coarse_solution.errors(at.y, at.z, at.order, self._legs)
+        return coarse_solution.errors(at.y, at.z, at.order, self.accepted_steps)
 
-    def work(self, at: Point) -> float:
-        """Work done on the manipulator, less what friction and impacts have taken [J]."""
-        return at.y[-1] - self._lost
-
-    def glide(
-        self, at: Point, h: float, count: int, torque: Torque, more: tuple[float, ...]
+    def step_many(
+        self, at: Point, h: float, count: int, torque: Torque, moment: tuple[float, ...]
     ) -> tuple[Point, int]:
-        """Do what `travel` does for up to `count` periods of h [s], as long as that is only steps.
+        """Do what `advance` does for up to `count` periods of h [s] that take one step each.
 
         Returns where the last period ended that was done, and how many were.
         """
-        if self._ends.resting or callable(torque):
+        if callable(torque):
             return at, 0
-        book, drive = self._mark(), (*self.limited(torque), *more)
-        done, (y, z, joints) = self._walk.glide(h, count, (at.y, at.z, at.joints), drive, at.order)
+        before, drive = self._checkpoint(), (*self.limited(torque), *moment)
+        done, (y, z, joints) = self._stepper.step_many(
+            h, count, (at.y, at.z, at.joints), drive, at.order
+        )
         if done == 0:
             return at, 0
-        self._book = book
-        self._legs += done
-        return Point(y, z, joints, self._walk.method.order), done
+        self._before = before
+        self.accepted_steps += done
+        return Point(y, z, joints, self._stepper.method.order), done
 
-    def travel(
+    def advance(
         self,
         at: Point,
         start: float,
         h: float,
         torque: Torque,
-        more: tuple[float, ...],
+        moment: tuple[float, ...],
         state: State,
     ) -> Point:
-        """Go on from `at` by h [s]; impacts on the way are part of it, other limits its end.
+        """Go on from `at` by h [s]; steps end where contact with a stop begins or ends.
 
         Raises:
-            RunStopped: a limit was met; it carries `state`, and nothing has changed.
-            CannotStep: no step resolves the motion.
+            RunStopped: a limit was reached; it carries `state`, and nothing has changed.
+            CannotStep: no step resolves the motion, or the budget is spent.
 
         """
-        kept = self._book = self._mark()
-        self._walk.origin = start
-        drive = (*self._driven.begin(torque, start), *more)
+        before = self._before = self._checkpoint()
+        self._stepper.origin = start
+        self._budget.begin()
+        drive = (*self._torque.begin(torque, start), *moment)
         try:
-            x, impacts = 0.0, 0
-            if self._ends.resting:
-                free = self._driven.free(drive)
-                at = self._point(*self._ends.settled(x, at.y, at.z, free), at.order)
-            for _ in range(_ENDS_PER_PERIOD):
-                at, x, hit = self._until_met(at, x, h, drive)
-                if hit is not None and hit.error is not None:
-                    raise hit.error(hit.reason, start + x, state)
-                if hit is None or hit in self._ends.resting:
-                    at = self._let_go(at, hit)
-                elif hit not in self._kinks:
-                    impacts += 1
-                    if impacts > _IMPACTS_PER_PERIOD:
-                        raise ImpactsAccumulate(hit.reason, start + x, state)
-                    at = self._strike(at, hit, x, drive)
-                if x >= h:
-                    return at
-            raise CannotStep(f"ends are met or left {_ENDS_PER_PERIOD} times in one period")
+            x = 0.0
+            while x < h:
+                at, x, event = self._until_event(at, x, h, drive)
+                if event is not None and event.error is not None:
+                    raise event.error(event.reason, start + x, state)
+            return at
         except Exception:
-            self._go_back(kept)
+            self._restore(before)
             raise
 
-    def revisited(self, *way: Any) -> Point:
-        """`travel` a part of the last way again, and leave everything as it is now."""
-        now, began = self._mark(), self._book
-        history = list(self._walk.history)
-        self._go_back(began)
+    def repeat_part(self, *arguments: Any) -> Point:
+        """`advance` through a part of the last period again, and leave everything as it is now."""
+        now, before = self._checkpoint(), self._before
+        history = list(self._stepper.history)
+        self._restore(before)
         try:
-            return self.travel(*way)
+            return self.advance(*arguments)
         finally:
-            self._walk.history[:] = history
-            self._go_back(now)
-            self._book = began
+            self._stepper.history[:] = history
+            self._restore(now)
+            self._before = before
 
-    def _until_met(
+    def _until_event(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
-        """Go on from x to h, or to the first limit, kink or release before."""
-        slow = self._driven.by_function or bool(self._ends.resting)
-        walk, free = self._slow if slow else self._walk, self._driven.free(drive)
-        for leg in walk.legs(x, h, at.y, at.z, drive, at.order):
-            self._legs += 1
-            end = self._point(leg.y, leg.z, leg.order)
-            far = step_loops.all_far(self._ranges, at.joints, end.joints, leg.h)  # type: ignore[no-untyped-call]
-            if far and not self._ends.resting:
+        """Go on from x to h, or to the first limit or contact event before."""
+        stepper = self._plain_stepper if self._torque.is_function else self._stepper
+        for step in stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
+            self.accepted_steps += 1
+            end = self._point(step.y, step.z, step.order)
+            if step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
                 at = end
                 continue
-            again = cache(partial(self._part, walk, leg, at, end, drive))
-            signals = meetings(self._near(at, end), lambda x: again(x).joints)  # noqa: B023
-            signals += self._ends.releases(leg.t, leg.h, lambda x: again(x).y, free)  # noqa: B023
-            met = first_met(signals, leg.h)
-            if met is not None:
-                x, limit = met
-                if limit in self._kinks:
-                    x = just_beyond(limit, x, again(x).joints, leg.h)
-                return again(x), leg.t + x, limit
+            part = cache(partial(self._part, stepper, step, at, end, drive))
+            found = first_event(self._near(at, end), lambda x: part(x).joints, step.h)  # noqa: B023
+            if found is not None:
+                x, event = found
+                if event.error is None:
+                    x = just_beyond(event, x, part(x).joints, step.h)
+                return part(x), step.t + x, event
             at = end
         return at, h, None
 
     def _near(self, at: Point, end: Point) -> list[Limit]:
-        """Limits and kinks that may be met on a leg."""
-        still = [limit.joint for limit in self._ends.resting]
-        near = [
-            limit
-            for limit in self._limits
-            if limit.joint not in still and limit.may_be_crossed(at.joints, end.joints)
-        ]
-        return near + [kink for kink in self._kinks if may_touch(kink, at.joints, end.joints)]
+        """Limits and contact events that may lie inside a step."""
+        near = [x for x in self._limits if x.may_be_crossed(at.joints, end.joints)]
+        return near + [x for x in self._contacts if may_occur(x, at.joints, end.joints)]
 
     def _part(
-        self, walk: Walk, leg: Leg, at: Point, end: Point, drive: tuple[float, ...], x: float
+        self,
+        stepper: AdaptiveStepper,
+        step: AcceptedStep,
+        at: Point,
+        end: Point,
+        drive: tuple[float, ...],
+        x: float,
     ) -> Point:
-        """Go again from `at`, where a leg began that led to `end`, a part x [s] of it."""
-        if x == leg.h:
+        """Repeat a part x [s] of an accepted step that led from `at` to `end`."""
+        if x == step.h:
             return end
-        return self._point(*walk.retake(leg.t, x, at.y, at.z, drive, at.order))
+        return self._point(*stepper.repeat(step.t, x, at.y, at.z, drive, at.order))
 
     def _point(self, y: list[float], z: list[float], order: int) -> Point:
         return Point(y, z, self._dynamics.joints(*y[:7]), order)
-
-    def _strike(self, at: Point, limit: Limit, x: float, drive: tuple[float, ...]) -> Point:
-        """Bounce off a limit or come to rest there, and count the energy that is lost."""
-        before = self._kinetic(at.y)
-        y, z = self._ends.strike(x, at.y, at.z, limit, self._driven.free(drive))
-        self._lost += before - self._kinetic(y)
-        return self._point(y, z, at.order)
-
-    def _let_go(self, at: Point, limit: Limit | None) -> Point:
-        """Let go of an end, or of none; what rests is put exactly where it does."""
-        if not self._ends.resting:
-            return at
-        leaving = () if limit is None else (limit,)
-        return self._point(*self._ends.let_go(at.y, at.z, leaving), at.order)
-
-    def _slope(self, t: float, *inputs: Any) -> tuple[float, ...]:
-        """Differentiate the state under torques that are a function, or held by ends."""
-        free = self._driven.slope(t, *inputs)
-        return self._ends.slope(inputs[: len(self._system.state)], free)
-
-    def _kinetic(self, y: list[float]) -> float:
-        size = len(self._dynamics.state)
-        return self._dynamics.energies(*y[:size], *(0.0,) * len(self._dynamics.drive))[0]

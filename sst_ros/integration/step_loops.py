@@ -10,7 +10,7 @@ from the module that `backend` writes.
 from __future__ import annotations
 
 
-def pair(t, h, y, z, d, new_y, new_z, error):
+def step_pair(t, h, y, z, d, new_y, new_z, error):
     """Advance y by two steps of h / 2 and its companion z by one of h (global Richardson).
 
     Returns the size of the local error estimate of y, relative to a tolerance of 1.
@@ -61,7 +61,7 @@ def normalise(y):
         y[i] = y[i] * factor
 
 
-def march(t, h, count, y, d, new_y):
+def step_fixed(t, h, count, y, d, new_y):
     """Advance y by `count` steps of h; the error estimates are not looked at."""
     error = vector(SIZE)
     for i in range(SIZE):
@@ -71,7 +71,7 @@ def march(t, h, count, y, d, new_y):
         normalise(new_y)
 
 
-def glide(count, h, tolerance, y, z, d, ranges, joints, sizes):
+def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
     """Go on by up to `count` periods of h, a pair of steps each; return how many were done.
 
     Stops before a period that asks for more than that: one whose error is beyond the tolerance, or
@@ -83,7 +83,7 @@ def glide(count, h, tolerance, y, z, d, ranges, joints, sizes):
     error = vector(SIZE)
     found = vector(18)
     for k in range(count):
-        size = pair(0.0, h, y, z, d, new_y, new_z, error)
+        size = step_pair(0.0, h, y, z, d, new_y, new_z, error)
         if not size <= tolerance:
             return k
         joints_of(new_y, found)

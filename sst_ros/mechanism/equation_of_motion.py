@@ -18,8 +18,8 @@ from sst_ros.mechanism.virtual_work import Mechanism, Posture
 
 
 @dataclass(frozen=True)
-class Dynamics:
-    """Dynamics at one posture and rate. Arrays are read-only.
+class EquationOfMotion:
+    """EquationOfMotion at one posture and rate. Arrays are read-only.
 
     Attributes:
         m: mass matrix M = -T1 [kg m^2], shape (3, 3).
@@ -35,7 +35,7 @@ class Dynamics:
     gamma_dot: Array
 
     @classmethod
-    def of(cls, mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike) -> Dynamics:
+    def of(cls, mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike) -> EquationOfMotion:
         """Evaluate Eqs. 63 to 92 once."""
         rate = np.array(gamma_dot, dtype=float)
         t1, t2 = virtual_work.equation_of_motion(mechanism, at, rate)

@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
 from sst_ros.mechanism.direct_kinematics import cross, rotations
+from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.state import Assembly
 
 RESIDUAL = 1e-14
 """Largest abs(r_k . t_k) of an assembly that is told to be one."""
@@ -23,26 +25,6 @@ RESIDUAL = 1e-14
 
 NEAR = 0.1
 """How near an assembly must be to the rotation that names it [rad]."""
-
-
-@dataclass(frozen=True)
-class Assembly:
-    """One way to assemble the manipulator at given actuator angles. Arrays are read-only.
-
-    Attributes:
-        rotation: R of {E} in {B}, shape (3, 3).
-        mu: angles of the passive revolute joints in (-pi, pi] [rad], shape (3,).
-        beta: angles of the passive curved prismatic joints in (-pi, pi] [rad], shape (3,).
-        det_j2: determinant of J2, zero at a parallel singularity.
-        admissible: E lies on the base triangle (Eq. 4) with 0 < beta_k <= beta_max for all legs.
-
-    """
-
-    rotation: Array
-    mu: Array
-    beta: Array
-    det_j2: float
-    admissible: bool
 
 
 @dataclass(frozen=True)
@@ -169,7 +151,8 @@ def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = No
         meant = [one for one in candidates if near is not None and _apart(one, near) < NEAR]
         if len(meant) == 1:
             return meant[0]
-        raise AmbiguousAssembly(angles, candidates)
+        orientations = quaternion_of(np.stack([one.rotation for one in candidates]))
+        raise AmbiguousAssembly(angles, candidates, orientations)
     return candidates[0]
 
 

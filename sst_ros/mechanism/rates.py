@@ -22,13 +22,12 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.direct_kinematics import cross
-from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 
 
 @dataclass(frozen=True)
-class Motion:
+class BodyRates:
     """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg.
 
     Attributes:
@@ -56,7 +55,7 @@ class Motion:
 
 def of_actuators(
     at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = (0.0, 0.0, 0.0)
-) -> Motion:
+) -> BodyRates:
     """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
     rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
@@ -73,7 +72,7 @@ def of_star(
     omega: ArrayLike,
     omega_dot: ArrayLike = (0.0, 0.0, 0.0),
     gamma: ArrayLike | None = None,
-) -> Motion:
+) -> BodyRates:
     """Everything from omega [rad/s] and omega_dot [rad/s^2] in {B}, each shape (3,).
 
     Args:
@@ -119,7 +118,7 @@ def _legs(
 
 def _motion(
     r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, joints: tuple[Array, ...]
-) -> Motion:
+) -> BodyRates:
     gamma_dot, mu_dot, _, gamma_ddot, mu_ddot, _ = joints
     zero = np.zeros(3)
     omega_a = np.stack([zero, zero, gamma_dot], axis=1)
@@ -136,21 +135,4 @@ def _motion(
     arrays = (omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
     for array in arrays:
         array.setflags(write=False)
-    return Motion(*arrays)
-
-
-def body_rates(
-    geometry: Geometry, quaternion: Array, gamma_dot: Array, mu_dot: Array, beta_dot: Array
-) -> Array:
-    """Compute W in {E} [rad/s], shape (..., 3), from the rates of the joints [rad/s], (..., 3).
-
-    It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
-    that could be singular; the mean of the three is taken. Where the orientation is nan, it is.
-    """
-    known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
-    rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
-    t, w = geometry.e, geometry.w @ rotation  # rows in {E}
-    r = np.cross(t, w)
-    r /= np.linalg.norm(r, axis=-1)[..., None]
-    of_legs = w * gamma_dot[..., None] - r * mu_dot[..., None] - t * beta_dot[..., None]
-    return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
+    return BodyRates(*arrays)

@@ -10,6 +10,7 @@ import sys
 from rclpy.node import Node
 
 from sst_ros.integration import code_cache, codegen
+from sst_ros.integration.cache_folder import cache_folder
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene
 
@@ -24,7 +25,7 @@ def use(node: Node, scene: Scene, given: SimulatorParameters) -> bool:
         node.get_logger().info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
         return False
     if code_cache.is_there(scene, given.integrator):
-        node.get_logger().info(f"machine code from {codegen.cache_folder()}")
+        node.get_logger().info(f"machine code from {cache_folder()}")
         return True
     maker = subprocess.Popen(
         [sys.executable, "-m", "sst_ros", "compile", given.scene, "--integrator", given.integrator],

@@ -9,7 +9,6 @@ import numpy as np
 
 from sst_ros.control.reference_motions import MotionSamples
 from sst_ros.errors import InputError, Problem
-from sst_ros.recording.recording import read
 
 
 def samples(bag: str | Path) -> MotionSamples:
@@ -19,6 +18,8 @@ def samples(bag: str | Path) -> MotionSamples:
         InputError: it is no recording of a run, or it has fewer than two such samples.
 
     """
+    from sst_ros.recording.recording import read  # needs rosbags, which other motions do not
+
     recording = read(Path(bag))
     whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
     if len(whole) < 2:

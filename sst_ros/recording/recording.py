@@ -6,13 +6,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sst_ros.errors import InputError
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording import signals
 from sst_ros.recording.bag_reader import refused
+from sst_ros.recording.body_rates import body_rates
+from sst_ros.recording.export import table_of
 from sst_ros.recording.signals import Series, Signals
 from sst_ros.recording.time_series import NANOSECONDS, Integers, aligned, places, usual
 from sst_ros.recording.topic_tables import (
@@ -30,6 +33,11 @@ from sst_ros.recording.topic_tables import (
     TICKS,
 )
 from sst_ros.scene.scene import Scene
+from sst_ros.torque import TorqueTable
+from sst_ros.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["ACTUATED", "JOINTS", "KINDS", "MOMENTS", "Commands", "Recording", "Ticks", "read"]
 
@@ -155,6 +163,45 @@ class Recording:
     def seconds(self) -> Array:
         """Time of each sample since the start of the run [s], shape (n,)."""
         return np.asarray(self.time_ns / NANOSECONDS)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The run as a `Trajectory`; samples whose orientation was lost are left out.
+
+        Between samples `Trajectory.at` integrates under the recorded torques. Its error estimate,
+        method and message are those that the simulator reported.
+        """
+        known = np.isfinite(self.quaternion).all(axis=1)
+        rates = (self.gamma_dot, self.mu_dot, self.beta_dot)
+        body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
+        joints = np.hstack([self.gamma, self.mu, self.beta, *rates])
+        reported = self.diagnostics
+        try:
+            error_estimate = float(reported.get("error_estimate", "nan"))
+        except ValueError:
+            error_estimate = np.nan
+        fault = reported.get("fault", "")
+        return Trajectory(
+            self.scene, self.seconds[known], self.quaternion[known], body_rate[known],
+            self.effort[known],
+            joints=joints[known],
+            status=1 if fault else 0,
+            message=fault or reported.get("phase", "recorded"),
+            method=reported.get("integrator", ""),
+            error_estimate=error_estimate,
+            law=None if self.ticks.gaps else TorqueTable(
+                self.ticks.start_ns / NANOSECONDS, self.ticks.torque
+            ),
+        )  # fmt: skip
+
+    def table(self, name: str = "samples") -> pd.DataFrame:
+        """Return a table as pandas: samples, ticks, commands, commands_stamped, external_moment.
+
+        Raises:
+            InputError: the recording has no such table, or pandas is missing.
+
+        """
+        return table_of(self.signals, name)
 
 
 def read(path: str | Path, *, damaged: bool = False) -> Recording:

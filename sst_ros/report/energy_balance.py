@@ -12,7 +12,7 @@ from sst_ros.dynamics.expression import trace
 from sst_ros.dynamics.kernel import Model
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
-from sst_ros.integration.ode import working
+from sst_ros.integration.ode import ode_with_work
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
@@ -34,9 +34,6 @@ def residual(recording: Recording, missing: list[str]) -> Array | None:
 
     """
     moment = recording.scene.moment
-    if recording.scene.stroke.at_end == "impact":
-        missing.append("impacts take energy that no topic tells: no energy residual")
-        return None
     if moment and moment.topic and recording.ticks.moment is None:
         missing.append("the moment on the star is not recorded: no energy residual")
         return None
@@ -71,7 +68,7 @@ class _Workers:
         self._course = course
         self._energy = trace(lambda *state: (_stored(dynamics.model, state),), dynamics.state)
         self._compiled = compiled and codegen.numba_version() is not None
-        system = working(dynamics)
+        system = ode_with_work(dynamics)
         size, drive = len(system.state), len(system.drive)
         self._module = module(system.program, dynamics, size, drive, compiled=self._compiled)
         self._time = recording.time_ns

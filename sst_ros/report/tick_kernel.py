@@ -2,7 +2,7 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
 """Loops of the report over many ticks, as text: `motion` puts them behind a scene's functions.
 
-Like `integration.loops`, whose `march` they call, they run as plain Python and under numba.
+They call `step_fixed` of `integration.step_loops`; like it they run plain and under numba.
 """
 # ruff: noqa: F821
 
@@ -20,7 +20,7 @@ def ride(times, lengths, counts, drives, ends, y, reached):
     for k in range(len(times)):
         h = lengths[k] / counts[k]
         for i in range(counts[k]):
-            march(times[k] + i * h, h, 1, y, drives[k], y)
+            step_fixed(times[k] + i * h, h, 1, y, drives[k], y)
             if len(ends):
                 joints_of(y, joints)
                 for end in ends:
@@ -43,5 +43,5 @@ def work_done(states, first, lengths, drives, work):
             y[i] = states[k][i]
         y[SIZE - 1] = 0.0
         for row in range(first[k], first[k + 1]):
-            march(0.0, lengths[row], 1, y, drives[row], y)
+            step_fixed(0.0, lengths[row], 1, y, drives[row], y)
         work[k] = y[SIZE - 1]

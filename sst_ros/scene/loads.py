@@ -141,34 +141,55 @@ class Actuators(Section):
 
 @dataclass(frozen=True)
 class Stroke(Section):
-    """The range of the actuators, 0 < gamma_k < arc P_k P_k+1."""
+    """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
+
+    Elastic (compliant) stops give the torque stiffness depth (1 + damping rate inwards), never a
+    pull. Their damping is given as such, or by the restitution at one impact rate.
+    """
 
     at_end: str = choice(
         "what happens at an end of the stroke",
-        ("stop", "ignore", "elastic", "impact"),
+        ("stop", "ignore", "elastic"),
         default="stop",
+        replaced=(
+            ("impact", "rigid impacts are replaced by elastic with restitution and impact_rate"),
+        ),
     )
     stiffness: float | None = number(
-        "stiffness of elastic ends", "N m/rad", default=None, above=0.0
+        "stiffness of elastic stops", "N m/rad", default=None, above=0.0
     )
     damping: float = number(
-        "damping of elastic ends: torque = stiffness depth (1 + damping rate inwards)",
+        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)",
         "s/rad",
         default=0.0,
         least=0.0,
     )
     restitution: float | None = number(
-        "rate after an impact / rate before", "1", default=None, least=0.0, most=1.0
+        "rate after an impact / rate before, at impact_rate; in place of damping",
+        "1",
+        default=None,
+        least=0.01,
+        most=1.0,
+    )
+    impact_rate: float | None = number(
+        "rate of the impacts that have this restitution", "rad/s", default=None, above=0.0
     )
 
     def check(self) -> Iterator[Problem]:
         """Refuse coefficients of another kind of end, and a kind without its own."""
-        for name, kind in (("stiffness", "elastic"), ("restitution", "impact")):
-            value = getattr(self, name)
-            if (value is not None) != (self.at_end == kind):
-                yield Problem(name, value, f"is given with at_end: {kind}, and only there")
-        if self.damping and self.at_end != "elastic":
-            yield Problem("damping", self.damping, "is given with at_end: elastic, and only there")
+        only = "is given with at_end: elastic, and only there"
+        elastic = self.at_end == "elastic"
+        if (self.stiffness is not None) != elastic:
+            yield Problem("stiffness", self.stiffness, only)
+        for name in ("damping", "restitution", "impact_rate"):
+            if getattr(self, name) and not elastic:
+                yield Problem(name, getattr(self, name), only)
+        if (self.restitution is None) != (self.impact_rate is None):
+            yield Problem(
+                "impact_rate", self.impact_rate, "is given with restitution, both or none"
+            )
+        if self.damping and self.restitution is not None:
+            yield Problem("damping", self.damping, "give either damping or restitution")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star, Vector
 from sst_ros.scene.loads import (
     Actuators,
@@ -197,6 +197,7 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
         return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())} ({error})"
+        allowed += suggestion(str(name_or_path), names())
         raise InputError("scene", [Problem("scene", str(name_or_path), allowed)]) from None
 
 

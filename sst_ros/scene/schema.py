@@ -29,8 +29,13 @@ class Spec:
     least: float = -math.inf
     most: float = math.inf
     choices: tuple[str, ...] = ()
+    replaced: tuple[tuple[str, str], ...] = ()
     section: type[Section] | None = None
     lengths: tuple[int, ...] = ()
+
+    def refusal(self, value: object) -> str:
+        """Say what is allowed, and what replaces a choice of an older version."""
+        return "; ".join([self.allowed(), *(new for old, new in self.replaced if old == value)])
 
     def allowed(self) -> str:
         """Say in words what is allowed."""
@@ -82,9 +87,11 @@ def text(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
     return _declare(Spec("text", doc), default)
 
 
-def choice(doc: str, choices: Sequence[str], *, default: Any = dataclasses.MISSING) -> Any:
+def choice(
+    doc: str, choices: Sequence[str], *, default: Any = dataclasses.MISSING, **spec: Any
+) -> Any:
     """Declare one word out of a list."""
-    return _declare(Spec("choice", doc, choices=tuple(choices)), default)
+    return _declare(Spec("choice", doc, choices=tuple(choices), **spec), default)
 
 
 def section(doc: str, cls: type[Section], *, default: Any = dataclasses.MISSING) -> Any:
@@ -133,7 +140,7 @@ class Section:
             try:
                 object.__setattr__(self, name, accept(spec, value))
             except ValueError:
-                problems.append(Problem(name, value, spec.allowed()))
+                problems.append(Problem(name, value, spec.refusal(value)))
         if not problems:
             problems = [problem for check in self.checks() for problem in check()]
         if problems:

@@ -156,7 +156,7 @@ def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> 
     try:
         return accept(spec, _typed(spec, node, value))
     except ValueError:
-        problems.append(Problem(key, value, spec.allowed(), _line(node)))
+        problems.append(Problem(key, value, spec.refusal(value), _line(node)))
         return None
 
 

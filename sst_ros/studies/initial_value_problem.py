@@ -9,7 +9,6 @@ kinks; there `Simulation`, which locates them, is the reference.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -19,14 +18,14 @@ from numpy.typing import NDArray
 from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, RunStopped
-from sst_ros.integration.compiled_method import Machine
-from sst_ros.integration.ode import System
+from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation, Torque
+from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, Torque
 
 INTERVALS = 20
 """Solutions are compared at this many instants or more."""
@@ -71,7 +70,7 @@ class InitialValueProblem:
         self.scene = scene
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
-        self.system = System(self.dynamics, scene.torque, work=True)
+        self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)
         self.torque: Torque = sine(scene.torque) if scene.torque else (0.0, 0.0, 0.0)
@@ -129,7 +128,7 @@ class InitialValueProblem:
         closure = float(np.abs(np.sum(r * t, axis=1)).max())
         return float(after - before - y[-1]), closure
 
-    def fixed_steps(self, machine: Machine, steps: int) -> Array:
+    def fixed_steps(self, machine: CompiledMethod, steps: int) -> Array:
         """States at the instants with `steps` steps an interval; nan after the last finite one."""
         result = np.full((self.count + 1, len(self.start)), np.nan)
         y = list(self.start)
@@ -137,7 +136,7 @@ class InitialValueProblem:
         h = self.interval / steps
         with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
             for k in range(self.count):
-                y = machine.march(k * self.interval, h, steps, y, self.drive)
+                y = machine.step_fixed(k * self.interval, h, steps, y, self.drive)
                 result[k + 1] = y
         return result
 
@@ -148,7 +147,9 @@ class InitialValueProblem:
             RunStopped: a limit is met.
 
         """
-        simulation = Simulation(self.scene, method, tolerance=tolerance)
+        simulation = Simulation(
+            self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
+        )
         rows = [np.array(self.start)]
         padding = (math.nan,) * (len(self.start) - 7)
         for k in range(self.count):
@@ -162,17 +163,13 @@ class InitialValueProblem:
 
     def _horizon(self) -> tuple[int, int, str]:
         whole = self.scene.duration or WHOLE_RUN_S
-        stopping = self.scene
-        if stopping.stroke.at_end == "impact":
-            stroke = dataclasses.replace(stopping.stroke, at_end="stop", restitution=None)
-            stopping = dataclasses.replace(stopping, stroke=stroke)
-        simulation, ends = Simulation(stopping, tolerance=1e-9), ""
+        simulation = Simulation(self.scene, tolerance=1e-9, step_budget=WHOLE_MOTION_BUDGET)
+        ends = ""
         try:
             for _ in range(100):
                 simulation.step(self.torque, round(whole / 100 * NANOSECONDS))
         except RunStopped as stopped:
-            what = "impact" if stopping is not self.scene else "stop"
-            ends = f"{what} at {stopped.time:.6f} s, {stopped.reason}"
+            ends = f"stop at {stopped.time:.6f} s, {stopped.reason}"
             whole = stopped.time
         if whole * NANOSECONDS < 1000 * INTERVALS:
             allowed = f"the run is over before it can be studied: {ends or f'{whole} s'}"

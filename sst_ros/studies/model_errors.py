@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Model errors of a controller: a wrong model, or a channel that changes its signals."""
+"""What a controller may have wrong: its model of the plant, or what it sees and when it acts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
 
 DELAYS = (1, 2, 3, 4, 5)
-"""Delays of commands in samples."""
+"""Samples by which commands come late."""
 
 COUNTS = (65536, 16384)
 """Steps of an encoder per turn of the joint."""
@@ -31,10 +31,10 @@ def _same(scene: Scene) -> Scene:
 
 @dataclass(frozen=True)
 class ModelError:
-    """One error of a controller.
+    """One thing that a controller has wrong.
 
     Attributes:
-        name: its name in tables.
+        name: what it is called in tables.
         model: the controller's model, of the plant's scene.
         channel: what stands between the plant and the controller.
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Array
 from sst_ros.studies.high_precision import EXTENDED, HighPrecisionDop853, LongArray
@@ -58,7 +58,7 @@ def solve_reference(
         )
         how = "Simulation, dop853, tolerance 1e-14"
         return ReferenceSolution(fine, _own(problem, rough, fine), how)
-    machine = Machine(problem.system, DOP853, compiled=compiled)
+    machine = CompiledMethod(problem.system, DOP853, compiled=compiled)
     best, solution = _finest(problem, machine)
     solver = HighPrecisionDop853(problem.system.program, kind, problem.drive)
     began = time.perf_counter()
@@ -78,7 +78,7 @@ def solve_reference(
     return ReferenceSolution(fine, _own(problem, rough, fine), how)
 
 
-def _finest(problem: InitialValueProblem, machine: Machine) -> tuple[int, Array]:
+def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int, Array]:
     """Halve the step until rounding dominates; return steps an interval, and the solution."""
     found: list[tuple[float, int, Array]] = []
     before = problem.fixed_steps(machine, 1)

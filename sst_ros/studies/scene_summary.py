@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from sst_ros.dynamics.limits import limits_of
+from sst_ros.dynamics.loads import damping_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
@@ -84,10 +85,11 @@ def _right_hand_side(scene: Scene, dynamics: Dynamics) -> list[str]:
 
 def _ends(scene: Scene) -> Iterator[tuple[str, str]]:
     stroke, workspace = scene.stroke, scene.workspace
-    more = {
-        "elastic": f", {stroke.stiffness} N m/rad, damping {stroke.damping:g} s/rad",
-        "impact": f", restitution {stroke.restitution}",
-    }.get(stroke.at_end, "")
+    more = ""
+    if stroke.at_end == "elastic":
+        more = f", {stroke.stiffness} N m/rad, damping {damping_of(stroke):.3g} s/rad"
+    if stroke.restitution is not None:
+        more += f" (restitution {stroke.restitution:g} at {stroke.impact_rate:g} rad/s)"
     yield "stroke", f"0 < gamma_k < arc: {stroke.at_end}{more}"
     yield "workspace", f"0 < beta_k <= {workspace.beta_max_deg:g} deg: {workspace.at_edge}"
     yield "watched", f"{len(list(limits_of(scene, Geometry.of(scene))))} ends between steps"

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.integration.adaptive_stepper import Mark, Walk
-from sst_ros.integration.compiled_method import Machine, Method
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper, StepperCheckpoint
+from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 from sst_ros.studies.initial_value_problem import InitialValueProblem
@@ -62,7 +62,7 @@ def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[S
 
 
 def _fixed(problem: InitialValueProblem, method: Method, compiled: bool) -> Iterator[SolverSetting]:
-    machine = Machine(problem.system, method, compiled=compiled)
+    machine = CompiledMethod(problem.system, method, compiled=compiled)
     for steps in _STEPS_PER_INTERVAL:
         count, h = steps * problem.count, problem.interval / steps
 
@@ -70,7 +70,7 @@ def _fixed(problem: InitialValueProblem, method: Method, compiled: bool) -> Iter
             return problem.fixed_steps(machine, steps), len(method.a) * count
 
         def timed(count: int = count, h: float = h) -> None:
-            machine.march(0.0, h, count, list(problem.start), problem.drive)
+            machine.step_fixed(0.0, h, count, list(problem.start), problem.drive)
 
         yield SolverSetting(method.name, FIXED, h, solve, timed)
 
@@ -79,24 +79,28 @@ def _adaptive(
     problem: InitialValueProblem, method: Method, compiled: bool
 ) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
-        stepper = Walk(problem.system, method.name, tolerance, compiled=compiled)
+        stepper = AdaptiveStepper(problem.system, method.name, tolerance, compiled=compiled)
 
-        def run(stepper: Walk = stepper, fresh: Mark = stepper.mark()) -> Array:  # noqa: B008
-            stepper.go_back(fresh)
+        def run(
+            stepper: AdaptiveStepper = stepper,
+            fresh: StepperCheckpoint = stepper.checkpoint(),  # noqa: B008
+        ) -> Array:
+            stepper.restore(fresh)
             rows = [list(problem.start)]
             y, coarse, order = list(problem.start), list(problem.start), method.order
             for k in range(problem.count):
                 begin, end = k * problem.interval, (k + 1) * problem.interval
-                for step in stepper.legs(begin, end, y, coarse, problem.drive, order):
+                for step in stepper.accepted_steps(begin, end, y, coarse, problem.drive, order):
                     y, coarse, order = step.y, step.z, step.order
                 rows.append(y)
             return np.array(rows)
 
-        def solve(stepper: Walk = stepper, run: Callable[[], Array] = run) -> tuple[Array, int]:
-            before = stepper.attempts
+        def solve(
+            stepper: AdaptiveStepper = stepper, run: Callable[[], Array] = run
+        ) -> tuple[Array, int]:
+            before = stepper.budget.spent
             states = run()
-            # Two half steps and a whole one for the error estimate.
-            return states, 3 * len(method.a) * (stepper.attempts - before)
+            return states, stepper.budget.spent - before
 
         yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import SstError
-from sst_ros.integration.adaptive_stepper import Walk
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 
 LONGEST_STEP = 1e-2
 """Longest control period that is recommended [s]."""
@@ -58,12 +58,12 @@ class StepAdvice:
 def step_advice(scene: Scene) -> StepAdvice:
     """Recommend a method and a step for a scene."""
     try:
-        simulation = Simulation(scene)
+        simulation = Simulation(scene, step_budget=WHOLE_MOTION_BUDGET)
     except SstError as error:
         return StepAdvice(f"none, the scene cannot start: {error}")
     state, dynamics = simulation.state, simulation.dynamics
     lagged = (0.0,) * (len(dynamics.state) - 7)
-    stepper = Walk(System(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
+    stepper = AdaptiveStepper(ODE(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
     y = (*state.quaternion, *state.body_rate, *lagged)
     eigenvalues = stepper.spectrum(0.0, y, (0.0,) * len(dynamics.drive))
     fastest = float(np.abs(eigenvalues).max())

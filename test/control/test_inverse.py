@@ -21,7 +21,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import singularities, virtual_work, workspace
-from sst_ros.mechanism.equation_of_motion import Dynamics as PaperDynamics
+from sst_ros.mechanism.equation_of_motion import EquationOfMotion
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Moment
@@ -70,7 +70,7 @@ def test_a_moment_from_a_topic_counts(sample, acceleration):
 def test_torques_are_those_of_the_paper(sample, gamma_ddot):
     scene = dataclasses.replace(sample.scene, moment=Moment(topic=True))
     at, moment = sample.posture, tuple(sample.moment.tolist())
-    paper = PaperDynamics.of(sample.mechanism, at, sample.gamma_dot)
+    paper = EquationOfMotion.of(sample.mechanism, at, sample.gamma_dot)
     expected = paper.torque(gamma_ddot, moment)
     omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, sample.gamma_dot).omega_dot
     body = tuple((sample.rotation.T @ omega_dot).tolist())

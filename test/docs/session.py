@@ -14,7 +14,7 @@ from pathlib import Path
 from docs.blocks import ROOT, commands
 
 from docs import installed
-from sst_ros.__main__ import NODES
+from sst_ros.cli.main import NODES
 
 PYTHONS = (".venv/bin/python", "python", "python3")
 LIMIT_S = 60.0

@@ -17,7 +17,7 @@ GOOD = (
     "ros2 bag record $(cat $(ros2 pkg prefix --share sst_ros)/config/topics.txt)",
     "ros2 launch sst_ros simulate.launch.py play:=true",
     "make demo PYTHON=python3.12",
-    "pip install 'sst_ros[export,fast]'",
+    "pip install 'sst_ros[record,fast]'",
 )
 BAD = (
     "ros2 run sst_ros simulater",
@@ -35,7 +35,7 @@ BAD = (
     "ros2 launch sst_ros simulate.launch.py plays:=true",
     "ros2 launch sst_ros simulation.launch.py",
     "make demos",
-    "pip install 'sst_ros[exports]'",
+    "pip install 'sst_ros[export]'",
 )
 
 

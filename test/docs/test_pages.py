@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
 
-from sst_ros.__main__ import NODES, parser
+from sst_ros.cli.main import NODES, parser
 
 PAGES = pages()
 LONG = ("batch", "fast", "follow", "judge", "lockstep", "look", "many", "plot", "record")

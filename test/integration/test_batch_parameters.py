@@ -13,10 +13,10 @@ from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.initial_states import NO_RATE
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import singularities, workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Initial, Link, Spring
@@ -123,9 +123,9 @@ def test_a_row_has_the_bits_of_steps_of_its_scene(manipulators, samples, result)
     gamma, gamma_dot, torque = starts(samples)
     y, _ = manipulators.start(gamma, gamma_dot)
     for n in [n for n, text in enumerate(result.fault) if not text][:4]:
-        system = System(Dynamics.of(manipulators.scenario(n)))
-        machine = Machine(system, DORMAND_PRINCE, compiled=False)
-        ended = machine.march(0.0, 2e-3, 100, y[:, n].tolist(), torque[n].tolist())
+        system = ODE(Dynamics.of(manipulators.scenario(n)))
+        machine = CompiledMethod(system, DORMAND_PRINCE, compiled=False)
+        ended = machine.step_fixed(0.0, 2e-3, 100, y[:, n].tolist(), torque[n].tolist())
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
 
 

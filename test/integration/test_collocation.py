@@ -16,7 +16,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.gauss import Collocation, tables
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.integration.sine_source import flat_sin
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
@@ -59,7 +59,7 @@ def apart(y, truth):
     [(8, 3, 5, 1e-6), (8, 6, 6, 1e-9), (12, 3, 6, 1e-9), (12, 5, 8, 1e-12)],
 )
 def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, error):
-    system = System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
+    system = ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
     method = Collocation(system, nodes, compiled=False)
     flight = method.march(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
     assert apart(flight.y, truth) < error
@@ -71,7 +71,7 @@ def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, e
 @pytest.mark.parametrize(("nodes", "steps"), [(2, 128), (3, 48), (4, 24)])
 def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
     """Iterated to the end. Eight nodes come to rounding before their limit."""
-    method = Collocation(System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
+    method = Collocation(ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
     coarse, fine = (
         apart(method.march(0.0, 1.0 / n, n, STATE, iterations=20).y, truth)
         for n in (steps, 2 * steps)
@@ -83,7 +83,7 @@ def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
 @pytest.fixture(scope="module")
 def methods(tmp_path_factory):
     """The same method compiled and plain."""
-    system = System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
+    system = ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
         compiled = Collocation(system, 4)
@@ -111,7 +111,7 @@ def test_a_course_is_flown_again_and_again_and_from_elsewhere(truth, methods, wa
 @pytest.mark.parametrize("way", ["compiled", "plain"])
 def test_what_cannot_be_flown_is_refused(methods, way):
     with pytest.raises(InputError, match="nodes"):
-        Collocation(System(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), 0)
+        Collocation(ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), 0)
     method = methods[way]
     with pytest.raises(InputError, match=r"count(.|\n)*iterations"):
         method.course(0.0, 0.1, 0, STATE, iterations=0)
@@ -132,15 +132,15 @@ def test_the_flat_sine_is_the_sine(scale):
 
 def test_every_term_lag_and_a_drive_are_carried_along():
     """Against many steps of a method that is tested by itself."""
-    from sst_ros.integration.compiled_method import Machine
+    from sst_ros.integration.compiled_method import CompiledMethod
     from sst_ros.integration.methods import DOP853
 
     scene = loaded()
-    system = System(Dynamics.of(scene), work=True)
+    system = ODE(Dynamics.of(scene), work=True)
     state = Simulation(scene).state
     y = [*state.quaternion, *state.body_rate, *(0.0,) * (len(system.state) - 7)]
     drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]
-    wanted = Machine(system, DOP853, compiled=False).march(0.0, 2.5e-4, 80, y, drive)
+    wanted = CompiledMethod(system, DOP853, compiled=False).step_fixed(0.0, 2.5e-4, 80, y, drive)
     method = Collocation(system, compiled=False)
     found = method.march(0.0, 2e-3, 10, y, drive, iterations=9).y
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)

@@ -13,14 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from integration.paper_form import PaperForm
 from loaded_scenes import REST, apart
 from models import inertia_of
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
-from sst_ros.integration.propagator import Journey
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
@@ -114,29 +111,6 @@ def admissible():
     return np.array(state.joints.gamma), rotation_matrix(state.quaternion)
 
 
-def test_impacts_come_when_the_papers_equations_have_them(monkeypatch):
-    scene = load("impacts")
-    struck, strike = [], Journey._strike
-
-    def recorded(self, at, limit, x, drive):
-        struck.append((self._walk.origin + x, limit.leg))
-        return strike(self, at, limit, x, drive)
-
-    monkeypatch.setattr(Journey, "_strike", recorded)
-    simulation = Simulation(scene, "dop853", tolerance=1e-14)
-    while len(struck) < 2:
-        simulation.step(sine(scene.torque), 10 * MILLISECOND)
-    paper = PaperForm(scene, sine(scene.torque))
-    ends = [(leg, upper, paper.end(leg, upper)) for leg in range(3) for upper in (False, True)]
-    t, y = 0.0, paper.start
-    for time, leg in struck:
-        t, y = paper.first_zero(lambda t, y: min(end(t, y) for *_, end in ends), t, y, t + 0.95)
-        hit = min(ends, key=lambda end: end[2](t, y))[0]
-        assert hit == leg
-        assert abs(time - t) < 1e-12
-        y = paper.struck(y, leg, scene.stroke.restitution)
-
-
 def contact_time(stiffness):
     """How long gamma_1 is beyond its end, by nanoseconds, and the mass that it meets."""
     scene = replace(
@@ -194,7 +168,10 @@ def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
         friction=JointFriction(gamma=Friction(viscous=0.5)),
         initial=Initial(gamma=(0.05, 0.5, 0.5)),
     )
-    simulation, truth = Simulation(scene, tolerance=1e-9), Simulation(scene, "rodas4")
+    simulation, truth = (
+        Simulation(scene, tolerance=1e-9),
+        Simulation(scene, "rodas4", step_budget=10**6),
+    )
     pushes = [(-2.0, 0.0, 0.0)] * 60 + [(2.0, 0.0, 0.0)] * 40 + [(-4.0, 0.0, 0.0)] * 60
     for push in pushes:
         simulation.step(push, 10 * MILLISECOND)

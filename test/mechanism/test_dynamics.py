@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mechanism.closed_chains import random_geometry, random_mechanism, random_pose
 
 from sst_ros.mechanism import continuation, rates, virtual_work
-from sst_ros.mechanism.equation_of_motion import Dynamics
+from sst_ros.mechanism.equation_of_motion import EquationOfMotion
 
 
 @settings(max_examples=80, deadline=None)
@@ -20,7 +20,7 @@ def test_energy_momentum_and_both_dynamics_agree(seed):
     gamma, rotation = random_pose(rng, geometry)
     rate, torque, moment = rng.normal(size=(3, 3))
     at = virtual_work.posture(geometry, gamma, rotation)
-    found = Dynamics.of(mechanism, at, rate)
+    found = EquationOfMotion.of(mechanism, at, rate)
     assert np.linalg.eigvalsh(found.m)[0] > 0
     # Kinetic energy of the seven links, one by one.
     motion = rates.of_actuators(at, rate)
@@ -51,14 +51,14 @@ def test_power_is_the_rate_of_kinetic_energy(seed):
     gamma, rotation = random_pose(rng, geometry, least=0.3)
     rate, torque, moment = rng.normal(size=(3, 3))
     at = virtual_work.posture(geometry, gamma, rotation)
-    here = Dynamics.of(mechanism, at, rate)
+    here = EquationOfMotion.of(mechanism, at, rate)
     acceleration = here.acceleration(torque, moment)
 
     def energy(h):
         point = gamma + h * rate + h * h / 2 * acceleration
         moved = continuation.advance(geometry, rotation, gamma, point)
         posture = virtual_work.posture(geometry, point, moved)
-        return Dynamics.of(mechanism, posture, rate + h * acceleration).kinetic_energy
+        return EquationOfMotion.of(mechanism, posture, rate + h * acceleration).kinetic_energy
 
     h = 1e-4  # fourth order: truncation below 1e-8 for rates of some 100 /s
     slope = (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+import sst_ros
 from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
@@ -260,3 +261,19 @@ def test_a_recording_is_read_in_one_pass(tmp_path, bags, example2, monkeypatch):
     run = recording.read(bags.write(tmp_path / "bag", example2))
     assert set(run.signals.tables) == {"samples", "ticks", "commands"} and run.ticks.period_ns
     assert count == 1
+
+
+def test_a_recording_is_a_trajectory_and_tables(tmp_path, bags, example2):
+    pytest.importorskip("pandas")
+    run = sst_ros.read_bag(bags.write(tmp_path / "bag", example2))
+    motion = run.trajectory
+    assert isinstance(run, sst_ros.Recording) and isinstance(motion, sst_ros.Trajectory)
+    assert np.array_equal(motion.gamma, run.gamma) and np.array_equal(motion.torque, run.effort)
+    assert motion.success and motion.error_estimate == 1e-12 and motion.method == "dopri5"
+    simulation = sst_ros.Simulation(run.scene)
+    for tick in range(151):
+        simulation.step(tuple(run.ticks.torque[tick].tolist()), 1_000_000)
+    between = motion.at(0.151)  # between two samples, in the middle of a held torque
+    assert between.gamma == pytest.approx(simulation.state.joints.gamma, abs=1e-12)
+    table = run.table("ticks")
+    assert np.array_equal(table["tau_1_N_m"], run.ticks.torque[:, 0]) and table.index[0] == 0

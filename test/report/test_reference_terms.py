@@ -10,7 +10,7 @@ import pytest
 from sst_ros.recording import recording
 from sst_ros.report import formulation, reference, summary
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.loads import Actuators, Friction, Gravity, Initial, JointFriction, Moment, Spring
+from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Moment, Spring
 
 EXAMPLE2 = scene.load("example2")
 
@@ -72,19 +72,6 @@ def test_a_lagging_run_begins_again_from_the_efforts_of_a_sample(recorded, bags)
     integration = reference.integration(run)
     assert integration.restarts_ns == (40_000_000,)
     assert integration.compared == 50 and np.nanmax(integration.error.gamma) < 1e-9
-
-
-def test_after_an_impact_the_reference_begins_again_and_says_so(recorded):
-    bouncing = scene.load("impacts")
-    near = Initial(gamma=(1.5, 0.9, 0.9), gamma_dot=(2.0, 1.0, 1.0))
-    integration, ideal, notes = judged(recorded(replace(bouncing, initial=near)))
-    assert len(integration.restarts_ns) == 1
-    assert integration.compared == 50 and np.nanmax(integration.error.gamma) < 1e-9
-    assert "1 impacts: the reference begins again after each" in notes
-    assert "1 samples could not be compared" in notes and "torques are missing" not in notes
-    hit = integration.restarts_ns[0] // 2_000_000
-    assert np.isfinite(ideal.error.gamma[: hit - 1]).all()
-    assert np.isnan(ideal.error.gamma[hit:]).all()
 
 
 def moved(bags, value, named=True):

@@ -6,9 +6,9 @@ import re
 import pytest
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.report import states
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
@@ -28,9 +28,9 @@ def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():
 def test_the_advised_steps_of_other_scenes_resolve_their_motion(name):
     scene = load(name)
     step = float(re.match(r"dopri5 with steps of (\S+) s or less", step_advice(scene).text)[1])
-    system = System(Dynamics.of(scene))
-    machine = Machine(system, DORMAND_PRINCE, compiled=False)
+    system = ODE(Dynamics.of(scene))
+    machine = CompiledMethod(system, DORMAND_PRINCE, compiled=False)
     start = list(states.initial(scene))
     drive = [0.0] * len(system.drive)
-    whole, half = (machine.march(0.0, step / n, n * 20, start, drive) for n in (1, 2))
+    whole, half = (machine.step_fixed(0.0, step / n, n * 20, start, drive) for n in (1, 2))
     assert max(abs(a - b) for a, b in zip(whole, half, strict=True)) < 1e-4

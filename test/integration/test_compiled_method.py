@@ -16,9 +16,9 @@ from sst_ros.dynamics.expression import trace, with_jacobian
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
-from sst_ros.integration.ode import System
+from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
@@ -33,7 +33,7 @@ def start(scene, size):
 
 
 def system_of(scene, torque=None, work=False):
-    return System(Dynamics.of(scene), torque, work=work)
+    return ODE(Dynamics.of(scene), torque, work=work)
 
 
 def both(scene, method, cache, monkeypatch):
@@ -43,11 +43,11 @@ def both(scene, method, cache, monkeypatch):
     y, drive = start(scene, len(system.state)), (*DRIVE, *MOMENT)[: len(system.drive)]
     results = []
     for by_numba in (False, True):
-        machine = Machine(system, method, compiled=by_numba)
+        machine = CompiledMethod(system, method, compiled=by_numba)
         assert machine.compiled == by_numba
-        first = machine.pair(0.0, 1e-3, y, y, drive)
-        second = machine.pair(1e-3, 2e-3, first[0], first[1], drive)
-        results.append((first, second, machine.march(0.0, 1e-3, 200, y, drive)))
+        first = machine.step_pair(0.0, 1e-3, y, y, drive)
+        second = machine.step_pair(1e-3, 2e-3, first[0], first[1], drive)
+        results.append((first, second, machine.step_fixed(0.0, 1e-3, 200, y, drive)))
     return results
 
 
@@ -61,7 +61,7 @@ def test_numba_gives_the_bits_of_plain_python(tmp_path, monkeypatch):
     assert max(map(abs, plain[2])) > 0.1
 
 
-class Top(System):
+class Top(ODE):
     """A free rigid body: as small as a system with a quaternion can be."""
 
     @property
@@ -84,8 +84,8 @@ def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method(tmp_path, 
     y = [0.0, 0.6, 0.0, 0.8, 1.0, -2.0, 30.0]
     ends = []
     for by_numba in (False, True):
-        machine = Machine(Top(Dynamics.of(EXAMPLE2)), RODAS4, compiled=by_numba)
-        ends.append(machine.pair(0.0, 0.01, y, y, DRIVE))
+        machine = CompiledMethod(Top(Dynamics.of(EXAMPLE2)), RODAS4, compiled=by_numba)
+        ends.append(machine.step_pair(0.0, 0.01, y, y, DRIVE))
     assert ends[0] == ends[1]
     assert math.dist(ends[0][0], y) > 0.1
 
@@ -114,8 +114,8 @@ def truth_of(scene, span, torque):
     """DOP853 in steps that err below rounding, for two lengths of them agree."""
     system = system_of(scene, torque)
     y, drive = start(scene, 7), () if torque else (1000.0, -500.0, 700.0)
-    machine = Machine(system, DOP853, compiled=False)
-    few, many = (machine.march(0.0, span / n, n, y, drive) for n in (100, 200))
+    machine = CompiledMethod(system, DOP853, compiled=False)
+    few, many = (machine.step_fixed(0.0, span / n, n, y, drive) for n in (100, 200))
     assert math.dist(few[:4], many[:4]) < 2e-14
     return system, y, drive, many
 
@@ -128,10 +128,10 @@ def truth_of(scene, span, torque):
 def test_measured_order_is_that_of_the_theory(case, method, steps):
     """Errors stay well above rounding. Under sine torques the d/dt of RODAS4 is at work."""
     system, y, drive, truth = truth_of(*case)
-    machine = Machine(system, method, compiled=False)
+    machine = CompiledMethod(system, method, compiled=False)
     errors = []
     for count in (steps, 2 * steps):
-        end = machine.march(0.0, case[1] / count, count, y, drive)
+        end = machine.step_fixed(0.0, case[1] / count, count, y, drive)
         size = 7 if case is SINE else 4  # rates of 100 rad/s have rounding of their own
         errors.append(math.dist(end[:size], truth[:size]))
     assert errors[1] > 2e-14
@@ -140,7 +140,7 @@ def test_measured_order_is_that_of_the_theory(case, method, steps):
 
 def linearised(scene, torque, t, y, drive):
     system = system_of(scene, torque, work=True)
-    machine, size = Machine(system, RODAS4, compiled=False), len(system.state)
+    machine, size = CompiledMethod(system, RODAS4, compiled=False), len(system.state)
     flat = np.array(machine._module.jacobian(t, *y, *drive[: len(system.drive)]))
     return flat[:size], flat[size : 2 * size], flat[2 * size :].reshape(size, size).T
 
@@ -190,11 +190,11 @@ def test_the_derivative_by_time_is_exact():
 
 
 def test_a_step_without_a_finite_result_has_an_infinite_error():
-    machine = Machine(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
+    machine = CompiledMethod(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
     y = start(EXAMPLE2, 7)
-    assert machine.pair(0.0, 1e-3, y, y, (1e308, 1e308, 0.0))[2] == math.inf
+    assert machine.step_pair(0.0, 1e-3, y, y, (1e308, 1e308, 0.0))[2] == math.inf
 
 
 def test_a_slope_of_its_own_needs_an_explicit_method():
     with pytest.raises(ValueError, match="explicit method"):
-        Machine(system_of(viscous(1.0)), RODAS4, compiled=False, slope=lambda *x: x)
+        CompiledMethod(system_of(viscous(1.0)), RODAS4, compiled=False, derivative=lambda *x: x)

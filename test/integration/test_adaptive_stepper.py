@@ -13,9 +13,8 @@ from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
-from sst_ros.errors import Diverged, StrokeExceeded, WorkspaceLeft
-from sst_ros.integration import adaptive_stepper
-from sst_ros.integration.compiled_method import Machine
+from sst_ros.errors import Diverged, StepBudgetExceeded, StrokeExceeded, WorkspaceLeft
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation import Simulation
 
@@ -27,27 +26,29 @@ MILLISECOND = 1_000_000
 def pairs(monkeypatch):
     """Count attempts by method; a pair of RODAS4 makes 3 Jacobians and 18 evaluations."""
     counts = {}
-    attempt = Machine.pair
+    attempt = CompiledMethod.step_pair
 
     def counted(self, *arguments):
         counts[self.method.name] = counts.get(self.method.name, 0) + 1
         return attempt(self, *arguments)
 
-    monkeypatch.setattr(Machine, "pair", counted)
+    monkeypatch.setattr(CompiledMethod, "step_pair", counted)
     return counts
 
 
 @pytest.mark.parametrize("coefficient", [1e3, 1e4, 1e5])
 def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pairs):
     """Steps that an explicit method would need for stability grow with the coefficient."""
-    simulation = Simulation(viscous(coefficient), tolerance=1e-10)
+    simulation = Simulation(viscous(coefficient), tolerance=1e-10, step_budget=10**6)
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas4"
-    fastest = np.abs(simulation._journey._walk.spectrum(0.0, simulation._now.point.y, REST)).max()
+    fastest = np.abs(
+        simulation._propagator._stepper.spectrum(0.0, simulation._now.point.y, REST)
+    ).max()
     explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
     assert explicit > 0.6 * coefficient
     assert pairs["rodas4"] < min(350, explicit / 2)
-    assert simulation._journey._legs < (100 if coefficient == 1e5 else 300)
+    assert simulation.accepted_steps < (100 if coefficient == 1e5 else 300)
     assert pairs.get("dopri5", 0) + pairs.get("dop853", 0) < 60
 
 
@@ -103,10 +104,9 @@ def test_a_refused_step_leaves_no_trace_in_what_follows():
     assert one.changes == other.changes
 
 
-def test_a_budget_of_steps_ends_what_would_not_end(monkeypatch):
-    monkeypatch.setattr(adaptive_stepper, "STEP_BUDGET", 50)
-    simulation = Simulation(viscous(1e5), "dopri5")
-    with pytest.raises(Diverged, match="50 steps do not reach the end of the period") as caught:
+def test_a_budget_of_evaluations_ends_what_would_not_end():
+    simulation = Simulation(viscous(1e5), "dopri5", step_budget=1000)
+    with pytest.raises(StepBudgetExceeded, match="1000 evaluations do not reach") as caught:
         simulation.step(REST, 1_000_000_000)
     assert caught.value.state is simulation.state
     assert simulation.state.time_ns == 0

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Try to break sst_ros; print counts of what was tried and found.
+
+python -m benchmark.campaign                 # the whole, 30 minutes on two cores
+python -m benchmark.campaign --share 0.03    # a sample of it
+python -m benchmark.campaign --only bits invariants
+python -m benchmark.campaign --write         # and write docs/robustness.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from datetime import date
+from pathlib import Path
+
+from benchmark.campaign.ledger import KINDS, Ledger
+from benchmark.campaign.parts import PARTS, run
+
+PAGE = Path(__file__).parents[2] / "docs" / "robustness.md"
+
+
+def table(ledgers: list[Ledger]) -> str:
+    """Return the table of all parts, Markdown."""
+    titles = ("what was tried", "cases", "hangs", "tracebacks", "silent differences", "lost",
+              "longest [s]")  # fmt: skip
+    rows = [f"| {' | '.join(titles)} |", f"| --- {'| ---: ' * (len(titles) - 1)}|"]
+    for one in ledgers:
+        counts = " | ".join(str(getattr(one, kind)) for kind in KINDS)
+        rows.append(f"| {one.what} | {one.tried} | {counts} | {one.longest_s:.2f} |")
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """Run the campaign; exit with 1 where anything was found."""
+    parser = argparse.ArgumentParser(description=__doc__, prog="python -m benchmark.campaign")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("--share", type=float, default=1.0, help="share of all cases, 0 to 1")
+    parser.add_argument("--seed", type=int, default=2026, help="seed of all random choices")
+    parser.add_argument("--only", nargs="+", choices=sorted(PARTS), help="parts to run")
+    parser.add_argument("--processes", type=int, default=2, help="parts at once")
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    options = parser.parse_args()
+    parts = options.only or list(PARTS)
+    began, found = time.monotonic(), {}
+    with ProcessPoolExecutor(options.processes, max_tasks_per_child=1) as pool:
+        waiting = {pool.submit(run, part, options.share, options.seed): part for part in parts}
+        for future in as_completed(waiting):
+            part = waiting[future]
+            found[part] = ledger = future.result()
+            mark = "ok" if ledger.sound else "FOUND"
+            print(f"[{len(found)}/{len(parts)}] {part}: {mark}, {ledger.tried} cases, "
+                  f"{ledger.seconds:.0f} s", flush=True)  # fmt: skip
+            for note in ledger.notes[:20]:
+                print(f"    {note}", flush=True)
+    ledgers = [found[part] for part in parts]
+    text = table(ledgers)
+    minutes = (time.monotonic() - began) / 60
+    print(f"\n{text}\n\nseed {options.seed}, share {options.share:g}, {minutes:.1f} minutes")
+    if options.write:
+        made = (
+            f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f} minutes, "
+            f"{platform.machine()}, Python {platform.python_version()}, {date.today()}."
+        )
+        head = PAGE.read_text(encoding="utf-8").split("<!-- results -->")[0]
+        PAGE.write_text(f"{head}<!-- results -->\n\n{text}\n\n{made}\n", encoding="utf-8")
+    return 0 if all(ledger.sound for ledger in ledgers) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

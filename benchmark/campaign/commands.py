@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: wrong words, hostile paths, hostile surroundings."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmark.campaign.ledger import Budget, Ledger
+
+COMMAND_BOUND_S = 30.0
+"""A refusal takes a second; a command that does its work takes longer beside other work."""
+
+
+def sst_ros(
+    ledger: Ledger,
+    words: Sequence[str],
+    *,
+    folder: Path,
+    env: Mapping[str, str] | None = None,
+    bound: float = COMMAND_BOUND_S,
+    fails: bool | None = None,
+    user: int | None = None,
+) -> subprocess.CompletedProcess[str] | None:
+    """Run the command line; count a hang, a traceback, a long message or a wrong exit status."""
+    ledger.tried += 1
+    name, began = " ".join(words)[:120], time.perf_counter()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "sst_ros", *words],
+            cwd=folder,
+            env={**os.environ, **(env or {})},
+            capture_output=True,
+            text=True,
+            errors="backslashreplace",
+            timeout=bound,
+            user=user,
+            stdin=subprocess.DEVNULL,
+        )
+    except subprocess.TimeoutExpired:
+        ledger.found("hangs", f"{name}: no end within {bound:g} s")
+        return None
+    except (ValueError, OSError) as error:  # words that no process can be given
+        ledger.tried -= 1
+        ledger.notes.append(f"not started: {name!r}: {error}")
+        return None
+    ledger.longest_s = max(ledger.longest_s, time.perf_counter() - began)
+    if "Traceback (most recent call last)" in done.stderr:
+        ledger.found("tracebacks", f"{name}: {done.stderr.strip().splitlines()[-1]}")
+    elif fails is not None and fails == (done.returncode == 0):
+        ledger.found("silent", f"{name}: exit status {done.returncode}")
+    elif done.returncode < 0:
+        ledger.found("tracebacks", f"{name}: ended by signal {-done.returncode}")
+    return done
+
+
+VERBS = ("compile", "demo", "describe", "export", "plan", "plot", "report", "recover", "scene",
+         "study", "view", "simulator", "torque_player", "inverse_dynamics", "recorder", "viewer",
+         "simulate", "workspace")  # fmt: skip
+
+WRONG = (
+    ["nosuchverb"],
+    ["simulatr"],
+    ["--nosuchoption"],
+    ["scene", "show"],
+    ["scene", "show", "nosuchscene"],
+    ["scene", "show", "/"],
+    ["scene", "show", "/dev/null"],
+    ["scene", "check", "/proc/self/mem"],
+    ["scene", "check", "\udcff"],
+    ["compile", "example2", "--integrator", "nope"],
+    ["demo", "--out", "/etc/passwd"],
+    ["demo", "--scene", "reach"],
+    ["plan", "check", "reach", "--csv", "/proc/x"],
+    ["plan", "check", "reach", "--csv", "/tmp"],
+    ["report", "run", "/nonexistent"],
+    ["report", "run", "/etc"],
+    ["report", "accuracy", "--scene", "nosuchscene"],
+    ["export", "/nonexistent"],
+    ["plot", "/nonexistent"],
+    ["recover", "/nonexistent"],
+    ["view", "/nonexistent", "--port", "-1"],
+    ["view", "--scene", "swing", "--port", "99999"],
+    ["describe", "nosuchscene"],
+    ["simulator", "--scene", "nosuchscene"],
+    ["simulator", "--bogus"],
+    ["simulator", "--ros-args", "-p", "nonexist:=1"],
+    ["simulator", "--ros-args", "-p", "rate:=0"],
+    ["simulator", "--ros-args", "-p", "rate:=nan"],
+    ["simulator", "--ros-args", "-p", "real_time_factor:=5e-324"],
+    ["simulator", "--ros-args", "-r", "__node:=not a name"],
+    ["simulator", "--ros-args", "--params-file", "/etc/passwd"],
+    ["recorder", "--ros-args", "-p", "topics:=['a b']"],
+    ["recorder", "--ros-args", "-p", "output:=/proc/bag"],
+    ["torque_player", "--ros-args", "-p", "scene:=nosuchscene"],
+    ["inverse_dynamics", "--ros-args", "-p", "mode:=nosuchmode"],
+)
+
+
+def command_lines(budget: Budget, seed: int) -> Ledger:
+    """Give wrong words to every verb: one line and a status other than 0, or usage."""
+    ledger, rng = Ledger("command lines"), random.Random(seed)
+    env = {"ROS_DOMAIN_ID": "97", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "folder").mkdir()
+        (folder / "empty.yaml").write_text("")
+        (folder / "binary.yaml").write_bytes(os.urandom(300))
+        wrong = list(WRONG)
+        count = budget.cases(150, least=8)
+        for words in wrong if budget.share >= 1 else rng.sample(wrong, min(len(wrong), len(count))):
+            sst_ros(ledger, words, folder=folder, env=env, fails=True)
+        words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]
+        words_of += ["--out", "--force", "--scene", "\x1b[31m", "a" * 300, "../..", "~", "'"]
+        for _ in range(len(count) - ledger.tried):
+            verb = rng.choice(VERBS[:11])
+            words = [verb, "--nosuchoption", *rng.choices(words_of, k=rng.randint(0, 3))]
+            sst_ros(ledger, words, folder=folder, env=env, fails=True)
+    return ledger
+
+
+def surroundings(budget: Budget, seed: int) -> Ledger:
+    """Run commands without a home, with a full disk, in plain ASCII, as another user."""
+    ledger = Ledger("surroundings: home, disk, locale, user")
+    nobody = 65534 if os.geteuid() == 0 else None
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o777)
+        readonly = folder / "readonly"
+        readonly.mkdir(mode=0o555)
+        cases: dict[str, tuple[list[str], dict[str, str], int | None]] = {
+            "no HOME": (["scene", "list"], {"HOME": ""}, None),
+            "HOME that is not there": (
+                ["scene", "show", "example2"],
+                {"HOME": "/nonexistent"},
+                None,
+            ),
+            "read-only HOME": (["compile", "example2"], {"HOME": str(readonly)}, nobody),
+            "TMPDIR that is not there": (["scene", "list"], {"TMPDIR": "/nonexistent"}, None),
+            "plain ASCII": (["scene", "show", "example2"], {"LANG": "C", "LC_ALL": "C"}, None),
+            "ASCII output": (["scene", "list"], {"PYTHONIOENCODING": "ascii"}, None),
+            "cache in a full disk": (
+                ["compile", "example2"],
+                {"XDG_CACHE_HOME": "/dev/full"},
+                None,
+            ),
+            "cache that is a file": (
+                ["compile", "example2"],
+                {"XDG_CACHE_HOME": "/etc/passwd"},
+                None,
+            ),
+            "another user": (["scene", "list"], {"HOME": str(folder)}, nobody),
+            "no columns": (["scene", "list"], {"COLUMNS": "0", "TERM": "dumb"}, None),
+        }
+        for label, (words, env, user) in cases.items():
+            before = len(ledger.notes)
+            sst_ros(ledger, words, folder=folder, env=env, user=user, bound=60.0)
+            ledger.notes[before:] = [f"{label}: {note}" for note in ledger.notes[before:]]
+        for verb in (["scene", "list"], ["scene", "keys"], ["--help"]):
+            ledger.tried += 1
+            with Path("/dev/full").open("w") as full:
+                done = subprocess.run(
+                    [sys.executable, "-m", "sst_ros", *verb], stdout=full, stderr=subprocess.PIPE,
+                    text=True, timeout=COMMAND_BOUND_S, cwd=folder,
+                )  # fmt: skip
+            if "Traceback" in done.stderr:
+                ledger.found(
+                    "tracebacks", f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
+                )
+    del budget, seed
+    return ledger

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one part of the campaign has tried and found."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+HANG_S = 1.0
+"""A call that takes longer than this is a hang, unless its part states another bound."""
+
+KINDS = ("hangs", "tracebacks", "silent", "lost")
+
+
+@dataclass
+class Ledger:
+    """Counts of one part.
+
+    Attributes:
+        what: what was tried, as the table shows it.
+        tried: how many cases.
+        hangs: calls beyond their bound.
+        tracebacks: errors that are not one of ours, or a traceback on a terminal.
+        silent: differences that nothing reported.
+        lost: messages lost beyond what the design allows.
+        notes: what a finding was, one line each.
+
+    """
+
+    what: str
+    tried: int = 0
+    hangs: int = 0
+    tracebacks: int = 0
+    silent: int = 0
+    lost: int = 0
+    seconds: float = 0.0
+    longest_s: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    def found(self, kind: str, note: str, count: int = 1) -> None:
+        """Count a finding of one of KINDS."""
+        setattr(self, kind, getattr(self, kind) + count)
+        self.notes.append(f"{kind}: {note}"[:400])
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing was found."""
+        return not any(getattr(self, kind) for kind in KINDS)
+
+    @contextlib.contextmanager
+    def case(self, name: str, allowed: tuple[type[BaseException], ...], bound: float = HANG_S
+             ) -> Iterator[None]:  # fmt: skip
+        """Try one case in this process: errors of `allowed` are answers, others are findings."""
+        self.tried += 1
+        began = time.perf_counter()
+        try:
+            yield
+        except allowed:
+            pass
+        except Exception as error:
+            self.found("tracebacks", f"{name}: {type(error).__name__}: {error}")
+        took = time.perf_counter() - began
+        self.longest_s = max(self.longest_s, took)
+        if took > bound:
+            self.found("hangs", f"{name}: {took:.2f} s")
+
+
+Part = Callable[["Budget", int], Ledger]
+
+
+class Budget:
+    """How much of a part is run: a share of its full count of cases.
+
+    Args:
+        share: 1 for the whole campaign.
+
+    """
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+
+    def cases(self, full: int, least: int = 1) -> range:
+        """Return numbers of the cases to try, of `full` in the whole campaign."""
+        return range(max(least, round(full * self.share)))

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings: flipped bytes, cuts, and recorders that are killed."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from benchmark.campaign.ledger import Budget, Ledger
+from benchmark.campaign.nodes import domain, ended, start
+from sst_ros.errors import SstError
+from sst_ros.recording import recovery
+from sst_ros.recording.recording import Recording, read
+
+SAMPLE_NS = 2_000_000
+LAST_CHUNK_NS = 1_000_000_000
+"""What a recorder may lose when it is killed: the chunk that it has not yet flushed."""
+
+
+@contextmanager
+def _recorded(seconds: float) -> Iterator[Path]:
+    """Record a run of scene `swing`, which moves by itself; give the bag."""
+    with tempfile.TemporaryDirectory() as name, domain():
+        bag = Path(name) / "bag"
+        recorder = start("recorder", output=bag)
+        simulator = start("simulator", scene="swing", duration=seconds)
+        try:
+            simulator.wait(timeout=60)
+            ended(recorder, signal.SIGINT)
+            yield bag
+        finally:
+            for process in (simulator, recorder):
+                ended(process, signal.SIGKILL)
+
+
+def _same(one: Recording, other: Recording) -> bool:
+    return len(one.time_ns) == len(other.time_ns) and all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
+        for name in ("time_ns", "gamma", "gamma_dot", "effort", "quaternion")
+    )
+
+
+def damages(budget: Budget, seed: int) -> Ledger:
+    """Flip single bytes of a recording and cut it: no number may change without a word."""
+    ledger, rng = Ledger("recordings: flipped bytes and cuts"), random.Random(seed)
+    with _recorded(2.0) as bag:
+        whole = read(bag)
+        (file,) = bag.glob("*.mcap")
+        data = file.read_bytes()
+        for number in budget.cases(500, least=10):
+            place, bit = rng.randrange(len(data)), 1 << rng.randrange(8)
+            changed = bytearray(data)
+            changed[place] ^= bit
+            _try(ledger, f"flip {number} of byte {place}", bag, file, bytes(changed), whole)
+        for number in budget.cases(100, least=3):
+            length = rng.randrange(len(data))
+            _try(ledger, f"cut {number} at byte {length}", bag, file, data[:length], whole)
+    return ledger
+
+
+def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: Recording) -> None:
+    file.write_bytes(data)
+    with ledger.case(f"read, {name}", (SstError,), bound=10.0):
+        found = read(bag)
+        if not _same(found, whole):
+            ledger.found("silent", f"{name}: numbers differ")
+    saved = bag.with_name("bag_recovered")
+    shutil.rmtree(saved, ignore_errors=True)
+    with ledger.case(f"recover, {name}", (SstError,), bound=10.0):
+        result = recovery.recover(bag)
+        again = read(result.bag)
+        # What was saved has to be a part of what was recorded, bit by bit.
+        kept = np.isin(whole.time_ns, again.time_ns)
+        if not np.array_equal(whole.gamma[kept], again.gamma):
+            ledger.found("silent", f"{name}: recovered numbers differ")
+        missing = len(whole.time_ns) - len(again.time_ns)
+        if missing and not (result.cut or getattr(result, "lost", 0)):
+            ledger.found("lost", f"{name}: {missing} samples missing and not reported", missing)
+    shutil.rmtree(saved, ignore_errors=True)
+
+
+def kills(budget: Budget, seed: int) -> Ledger:
+    """Kill the recorder at random moments: all but the last chunk comes back."""
+    ledger, rng = Ledger("recorders killed with -9"), random.Random(seed)
+    for number in budget.cases(34, least=1):
+        ledger.tried += 1
+        with tempfile.TemporaryDirectory() as name, domain():
+            bag = Path(name) / "bag"
+            recorder = start("recorder", output=bag)
+            simulator = start("simulator", scene="swing")
+            try:
+                _kill(ledger, f"kill {number}", rng.uniform(1.5, 4.0), recorder, bag)
+            except SstError as error:
+                ledger.found("lost", f"kill {number}: {error}")
+            finally:
+                for process in (simulator, recorder):
+                    ended(process, signal.SIGKILL)
+    return ledger
+
+
+def _kill(
+    ledger: Ledger, name: str, after: float, recorder: subprocess.Popen[str], bag: Path
+) -> None:
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and _size(bag) < 50_000:
+        time.sleep(0.01)
+    # The wait is the experiment: the moment of the kill is random.
+    time.sleep(after)
+    size = _size(bag)
+    recorder.kill()
+    recorder.wait()
+    result = recovery.recover(bag)
+    run = read(result.bag)
+    steps = np.diff(run.time_ns)
+    if len(steps) and not np.all(steps == SAMPLE_NS):
+        ledger.found("lost", f"{name}: gaps inside what was recovered, {size} bytes")
+
+
+def _size(bag: Path) -> int:
+    return sum(path.stat().st_size for path in bag.glob("*.mcap"))

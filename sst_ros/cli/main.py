@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `sst-ros`: commands, nodes, and the exit status of each."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import traceback
+
+from sst_ros.cli.failures import failure
+from sst_ros.cli.parsing import Parser
+from sst_ros.errors import printable
+
+PROGRAM = "sst-ros"
+COMMANDS = (
+    "simulate",
+    "workspace",
+    "scene",
+    "plan",
+    "describe",
+    "compile",
+    "demo",
+    "view",
+    "report",
+    "plot",
+    "export",
+    "recover",
+    "study",
+)
+NODES = {
+    "simulator": "node: integrate the equation of motion in real time",
+    "torque_player": "node: play the torques of a scene",
+    "inverse_dynamics": "node: follow a motion by feedforward and feedback",
+    "recorder": "node: record a run as a rosbag2 recording",
+    "viewer": "node: show a running simulator in a browser",
+}
+
+
+def run(words: list[str]) -> int:
+    """Run a command or a node; return the exit status. Errors are one line on stderr."""
+    debug, words = _without_debug(words)
+    try:
+        status = _run(words)
+        sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exc()
+        status, message = failure(error)
+        if isinstance(error, OSError):
+            _abandon_stdout()
+        for line in message.splitlines():
+            print(f"{PROGRAM}: {printable(line)}", file=sys.stderr)
+    return status
+
+
+def parser(only: str | None = None) -> Parser:
+    """Build the parser of all commands, or of one: to import them all takes longer than to run one.
+
+    Nodes are listed but parse their arguments themselves: a node takes those of ROS, too.
+    """
+    result = Parser(
+        prog=PROGRAM,
+        description="Simulator of the 3-RRP spherical star-triangle parallel manipulator.",
+        epilog=f"`{PROGRAM} COMMAND --help` describes a command or a node.",
+    )
+    result.add_argument("--version", action="version", version=_version())
+    result.add_argument("--debug", action="store_true", help="print the traceback of an error")
+    commands = result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    for name in COMMANDS:
+        if only in (None, name):
+            importlib.import_module(f"sst_ros.cli.{name}").add(commands)
+    for name, what in NODES.items() if only is None else ():
+        commands.add_parser(name, help=what, add_help=False)
+    return result
+
+
+def _run(words: list[str]) -> int:
+    if "_ARGCOMPLETE" in os.environ:
+        importlib.import_module("argcomplete").autocomplete(parser())
+    if words and words[0] in NODES:
+        started: int = importlib.import_module(f"sst_ros.nodes.{words[0]}").main(words)
+        return started
+    commands = parser(words[0] if words and words[0] in COMMANDS else None)
+    options, unknown = commands.parse_known_args(words)
+    if unknown:
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    if options.command is None:
+        commands.print_help()
+        return 0
+    done: int | None = options.run(options)
+    return done or 0
+
+
+def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
+    """Take --debug out of the arguments, wherever it is before those of ROS."""
+    end = words.index("--ros-args") if "--ros-args" in words else len(words)
+    kept = [word for word in words[:end] if word != "--debug"]
+    return len(kept) < end, [*kept, *words[end:]]
+
+
+def _version() -> str:
+    import sst_ros
+
+    return f"{PROGRAM} {sst_ros.__version__}"
+
+
+def _abandon_stdout() -> None:
+    """Keep Python from failing once more, when it ends, on a stdout that takes nothing."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

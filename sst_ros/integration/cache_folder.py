@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of compiled code: numba unpickles what lies there, so nobody else may write into it.
+
+The rules are those of StrictModes of OpenSSH: the folder and all folders above it belong to the
+user or to root, and nobody else can write into them. A folder above it may be writable where its
+sticky bit keeps others from replacing what is not theirs, as /tmp is, and a group may write whose
+only member is the user.
+"""
+
+from __future__ import annotations
+
+import atexit
+import grp
+import os
+import pwd
+import shutil
+import stat
+import tempfile
+import warnings
+from functools import lru_cache
+from pathlib import Path
+
+
+def cache_folder() -> Path:
+    """Return the folder of compiled code, made if it was not there.
+
+    It is SST_ROS_CACHE, or sst_ros in the user's cache folder. If somebody else could write into
+    that, it is a private temporary folder, and a warning is given.
+
+    Raises:
+        OSError: it cannot be made.
+
+    """
+    folder = configured_folder()
+    if folder is None:
+        return _private_folder("there is no home folder")
+    _make(folder)
+    reason = objection(folder)
+    return folder if reason is None else _private_folder(reason)
+
+
+def configured_folder() -> Path | None:
+    """Return the folder that the environment names, None where there is no home folder."""
+    if named := os.environ.get("SST_ROS_CACHE"):
+        return Path(named).absolute()
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named).absolute() / "sst_ros"
+    try:
+        return Path.home() / ".cache" / "sst_ros"
+    except RuntimeError:
+        return None
+
+
+def objection(folder: Path) -> str | None:
+    """Return why code in a folder is not trusted; None where it is."""
+    # The path as it is written may lead through links, which must be safe, too.
+    for path in {folder.absolute(), folder.resolve()}:
+        for place in (path / "__pycache__", path, *path.parents):
+            if reason := _objection(place, above=place in path.parents):
+                return reason
+    return None
+
+
+def is_safe_file(path: Path) -> bool:
+    """Return whether a file belongs to the user or root, and nobody else can write it."""
+    return _objection(path, above=False) is None
+
+
+def _objection(path: Path, *, above: bool) -> str | None:
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return None
+    if status.st_uid not in (0, os.geteuid()):
+        return f"{path} belongs to another user (uid {status.st_uid})"
+    if stat.S_ISLNK(status.st_mode):
+        return None  # its own mode means nothing; what it leads to is looked at, too
+    if above and status.st_mode & stat.S_ISVTX:
+        return None
+    if status.st_mode & stat.S_IWOTH:
+        return f"{path} can be written by every user"
+    if status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
+        return f"{path} can be written by its group (gid {status.st_gid})"
+    return None
+
+
+def _is_private_group(gid: int) -> bool:
+    """Return whether a group is the user's own: it bears his name and has no other member."""
+    try:
+        user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return (gid, group.gr_name) == (user.pw_gid, user.pw_name) and {user.pw_name}.issuperset(
+        group.gr_mem
+    )
+
+
+def _make(folder: Path) -> None:
+    """Make a folder, and those above it, for the user alone."""
+    if not folder.is_dir():
+        if folder.parent != folder:
+            _make(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+
+
+@lru_cache(maxsize=1)
+def _private_folder(reason: str) -> Path:
+    warnings.warn(
+        f"compiled code is not kept: {reason}; set SST_ROS_CACHE to a folder of your own",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    folder = Path(tempfile.mkdtemp(prefix="sst_ros_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plain data that every room uses: joints, states, torques and assembly modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+NANOSECONDS = 1_000_000_000
+"""Of a second: time is integer nanoseconds."""
+
+Vector3: TypeAlias = tuple[float, float, float]
+TorqueFunction: TypeAlias = Callable[[float], Vector3]
+"""Actuator torques [N m] at a simulated time [s]."""
+
+
+class Joints(NamedTuple):
+    """Angles [rad] and rates [rad/s] of all nine joints, by kind and leg."""
+
+    gamma: Vector3
+    mu: Vector3
+    beta: Vector3
+    gamma_dot: Vector3
+    mu_dot: Vector3
+    beta_dot: Vector3
+
+
+@dataclass(frozen=True)
+class State:
+    """The manipulator at one instant.
+
+    Attributes:
+        time_ns: simulated time since the start [ns].
+        quaternion: orientation of {E} in {B}, (x, y, z, w).
+        body_rate: angular velocity of the star in {E} [rad/s].
+        joints: angles and rates of all nine joints.
+        torque: torques that the actuators give at this instant [N m]; zero before the first step.
+
+    """
+
+    time_ns: int
+    quaternion: tuple[float, float, float, float]
+    body_rate: Vector3
+    joints: Joints
+    torque: Vector3
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """One assembly mode at given actuator angles: a root of the direct kinematics.
+
+    Arrays are read-only.
+
+    Attributes:
+        rotation: R of {E} in {B}, shape (3, 3).
+        mu: angles of the passive revolute joints in (-pi, pi] [rad], shape (3,).
+        beta: angles of the passive curved prismatic joints in (-pi, pi] [rad], shape (3,).
+        det_j2: determinant of J2, zero at a parallel singularity.
+        admissible: E lies on the base triangle (Eq. 4) with 0 < beta_k <= beta_max for all legs.
+
+    """
+
+    rotation: NDArray[np.float64]
+    mu: NDArray[np.float64]
+    beta: NDArray[np.float64]
+    det_j2: float
+    admissible: bool

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled code is loaded only from where nobody else can write."""
+
+import os
+import pickle
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from sst_ros.integration import cache_folder as module
+from sst_ros.integration.cache_folder import cache_folder, objection
+from sst_ros.integration.codegen import numba_version
+
+OTHER_USER = 65534
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to act as a second user")
+with_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
+
+PROGRAM = """
+from sst_ros.integration.codegen import load
+text = "def twice(x):\\n    return 2.0 * x\\n"
+print(load([text], {}, numba=True).twice(21.0))
+"""
+
+
+def run(cache, **options):
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env={**os.environ, "SST_ROS_CACHE": str(cache)},
+        capture_output=True, text=True, timeout=100, check=True, **options,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    result = tmp_path / "above" / "cache"
+    (result / "__pycache__").mkdir(parents=True, mode=0o700)
+    for path in (result, result.parent):
+        path.chmod(0o700)
+    return result
+
+
+def test_a_folder_of_the_user_is_trusted(folder):
+    assert objection(folder) is None
+
+
+@pytest.mark.parametrize(
+    ("place", "mode", "said"),
+    [
+        ("", 0o777, "every user"),
+        ("", 0o1777, "every user"),
+        ("..", 0o777, "every user"),
+        ("..", 0o1777, None),
+        ("__pycache__", 0o777, "every user"),
+        ("", 0o755, None),
+    ],
+)
+def test_a_folder_that_others_can_write_is_not(place, mode, said, folder):
+    (folder / place).resolve().chmod(mode)
+    reason = objection(folder)
+    assert reason is None if said is None else said in reason
+
+
+@pytest.mark.parametrize("private", [True, False])
+def test_a_group_may_write_that_has_no_other_member(private, folder, monkeypatch):
+    folder.chmod(0o770)
+    monkeypatch.setattr(module, "_is_private_group", lambda gid: private)
+    assert (objection(folder) is None) == private
+
+
+def test_the_group_of_a_user_is_private_only_without_other_members(monkeypatch):
+    user = module.pwd.getpwuid(os.geteuid())
+    for name, members, private in [
+        (user.pw_name, [], True),
+        (user.pw_name, [user.pw_name], True),
+        (user.pw_name, ["somebody"], False),
+        ("users", [], False),
+    ]:
+        group = module.grp.struct_group((name, "x", user.pw_gid, members))
+        monkeypatch.setattr(module.grp, "getgrgid", lambda gid, group=group: group)
+        assert module._is_private_group(user.pw_gid) == private
+        assert not module._is_private_group(user.pw_gid + 1)
+
+
+def test_a_link_is_followed(folder, tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    assert objection(link) is None
+    folder.chmod(0o777)
+    assert "every user" in objection(link)
+
+
+def test_what_belongs_to_another_user_is_not_trusted(folder, monkeypatch):
+    if os.geteuid() == 0:
+        os.chown(folder, OTHER_USER, OTHER_USER)
+    else:
+        monkeypatch.setattr(module.os, "geteuid", lambda: OTHER_USER)
+    assert "belongs to another user" in objection(folder)
+
+
+def test_a_private_folder_takes_the_place_of_one_that_is_not_trusted(folder, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(folder))
+    assert cache_folder() == folder
+    folder.parent.chmod(0o777)
+    module._private_folder.cache_clear()
+    with pytest.warns(RuntimeWarning, match="can be written by every user"):
+        private = cache_folder()
+    assert private != folder
+    assert private.stat().st_mode & 0o777 == 0o700
+    assert cache_folder() == private, "the same folder for the whole process"
+
+
+def test_a_new_folder_is_for_the_user_alone(tmp_path, monkeypatch):
+    old = os.umask(0)
+    try:
+        monkeypatch.delenv("SST_ROS_CACHE", raising=False)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a" / "b"))
+        found = cache_folder()
+    finally:
+        os.umask(old)
+    assert found == tmp_path / "a" / "b" / "sst_ros"
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (found, *found.parents[:2]))
+
+
+class Planted:
+    """Unpickled, it makes a folder."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@as_root
+@with_numba
+@pytest.mark.parametrize("mine", [False, True], ids=["folder of another user", "own folder"])
+def test_the_code_of_another_user_does_not_run(mine, tmp_path):
+    """numba unpickles its index: what another user has put there must not be read."""
+    assert run(tmp_path / "cache").stdout == "42.0\n"
+    shared = Path(tempfile.mkdtemp())
+    try:
+        shared.chmod(0o777)
+        cache, marker = shared / "cache", tmp_path / "planted"
+        shutil.copytree(tmp_path / "cache", cache)
+        for index in cache.rglob("*.nbi"):
+            index.write_bytes(pickle.dumps(Planted(marker)) + pickle.dumps(b""))
+            os.chown(index, OTHER_USER, OTHER_USER)
+        if mine:  # the folder was open when the file was planted, and is closed now
+            shared.chmod(0o700)
+        else:
+            for path in (cache, cache / "__pycache__", *cache.glob("*.py")):
+                os.chown(path, OTHER_USER, OTHER_USER)
+        done = run(cache)
+        assert done.stdout == "42.0\n"
+        assert not marker.exists()
+        assert ("compiled code is not kept" in done.stderr) != mine
+    finally:
+        shutil.rmtree(shared)
+
+
+@with_numba
+def test_a_full_disk_costs_the_cache_and_nothing_else(tmp_path):
+    def limited():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+
+    done = run(tmp_path / "cache", preexec_fn=limited)
+    assert done.stdout == "42.0\n"
+    assert "compiled code is not kept" in done.stderr
+    assert run(tmp_path / "cache").stdout == "42.0\n"

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compliant stops: the restitution that their damping has, and contacts at the same time."""
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from one_freedom import inertia, slope
+from scipy.integrate import solve_ivp
+
+from sst_ros.dynamics.loads import damping_of
+from sst_ros.errors import InputError
+from sst_ros.scene.loads import Initial, Stroke, Workspace
+from sst_ros.scene.scene import load
+from sst_ros.simulation import Simulation
+
+EXAMPLE1 = load("example1")
+START = np.pi / 4
+REST = (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("e", [0.1, 0.5, 0.6, 0.9, 0.99, 0.998, 0.999, 1.0 - 1e-6, 1.0])
+def test_the_damping_satisfies_the_exact_relation(e):
+    """d (1 + e) = ln((1 + d) / (1 - d e)), solved by mpmath to 40 digits."""
+    damping = damping_of(Stroke(at_end="elastic", stiffness=10.0, restitution=e, impact_rate=2.5))
+    if e == 1.0:
+        assert damping == 0.0
+        return
+    with mpmath.workdps(40):
+        restitution = mpmath.mpf(e)
+
+        def relation(d):
+            return d * (1 + restitution) - mpmath.log((1 + d) / (1 - d * restitution))
+
+        d = mpmath.mpf(2.5) * damping
+        exact = mpmath.findroot(relation, (d * (1 - mpmath.mpf("1e-9")), d), verify=False)
+        assert abs(d / exact - 1) < 2e-13
+
+
+def bounced(**stroke):
+    """Example 1 on its way from pi/4 to the upper stops, all three at the same rate."""
+    scene = replace(
+        EXAMPLE1,
+        torque=None,
+        stroke=Stroke(at_end="elastic", **stroke),
+        workspace=Workspace(at_edge="ignore"),
+        initial=Initial(gamma=(START,) * 3, gamma_dot=(1.0,) * 3),
+    )
+    simulation = Simulation(scene, tolerance=1e-13)
+    for _ in range(150):
+        simulation.step(REST, 10_000_000)
+    return simulation
+
+
+@pytest.mark.parametrize(("stiffness", "restitution"), [(2e3, 0.5), (1e6, 0.5), (1e6, 0.9)])
+def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
+    stiffness, restitution
+):
+    """Example 1 moved symmetrically is one equation, which SciPy integrates by itself."""
+    how = {"stiffness": stiffness, "restitution": restitution, "impact_rate": 1.0}
+    simulation = bounced(**how)
+    joints, c = simulation.state.joints, damping_of(Stroke(at_end="elastic", **how))
+    assert np.ptp(joints.gamma) < 1e-12 and np.ptp(joints.gamma_dot) < 1e-12
+
+    def acceleration(t, y):
+        x, v = y
+        depth = max(x - np.pi / 4, 0.0)
+        push = stiffness * depth * max(1.0 + c * v, 0.0)
+        return v, -(push + 0.5 * slope(EXAMPLE1, x) * v * v) / inertia(EXAMPLE1, x)
+
+    def contact(t, y):
+        return y[0] - np.pi / 4
+
+    contact.terminal = True
+    t, y = 0.0, (0.0, 1.0)
+    rates = []
+    while t < 1.5:
+        found = solve_ivp(
+            acceleration, (t, 1.5), y, "DOP853", events=contact, rtol=2.3e-14, atol=1e-15
+        )
+        t, y = found.t[-1], found.y[:, -1]
+        if found.status == 1:
+            rates.append(y[1])
+            y = (np.pi / 4 + np.sign(y[1]) * 1e-16 + y[1] * 1e-13, y[1])
+            t += 1e-13
+    assert len(rates) == 2
+    assert joints.gamma[0] - START == pytest.approx(y[0], abs=2e-9)
+    assert joints.gamma_dot[0] == pytest.approx(y[1], abs=2e-9)
+
+
+def test_stiff_stops_have_the_restitution_at_the_impact_rate():
+    """The relation is exact for a constant inertia: the depth of contact is what remains."""
+    rate = impact_rate()
+    found = []
+    for stiffness in (1e6, 1e8):
+        simulation = bounced(stiffness=stiffness, restitution=0.5, impact_rate=rate)
+        before, after = 1.0, energy(simulation) / energy(start())
+        found.append(abs(np.sqrt(after / before) - 0.5))
+    assert found[1] < 1e-4 and found[1] < 0.2 * found[0]
+
+
+def start():
+    return Simulation(replace(EXAMPLE1, initial=Initial(gamma=(START,) * 3, gamma_dot=(1.0,) * 3)))
+
+
+def energy(simulation):
+    state = simulation.state
+    return simulation.dynamics.energies(*state.quaternion, *state.body_rate, *REST)[0]
+
+
+def impact_rate():
+    """Rate at pi/2 of a motion that keeps its energy, from rate 1 at pi/4."""
+    return np.sqrt(inertia(EXAMPLE1, 0.0) / inertia(EXAMPLE1, np.pi / 4))
+
+
+def test_rigid_impacts_are_refused_with_what_replaces_them():
+    with pytest.raises(InputError, match="replaced by elastic with restitution and impact_rate"):
+        Stroke(at_end="impact")
