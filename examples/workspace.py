@@ -11,9 +11,8 @@ import sys
 
 import numpy as np
 
-from sst_ros.mechanism import singularities, workspace
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.plot.workspace import draw
+from sst_ros import Geometry, plot_workspace, workspace
+from sst_ros.mechanism import singularities
 
 MANIPULATORS = {
     "Isotropic: v = I, α = 120°, 120°, 120°": Geometry.build(np.eye(3), np.radians([120] * 3)),
@@ -26,13 +25,10 @@ MANIPULATORS = {
 
 def main(path: str) -> None:
     """Map, report, draw."""
-    charts, meshes = [], []
-    for title, geometry in MANIPULATORS.items():
-        s, faces = workspace.triangle_directions(geometry, divisions=60)
-        charts.append(workspace.over_orientations(geometry, s, turns=180, progress=True))
-        meshes.append(faces)
-        print(f"{title}\n{singularities.report(geometry, charts[-1])}\n")
-    draw(charts, meshes, list(MANIPULATORS)).savefig(path, dpi=110)
+    charts = [workspace(geometry, progress=True) for geometry in MANIPULATORS.values()]
+    for (title, geometry), chart in zip(MANIPULATORS.items(), charts, strict=True):
+        print(f"{title}\n{singularities.report(geometry, chart)}\n")
+    plot_workspace(*charts, titles=list(MANIPULATORS)).savefig(path, dpi=110)
     print(f"drew {path}")
 
 

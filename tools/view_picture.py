@@ -91,7 +91,7 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
             node, axes_length=length * size, axes_radius=0.010 * size, position=position,
             origin_radius=0.018 * size,
         )  # fmt: skip
-        along = -0.3 if link == BASE else 0.5
+        along = {BASE: -0.3, STAR: 0.25}.get(link, 0.5)
         server.scene.add_label(
             f"{node}/name", name, position=along * length * size * np.ones(3),
             anchor="center-center", font_screen_scale=1.7,

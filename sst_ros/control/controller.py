@@ -188,7 +188,7 @@ class Controller:
         return Command(torque, feedforward, feedback, desired, torque != asked)
 
     def _at_desired(self, at: Reference) -> Triple:
-        return self._inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
+        return self._inverse.reference_torque(at)
 
     def _computed(
         self, desired: Reference, measured: Measurement, error: Triple

@@ -8,24 +8,29 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sst_ros.control.reference import Quadruple, Triple
+from sst_ros.control.reference import REST, Quadruple, Reference, Triple
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, SingularConfiguration
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation import State
 
 SINGULAR = 1e-10
 """sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""
-
-REST: Triple = (0.0, 0.0, 0.0)
 
 
 class InverseDynamics:
     """Torques at the joints of a scene, all its terms included.
 
-    It is the model that the simulation integrates, solved for the torques. What stands between a
-    command and a torque (limit, lag) is no part of it.
+    It is the model that the simulation integrates, solved for the torques: tau = M gamma_ddot + h
+    (the paper's Eq. 90 with every term of the scene). What lies between a command and a torque
+    (limit, lag) is no part of it.
+
+    Args:
+        scene: the manipulator.
+
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -69,14 +74,31 @@ class InverseDynamics:
             raise self._refusal(quaternion, given)
         return first, second, third
 
-    def gravity_torque(self, quaternion: Quadruple) -> Triple:
+    def reference_torque(self, reference: Reference) -> Triple:
+        """Torques [N m] of a reference: the feedforward; raises as `torque`."""
+        return self.torque(reference.quaternion, reference.body_rate, reference.body_acceleration)
+
+    def gravity_torque(self, at: State | Sequence[float]) -> Triple:
         """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
+
+        Args:
+            at: a state of a simulation; or gamma [rad], shape (3,), for the admissible assembly;
+                or the quaternion (x, y, z, w) of {E} in {B}, shape (4,).
 
         Raises:
             SingularConfiguration, InputError: as `torque`.
+            AssemblyError: gamma has no unique admissible assembly.
 
         """
-        return self.torque(quaternion, REST, REST)
+        pose = at.quaternion if isinstance(at, State) else tuple(at)
+        if len(pose) == 3:
+            rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation
+            pose = tuple(quaternion_of(rotation).tolist())
+        if len(pose) != 4:
+            allowed = "must be a State, three angles gamma or a quaternion"
+            raise InputError("gravity_torque", [Problem("at", at, allowed)])
+        x, y, z, w = pose
+        return self.torque((x, y, z, w), REST, REST)
 
     def _refusal(self, quaternion: Quadruple, given: Sequence[float]) -> Exception:
         problems = list(_problems(quaternion, given))

@@ -131,12 +131,9 @@ def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     inverse = InverseDynamics(scene)
 
     def torque(time: float) -> Triple:
-        at = motion.at(time)
-        return inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
+        return inverse.reference_torque(motion.at(time))
 
-    torques = np.array(
-        [inverse.torque(at.quaternion, at.body_rate, at.body_acceleration) for at in desired]
-    )
+    torques = np.array([inverse.reference_torque(at) for at in desired])
     demands = [_demand(motion, torque, leg, times, desired, torques) for leg in range(3)]
     problems = [*_beyond(distances), *_too_much(demands, scene.actuators)]
     return MotionPlan(

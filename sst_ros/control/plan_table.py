@@ -127,5 +127,5 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
         writer.writerow(["time", "tau_1", "tau_2", "tau_3"])
         for k in range(count + 1):
             at = plan.motion.at((k + 0.5) * period if k < count else math.inf)
-            torque = inverse.torque(at.quaternion, at.body_rate, at.body_acceleration)
+            torque = inverse.reference_torque(at)
             writer.writerow([repr(k * period), *map(repr, torque)])

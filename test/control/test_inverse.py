@@ -26,6 +26,7 @@ from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
+from sst_ros.simulation import Simulation
 
 FEW = settings(FAST, max_examples=25)  # each traces programs of its own
 EPS = np.finfo(float).eps
@@ -151,3 +152,17 @@ def test_a_parallel_singularity_is_told():
 def test_what_is_no_state_is_refused(q, rate, acceleration, named):
     with pytest.raises(InputError, match=named):
         InverseDynamics(load("example1")).torque(q, rate, acceleration)
+
+
+def test_gravity_torque_takes_a_state_angles_or_a_quaternion():
+    scene = load("gravity_payload")
+    inverse, state = InverseDynamics(scene), Simulation(scene).state
+    expected = inverse.torque(state.quaternion, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert np.abs(expected).max() > 0.1
+    assert inverse.gravity_torque(state) == inverse.gravity_torque(state.quaternion) == expected
+    assert inverse.gravity_torque(state.joints.gamma) == pytest.approx(expected, abs=1e-13)
+    assert inverse.gravity_torque(np.array(state.joints.gamma)) == pytest.approx(
+        expected, abs=1e-13
+    )
+    with pytest.raises(InputError, match="three angles gamma or a quaternion"):
+        inverse.gravity_torque((0.1, 0.2))

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Examples that no page runs as a whole."""
+"""The examples, run as a reader runs them; those that are nodes are in test/ros."""
 
+import subprocess
+import sys
+
+import bags
 import numpy as np
+import pytest
 from docs.blocks import ROOT
 
 from sst_ros import Simulation, load_scene
@@ -11,6 +16,43 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import read
 
 EXAMPLES = ROOT / "examples"
+
+
+PICTURES = {
+    "own_scene": "largest angles [rad]",
+    "own_controller": "error at the end [rad]",
+    "monte_carlo": "% leave the stroke",
+    "workspace": "drew ",
+}
+
+
+def run(name, *words):
+    """What an example prints."""
+    command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *map(str, words)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_an_example_draws_its_picture(name, tmp_path):
+    if name == "monte_carlo":
+        pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
+    picture = tmp_path / "picture.png"
+    printed = run(name, picture)
+    assert PICTURES[name] in printed
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
+    if name == "own_controller":
+        errors = printed.partition("[rad]")[2].strip(" []\n").split()
+        assert np.abs(np.array(errors, dtype=float)).max() < 1e-3
+
+
+def test_a_recording_as_a_table(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.simulated(load_scene("example2"), 0.1))
+    shown = run("bag_to_pandas", bag)
+    assert [line.split()[0] for line in shown.splitlines()[1:]] == [
+        f"{name}_{k}" for name in ("gamma", "gamma_dot", "tau") for k in (1, 2, 3)
+    ]
 
 
 def test_the_examples_geometry_stays_inside_for_its_whole_run():
