@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from one_freedom import inertia, slope
 from scipy.integrate import solve_ivp
 
 from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.errors import StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.symmetric_motion import inertia, inertia_slope
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
@@ -24,7 +24,7 @@ def swing(t_end):
 
     def rates(t, y):
         x, rate = y
-        push = 1.13 * np.sin(12.0 * t) - 0.5 * slope(EXAMPLE1, x) * rate**2
+        push = 1.13 * np.sin(12.0 * t) - 0.5 * inertia_slope(EXAMPLE1, x) * rate**2
         return rate, push / inertia(EXAMPLE1, x)
 
     start = (0.0, EXAMPLE1.initial.gamma_dot[0])

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST
-from one_freedom import inertia, slope
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -28,6 +27,7 @@ from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.symmetric_motion import inertia, inertia_slope
 from sst_ros.scene.motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
 from sst_ros.scene.scene import (
     Actuators,
@@ -70,7 +70,7 @@ def swing_torque(time):
     law = WAY * np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     u = time / TIME
     x, rate, acceleration = law(u), law.deriv()(u) / TIME, law.deriv(2)(u) / TIME**2
-    return inertia(EXAMPLE1, x) * acceleration + 0.5 * slope(EXAMPLE1, x) * rate**2, rate
+    return inertia(EXAMPLE1, x) * acceleration + 0.5 * inertia_slope(EXAMPLE1, x) * rate**2, rate
 
 
 def summit(function, count=4000):

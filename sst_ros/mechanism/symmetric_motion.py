@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The symmetric motion of the isotropic manipulator: one degree of freedom, as in Example 1.
+
+Where the base triangle has right angles, the arcs are 120 degrees apart, all legs are alike and all
+torques are equal, all gamma_k stay equal and E stays at the centre. The angle of the star about s
+obeys tan psi = sqrt(3) tan x with x = gamma_k - pi/4, and Lagrange's equation of x is
+
+    M1(x) x_ddot + M1'(x) x_dot^2 / 2 = tau(t),
+    M1(x) = I_zz / d^2 + Ia_zz + Ip_yy + 2 Ip_xx cos^2 x / d^2,  d = 2 - cos 2x,
+
+with the star's inertia I in {E}, those of the links Ia in {1k} and Ip in {2k}.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
+
+HOME = math.pi / 4
+"""gamma_k [rad] at x = 0: every carriage is in the middle of its side."""
+_TOLERANCE = 1e-13
+"""SciPy's tightest; the steps are shorter than it asks for, so that only rounding is left."""
+_STEPS = 50
+"""The secant converges in five steps; more means that there is no such motion."""
+
+
+def inertia(scene: Scene, x: float) -> float:
+    """M1(x) [kg m^2], twice the kinetic energy of a leg's share over x_dot^2."""
+    star, link = scene.star.inertia, scene.intermediate_inertias[0]
+    d, c = 2.0 - math.cos(2.0 * x), math.cos(x)
+    axial = scene.actuated_inertias[0][2][2] + link[1][1]
+    return float(star.zz / d**2 + axial + 2.0 * link[0][0] * c**2 / d**2)
+
+
+def inertia_slope(scene: Scene, x: float) -> float:
+    """M1'(x) [kg m^2/rad]."""
+    star, link = scene.star.inertia, scene.intermediate_inertias[0]
+    d, d_slope = 2.0 - math.cos(2.0 * x), 2.0 * math.sin(2.0 * x)
+    shape = 2.0 * link[0][0]
+    turning = -2.0 * (star.zz + shape * math.cos(x) ** 2) * d_slope / d**3
+    return float(turning - shape * math.sin(2.0 * x) / d**2)
+
+
+def drift_free_rate(scene: Scene) -> float:
+    """Find the initial rate [rad/s] at gamma_k = pi/4 with which gamma returns after one period.
+
+    The paper's rate for Example 1 is lost; this is the one that makes its motion periodic, whatever
+    the inertias are.
+
+    Raises:
+        InputError: the scene is not symmetric, or has no sine torque that is equal at all legs.
+
+    """
+    amplitude, frequency, phase = _torque(scene)
+    _refuse_asymmetry(scene)
+    period = 2.0 * math.pi / frequency
+
+    from scipy.integrate import solve_ivp
+
+    def rates(t: float, y: tuple[float, float]) -> tuple[float, float]:
+        torque = amplitude * math.sin(frequency * t + phase)
+        push = torque - 0.5 * inertia_slope(scene, y[0]) * y[1] ** 2
+        return y[1], push / inertia(scene, y[0])
+
+    def drift(rate: float) -> float:
+        run = solve_ivp(
+            rates, (0.0, period), (0.0, rate), method="DOP853", rtol=_TOLERANCE, atol=1e-15,
+            max_step=period / 300,
+        )  # fmt: skip
+        return float(run.y[0, -1])
+
+    # For a constant inertia the rate is -amplitude cos(phase) / (frequency M1).
+    before = -amplitude * math.cos(phase) / (frequency * inertia(scene, 0.0))
+    rate, moved = 0.9 * before, drift(before)
+    for _ in range(_STEPS):
+        now = drift(rate)
+        if abs(now) < 1e-14 * period or now == moved:
+            return rate
+        before, moved, rate = rate, now, rate - now * (rate - before) / (now - moved)
+    raise InputError(
+        scene.name, [Problem("torque", amplitude, "must leave a motion that repeats itself")]
+    )
+
+
+def _torque(scene: Scene) -> tuple[float, float, float]:
+    torque = scene.torque
+    if torque is None:
+        raise InputError(scene.name, [Problem("torque", None, "must be a sine torque")])
+    phases = torque.phase
+    numbers = [(torque.amplitude[k], torque.frequency[k], phases[k]) for k in range(3)]
+    if numbers[0] != numbers[1] or numbers[0] != numbers[2] or numbers[0][1] <= 0.0:
+        allowed = "must be the same sine at all three actuators"
+        raise InputError(scene.name, [Problem("torque", numbers, allowed)])
+    return numbers[0]
+
+
+def _refuse_asymmetry(scene: Scene) -> None:
+    """Raise InputError where the motion has more than one degree of freedom."""
+    geometry = Geometry.of(scene)
+    products = geometry.v @ geometry.v.T - [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    problems = []
+    if abs(products).max() > 1e-12:
+        problems.append(Problem("base.v", scene.base.v, "must be at right angles"))
+    if any(abs(alpha - 120.0) > 1e-9 for alpha in scene.star.alpha_deg):
+        problems.append(Problem("star.alpha_deg", scene.star.alpha_deg, "must be 120 deg"))
+    for key, links in (
+        ("actuated_links", scene.actuated_inertias),
+        ("intermediate_links", scene.intermediate_inertias),
+    ):
+        if abs(links - links[0]).max() > 0.0:
+            problems.append(Problem(key, "three different links", "must be alike"))
+    link = scene.intermediate_inertias[0]
+    if link[1][1] != link[2][2] or link[0][1] or link[0][2] or link[1][2]:
+        allowed = "must be diagonal with yy = zz"
+        problems.append(Problem("intermediate_links.inertia", link.tolist(), allowed))
+    loads = {"gravity": scene.gravity, "friction": scene.friction, "payload": scene.payload}
+    problems += [Problem(key, "given", "must be absent") for key, load in loads.items() if load]
+    if problems:
+        raise InputError(scene.name, problems)
