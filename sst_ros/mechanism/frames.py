@@ -5,19 +5,57 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from sst_ros.mechanism.geometry import Array
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Array:
-    """Rotation R of {E} in {B}, shape (..., 3, 3), of quaternions (x, y, z, w), (..., 4)."""
-    return np.asarray(Rotation.from_quat(np.asarray(quaternion)).as_matrix())
+    """Rotation R of {E} in {B}, shape (..., 3, 3), of quaternions (x, y, z, w), (..., 4).
+
+    Raises:
+        ValueError: a quaternion is zero.
+
+    """
+    q = np.asarray(quaternion, dtype=float)
+    length = np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
+    if np.any(length == 0.0):
+        raise ValueError("a quaternion of length zero is no rotation")
+    x, y, z, w = np.moveaxis(q / length, -1, 0)
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    rows = (
+        (xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        (2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
+        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quaternion_of(rotation: ArrayLike) -> Array:
-    """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True))
+    """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices (..., 3, 3).
+
+    The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31 (2008)
+    440-442). Where w is zero, the first other component that is not is positive.
+    """
+    m = np.asarray(rotation, dtype=float)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    found = []
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        parts = [np.empty(0)] * 4
+        parts[i] = 1.0 - trace + 2.0 * m[..., i, i]
+        parts[j] = m[..., j, i] + m[..., i, j]
+        parts[k] = m[..., k, i] + m[..., i, k]
+        parts[3] = m[..., k, j] - m[..., j, k]
+        found.append(np.stack(parts, axis=-1))
+    last = [m[..., k, j] - m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+    found.append(np.stack([*last, 1.0 + trace], axis=-1))
+    diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], trace], axis=-1)
+    largest = np.argmax(diagonal, axis=-1)
+    q = np.take_along_axis(np.stack(found, axis=-2), largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
+    signs = np.sign(np.roll(q, 1, axis=-1))  # w first
+    first = np.argmax(signs != 0.0, axis=-1)
+    sign = np.take_along_axis(signs, first[..., None], axis=-1)
+    return np.asarray(np.where(sign < 0.0, -q, q))
 
 
 def zyz_angles(rotation: ArrayLike) -> Array:

@@ -15,6 +15,7 @@ import pytest
 from loaded_scenes import REST, apart, run
 
 from sst_ros.control.torque_profiles import sine
+from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
 
@@ -115,3 +116,30 @@ def test_springs_keep_their_energy_for_20_seconds():
 @pytest.mark.slow
 def test_springs_keep_their_energy_for_1000_seconds():
     assert energy_drift(1000.0, compiled=True) < 1e-12
+
+
+SHARP = [  # underestimated 27, 11, 16 and 10 times by an estimate that took order 4 for granted
+    ("example2", 0.05, 1e-4, 1),
+    ("example2", 0.5, 1e-3, 5),
+    ("example2", 0.5, 1e-4, 5),
+    ("friction", 0.05, 1e-4, 2),
+]
+
+
+@pytest.mark.parametrize(("name", "coulomb", "smoothing", "step_ms"), SHARP)
+def test_fixed_steps_over_sharp_friction_are_estimated_by_the_order_that_is_left(
+    name, coulomb, smoothing, step_ms
+):
+    friction = JointFriction(gamma=Friction(coulomb=coulomb, smoothing=smoothing))
+    scene = replace(load(name), friction=friction)
+    torque = sine(scene.torque)
+    fixed = Simulation(scene, "rk4")
+    truth = Simulation(scene, tolerance=1e-11, step_budget=10**6)
+    for k in range(50):
+        now = torque(k * PERIOD)
+        truth.step(now, 10_000_000)
+        for _ in range(10 // step_ms):
+            fixed.step(now, step_ms * 1_000_000)
+    error, rate_error = apart(fixed, truth)
+    assert 0.1 * error < fixed.error_estimate < 10.0 * error
+    assert 0.1 * rate_error < fixed.rate_error_estimate < 10.0 * rate_error
