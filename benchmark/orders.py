@@ -71,7 +71,7 @@ def _orders() -> None:
         told(method.name, method.order, n, [math.dist(end, truth) for end in ends])
     for nodes, n in ((2, 64), (4, 12)):
         gauss = Collocation(system, nodes, compiled=False)
-        ends = [gauss.march(0.0, SPAN / k, k, start, iterations=20).y for k in (n, 2 * n)]
+        ends = [gauss.solve(0.0, SPAN / k, k, start, iterations=20).y for k in (n, 2 * n)]
         told(f"gauss {nodes}", 2 * nodes, n, [math.dist(end, truth) for end in ends])
 
 

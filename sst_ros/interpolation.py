@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.kernel import Joints
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, State
 from sst_ros.torque import ConstantTorque, FeedbackFunction, TorqueProfile
 
@@ -26,6 +27,12 @@ _ACCURACY = 1e-13
 
 def integrated(trajectory: Trajectory, times: Array) -> Array:
     """States (quaternion, body rate, acting torque) at times [s] inside, shape (m, 10)."""
+    if trajectory.dense is not None:
+        states = trajectory.dense(times)
+        if states.shape[1] > 7 or not isinstance(trajectory.law, TorqueProfile):
+            return states
+        limit = _torque_limit(trajectory.scene)
+        return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
     samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
     before = np.searchsorted(trajectory.t, times, side="right") - 1
     found = samples[before]
@@ -51,6 +58,11 @@ def state_of(dynamics: Dynamics, t: float, y: Sequence[float], torque: Sequence[
     )
 
 
+def _torque_limit(scene: Scene) -> float:
+    limit = scene.actuators.torque_limit if scene.actuators else None
+    return np.inf if limit is None else limit
+
+
 class _Gap:
     """Integrates from a sample towards the next one."""
 
@@ -58,8 +70,7 @@ class _Gap:
         scene = trajectory.scene
         self._dynamics = Dynamics.of(scene)
         self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
-        limit = scene.actuators.torque_limit if scene.actuators else None
-        self._limit = np.inf if limit is None else limit
+        self._limit = _torque_limit(scene)
         self._more = (0.0,) * (len(self._dynamics.drive) - 3)
 
     def states(self, k: int, sample: Array, times: Array) -> Array:

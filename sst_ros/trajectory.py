@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,6 +50,7 @@ class Trajectory:
         evaluations: how often the derivative was evaluated.
         law: torques that act between the samples, for `at`; by default each is held over the
             interval that ends at its sample.
+        dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
 
     Raises:
         InputError: shapes do not fit, or times do not ascend.
@@ -72,6 +73,7 @@ class Trajectory:
         energy_residual: float | Callable[[], float] = float("nan"),
         evaluations: int = 0,
         law: Law | None = None,
+        dense: Callable[[Array], Array] | None = None,
     ) -> None:
         given = {"t": t, "quaternion": quaternion, "body_rate": body_rate, "torque": torque}
         arrays = {name: np.asarray(value, dtype=float) for name, value in given.items()}
@@ -89,7 +91,19 @@ class Trajectory:
         self.error_estimate = error_estimate
         self.evaluations = evaluations
         self.law = law
+        self.dense = dense
         self._residual = energy_residual
+
+    @classmethod
+    def _shared(cls, shared: dict[str, Any], y: Array) -> Trajectory:
+        """Build one from its other attributes and checked states (n, 7 or 10), for `simulate`."""
+        new = cls.__new__(cls)
+        new.__dict__.update(shared)
+        new.quaternion = y[:, :4]
+        new.body_rate = y[:, 4:7]
+        if y.shape[1] > 7:
+            new.torque = y[:, 7:10]
+        return new
 
     def __len__(self) -> int:
         return len(self.t)
@@ -196,6 +210,7 @@ class Trajectory:
             energy_residual=self._residual,
             evaluations=self.evaluations,
             law=self.law,
+            dense=self.dense,
         )
 
     def to_pandas(self) -> pd.DataFrame:

@@ -16,7 +16,8 @@ FLOORS = (
     {"mechanism"},
     {"dynamics"},
     {"integration"},
-    {"torque", "simulation", "interpolation", "trajectory", "trajectory_file", "simulate_motion"},
+    {"simulation", "torque", "interpolation", "trajectory", "trajectory_file"}
+    | {"simulate_gauss", "simulate_steps", "simulate_motion"},
     {"control", "description"},
     {"recording"},
     {"plot", "report", "studies", "view"},

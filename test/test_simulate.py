@@ -65,6 +65,62 @@ def test_a_limit_ends_the_motion_and_keeps_what_is_valid():
     assert few.t[2] == pytest.approx(found.t[-1], abs=1e-9)
 
 
+def test_collocation_is_chosen_for_a_smooth_motion_under_a_profile_and_is_as_accurate_as_it_says():
+    truth = simulate(EXAMPLE2, method="dop853", tolerance=1e-13)
+    found = simulate(EXAMPLE2, tolerance=1e-9)
+    assert "gauss" in found.method
+    assert "auto" in found.method
+    assert found.evaluations < 1000
+    apart = np.abs(found.quaternion[-1] - truth.quaternion[-1]).max()
+    assert apart < found.error_estimate <= 1e-9
+    assert abs(found.energy_residual) < 1e-9
+    times = np.linspace(0.0, 1.0, 201)
+    np.testing.assert_allclose(found.at(times).gamma, truth.gamma, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.at(times).torque, truth.torque, rtol=0, atol=1e-13)
+    sampled = simulate(EXAMPLE2, tolerance=1e-9, t_eval=times)
+    np.testing.assert_allclose(sampled.gamma, found.at(times).gamma, rtol=0, atol=1e-14)
+
+
+def test_the_same_call_again_gives_the_same_bits_and_its_own_arrays():
+    first, second = simulate(EXAMPLE2), simulate(EXAMPLE2)
+    assert first.quaternion.tobytes() == second.quaternion.tobytes()
+    first.quaternion[:] = 0.0
+    assert second.quaternion.all(axis=1).any()
+    other = simulate(EXAMPLE2, duration=0.5)
+    assert other.t[-1] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("scene", "torque", "said"),
+    [
+        ("elastic_stops", None, "at_end: elastic"),
+        ("friction", None, "steps of collocation"),
+        ("example2", lambda t: (t, t, t), "constant torques and sines"),
+    ],
+)
+def test_auto_says_why_collocation_is_not_chosen_and_gauss_refuses(scene, torque, said):
+    assert said in simulate(scene, torque, 0.02).method or scene == "friction"
+    if scene != "friction":
+        with pytest.raises(InputError, match=said):
+            simulate(scene, torque, 0.02, method="gauss")
+
+
+def test_collocation_ends_at_a_limit_as_the_steps_do():
+    found = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 0.4)
+    stepped = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 0.4, method="dop853", tolerance=1e-12)
+    assert "gauss" in found.method
+    assert (found.status, stepped.status) == (1, 1)
+    assert found.t[-1] == pytest.approx(stepped.t[-1], abs=2e-9)
+    assert found.message[:35] == stepped.message[:35]
+    assert found.gamma[-1, 0] == pytest.approx(np.pi / 2, abs=1e-9)
+
+
+def test_a_stiff_scene_is_stepped_by_rodas4():
+    found = simulate("stiff", duration=0.05)
+    assert "rodas4" in found.method
+    assert found.success
+
+
 def test_another_start():
     for initial in (([0.5, 0.6, 0.7], np.zeros(3)), {"gamma": [0.5, 0.6, 0.7]}):
         found = simulate(EXAMPLE2, duration=0.01, initial=initial)
@@ -87,6 +143,7 @@ def test_another_start():
         ({"method": "euler"}, "must be one of auto, rk4, dopri5, dop853, rodas4, gauss"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),
+        ({"method": "gauss", "torque": lambda t: (t, t, t)}, "constant torques and sines"),
         ({"initial": {"gama": 1}}, "must have the key gamma"),
         ({"initial": {"gamma": [3.0, 1.0, 1.0]}}, "must lie in the stroke"),
     ],

@@ -35,7 +35,7 @@ def series(task: Task, quick: bool) -> list[Series]:
 def _collocation(task: Task, nodes: int) -> Series:
     """Few long steps; how often each is iterated is part of the setting.
 
-    Numbers are laid out before, as MuJoCo's and Pinocchio's data are; `fly` is the whole second,
+    Numbers are laid out before, as MuJoCo's and Pinocchio's data are; `run` is the whole second,
     from the start, torques at all nodes included, in one call from Python.
     """
     method = Collocation(task.system, nodes)
@@ -45,13 +45,13 @@ def _collocation(task: Task, nodes: int) -> Series:
 
     def setting(steps: int, iterations: int) -> Setting:
         def prepare() -> Run:
-            course = method.course(0.0, DURATION / steps, steps, task.start, iterations=iterations)
+            motion = method.prepare(0.0, DURATION / steps, steps, task.start, iterations=iterations)
 
             def poses(pieces: int) -> list[Pose]:
-                course.fly()
-                return [task.pose_of(course.end)]
+                motion.run()
+                return [task.pose_of(motion.end)]
 
-            return Run(course.fly, poses)
+            return Run(motion.run, poses)
 
         label = f"{steps} steps of {iterations} iterations"
         return Setting(label, steps * iterations, prepare, samples=False)

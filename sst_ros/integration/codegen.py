@@ -229,10 +229,17 @@ def _code(text: str, name: str) -> CodeType:
     return compile(text, f"<{name}>", "exec")
 
 
-def has_code(texts: list[str], constants: dict[str, Any], functions: Sequence[str]) -> bool:
+def has_code(
+    texts: list[str],
+    constants: dict[str, Any],
+    functions: Sequence[str],
+    *,
+    rounding: bool = True,
+) -> bool:
     """Tell whether machine code of these functions of the module is there to be loaded."""
+    more = "" if rounding else _FREE_ROUNDING
     try:
-        path = _path_of(_for_numba(texts, constants))
+        path = _path_of(_for_numba(texts, constants, more=more))
     except OSError:
         return False
     cached = path.parent / "__pycache__"

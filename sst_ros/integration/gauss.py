@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gauss collocation whose stages are the lanes of a SIMD loop: whole motions in few long steps.
+"""Gauss collocation whose nodes are the lanes of a SIMD loop: whole motions in few long steps.
 
 A step puts a polynomial through the accelerations at the Gauss nodes (order 2 s with s nodes). Its
-equations are solved by iteration (Picard; van der Houwen & Sommeijer, J. Comput. Appl. Math. 29
-(1990) 111-127): all s accelerations are evaluated at once, which costs a compiler with SIMD little
-more than one. The first evaluation of a step is at the state of its beginning, where only time
-differs from lane to lane. Steps know nothing of each other.
+equations are solved by fixed-point iteration (Picard; van der Houwen & Sommeijer, J. Comput. Appl.
+Math. 29 (1990) 111-127): all s accelerations are evaluated at once, which costs a compiler with
+SIMD little more than one. The first evaluation of a step is at the state of its beginning, where
+only time differs from lane to lane. Steps have one length and no memory of each other.
 
 For motions that are smooth over long steps, as under torques that are functions of time in a
-scene; not for stiff scenes, nor for torques that jump, nor for ends.
+scene; not for stiff scenes, nor for torques that jump, nor for contacts.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 
+from sst_ros.dynamics.expression import Program
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen, gauss_source
 from sst_ros.integration.ode import ODE
@@ -30,7 +31,7 @@ NODES = 8
 """Two registers of AVX2; order 16."""
 
 
-class Flight(NamedTuple):
+class EndState(NamedTuple):
     """Where a motion ends.
 
     Attributes:
@@ -43,46 +44,73 @@ class Flight(NamedTuple):
     change: float
 
 
-class Course:
-    """A stretch of motion whose numbers are laid out once, to be flown as often as one likes.
+class PreparedMotion:
+    """A motion whose numbers are laid out once, to be computed as often as one likes.
 
     Attributes:
-        fly: go from the beginning to the end; returns the change of `Flight`, infinite where the
-            motion has no finite end. It takes no argument and allocates nothing.
+        run: compute it; returns the change of `EndState`, infinite where the motion has no finite
+            end. It takes no argument and allocates nothing.
 
     """
 
-    def __init__(self, march: Callable[[Any], float], block: Any, at: gauss_source.Places) -> None:
-        self._block, self._at = block, at
-        self.fly: Callable[[], float] = partial(march, block)
+    def __init__(
+        self,
+        march: Callable[..., float],
+        block: Any,
+        states: Any,
+        at: gauss_source.Places,
+        nodes: int,
+    ) -> None:
+        self._block, self._states, self._at, self._nodes = block, states, at, nodes
+        self.run: Callable[[], float] = partial(march, block, states)
 
     def begin(self, t: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
-        """Say where `fly` begins: time [s], state, and a drive that is constant.
+        """Set where `run` begins: time [s], state, and a drive that is constant.
 
         Raises:
-            InputError: there are more or fewer numbers than in the system's state and drive.
+            InputError: there are more or fewer numbers than in the state and the drive of the ODE.
 
         """
         place = self._at.begin
         wanted, found = place.stop - place.start - 1, len(y) + len(d)
         if found != wanted:
-            told = f"state and drive must have {wanted} numbers"
-            raise InputError("collocation", [Problem("y, d", found, told)])
+            allowed = f"state and drive must have {wanted} numbers"
+            raise InputError("collocation", [Problem("y, d", found, allowed)])
         for number, value in enumerate((t, *y, *d), start=place.start):
             self._block[number] = value
 
+    def set_step(self, h: float) -> None:
+        """Set the length of a step [s]."""
+        self._block[self._at.counts.stop - 1] = h
+        scaled = (h * tables(self._nodes)).ravel()
+        self._block[self._at.tables] = scaled.tolist() if type(self._block) is list else scaled
+
+    @property
+    def states(self) -> Array:
+        """States at the ends of the steps of the last run, shape (count, numbers of the state)."""
+        count = int(self._block[0])
+        return np.array(self._states).reshape(count, -1)
+
     @property
     def end(self) -> list[float]:
-        """State where the last flight ended."""
-        return [float(value) for value in self._block[self._at.end]]
+        """State at the end of the last run."""
+        size = len(self._states) // int(self._block[0])
+        return [float(value) for value in self._states[-size:]]
+
+    @property
+    def least_margins(self) -> Array:
+        """Least margin of each limit at all nodes of the last run, shape (limits,)."""
+        least = np.asarray(self._block[self._at.least])
+        return np.asarray(least.reshape(-1, self._nodes).min(axis=1))
 
 
 class Collocation:
-    """Motions of a system by Gauss collocation with steps of one length.
+    """Motions of an ODE by Gauss collocation with steps of one length.
 
     Args:
-        system: what is integrated.
+        ode: what is integrated.
         nodes: of a step; the order is twice as many.
+        limits: margins of the state's first seven numbers, watched at all nodes; none by default.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
 
     Raises:
@@ -90,19 +118,26 @@ class Collocation:
 
     """
 
-    def __init__(self, system: ODE, nodes: int = NODES, *, compiled: bool = True) -> None:
+    def __init__(
+        self,
+        ode: ODE,
+        nodes: int = NODES,
+        *,
+        limits: Program | None = None,
+        compiled: bool = True,
+    ) -> None:
         _refuse(nodes=nodes)
         self._compiled = compiled and codegen.numba_version() is not None
-        self._nodes = nodes
-        self._at = gauss_source.places(system, nodes)
+        self._nodes, self._size = nodes, len(ode.state)
+        self._at = gauss_source.places(ode, nodes, limits)
         self._module = codegen.load(
-            gauss_source.source(system, nodes), {}, numba=self._compiled, rounding=False
+            gauss_source.source(ode, nodes, limits), {}, numba=self._compiled, rounding=False
         )
 
-    def course(
+    def prepare(
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
         *, iterations: int = 5,
-    ) -> Course:  # fmt: skip
+    ) -> PreparedMotion:  # fmt: skip
         """Lay out `count` steps of h from t.
 
         Args:
@@ -120,30 +155,42 @@ class Collocation:
         _refuse(count=count, iterations=iterations)
         at, block = self._at, _aligned(self._at.numbers)
         block[at.counts] = count, iterations, h
-        block[at.tables] = h * tables(self._nodes).ravel()
-        numbers = block if self._compiled else block.tolist()
-        march = _direct(self._module.march) if self._compiled else self._module.march
-        course = Course(march, numbers, at)
-        course.begin(t, y, d)
-        return course
+        states = np.zeros(count * self._size)
+        if self._compiled:
+            march = _machine_code(self._module.march)
+            motion = PreparedMotion(march, block, states, at, self._nodes)
+        else:
+            lists = block.tolist(), states.tolist()
+            motion = PreparedMotion(self._module.march, *lists, at, self._nodes)
+        motion.set_step(h)
+        motion.begin(t, y, d)
+        return motion
 
-    def march(
+    def solve(
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
         *, iterations: int = 5,
-    ) -> Flight:  # fmt: skip
-        """Go on from t by `count` steps of h, see `course`.
+    ) -> EndState:  # fmt: skip
+        """Go on from t by `count` steps of h, see `prepare`.
 
         Raises:
             ArithmeticError: the motion has no finite end.
 
         """
-        course = self.course(t, h, count, y, d, iterations=iterations)
-        change = course.fly()
+        motion = self.prepare(t, h, count, y, d, iterations=iterations)
+        change = motion.run()
         if not math.isfinite(change):
-            raise ArithmeticError(f"{count} steps of {h:g} s from t = {t:g} s end nowhere finite")
-        return Flight(course.end, change)
+            raise ArithmeticError(f"{count} steps of {h:g} s from t = {t:g} s: not finite")
+        return EndState(motion.end, change)
 
 
+def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> bool:
+    """Tell whether the machine code of a `Collocation` is there to be loaded."""
+    texts = gauss_source.source(ode, nodes, limits)
+    known = codegen.numba_version() is not None
+    return known and codegen.has_code(texts, {}, ("march",), rounding=False)
+
+
+@lru_cache(maxsize=16)
 def tables(nodes: int) -> Array:
     """Rows: nodes, weights, then columns of A.
 
@@ -156,13 +203,13 @@ def tables(nodes: int) -> Array:
     return np.vstack([(x + 1.0) / 2.0, w / 2.0, integrals.T])
 
 
-def _direct(function: Any) -> Callable[[Any], float]:
-    """Machine code for one array: numba then need not look at the argument in each call."""
+def _machine_code(function: Any) -> Callable[..., float]:
+    """Machine code for two arrays: numba then need not look at the arguments in each call."""
     import numba
 
-    signature = (numba.types.Array(numba.float64, 1, "C"),)
-    function.compile(signature)
-    found: Callable[[Any], float] = function.get_overload(signature)
+    array = numba.types.Array(numba.float64, 1, "C")
+    function.compile((array, array))
+    found: Callable[..., float] = function.get_overload((array, array))
     return found
 
 

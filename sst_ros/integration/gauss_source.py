@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text of the loop of Gauss collocation: Picard's iteration over lanes, see `collocation`.
+"""Source of the loop of Gauss collocation: Picard's iteration over SIMD lanes, see `gauss`.
 
 An iteration integrates the slopes at the nodes to rates, turns the quaternion with these rates,
 and evaluates. Rows of `block` are read lane by lane before a loop, since SIMD needs that they are
@@ -12,8 +12,9 @@ import inspect
 import re
 from typing import NamedTuple
 
+from sst_ros.dynamics.expression import Program
 from sst_ros.integration.ode import ODE
-from sst_ros.integration.simd_source import Layout, indented, loop, split
+from sst_ros.integration.simd_source import Layout, evaluated, indented, loop, split
 from sst_ros.integration.sine_source import flat_sin
 
 HEAD = 3
@@ -21,42 +22,43 @@ HEAD = 3
 
 
 class Places(NamedTuple):
-    """Where in the numbers of a course is what: counts and step, time with state and drive, end."""
+    """Where in `block` is what: counts and step, time with state and drive, tables, margins."""
 
     numbers: int
     counts: slice
     begin: slice
-    end: slice
     tables: slice
+    least: slice
 
 
-def places(system: ODE, nodes: int) -> Places:
+def places(system: ODE, nodes: int, limits: Program | None) -> Places:
     """Lay out what `march` reads and writes."""
-    at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
-    begin, end, table = (at.first(group) for group in ("begin", "end", "node"))
+    at, inputs = _layout(system, nodes, limits), len(system.program.inputs)
+    begin, table, least = (at.first(group) for group in ("begin", "node", "least"))
     return Places(
         at.numbers,
         slice(0, HEAD),
         slice(begin, begin + inputs),
-        slice(end, end + size),
         slice(table, table + (2 + nodes) * nodes),
+        slice(least, least + (len(limits.outputs) * nodes if limits else 0)),
     )
 
 
-def source(system: ODE, nodes: int) -> list[str]:
-    """Texts of flat_sin and of `march(block)`, which returns the change of `collocation.Flight`."""
-    return [inspect.getsource(flat_sin), _march(system, nodes)]
+def source(system: ODE, nodes: int, limits: Program | None) -> list[str]:
+    """Texts of flat_sin and of `march(block, states)`, see `gauss.PreparedMotion`."""
+    return [inspect.getsource(flat_sin), _march(system, nodes, limits)]
 
 
-def _layout(system: ODE, nodes: int) -> Layout:
+def _layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
     size, inputs = len(system.state), len(system.program.inputs)
 
     def rows(numbers: int) -> int:
         return -(-numbers // nodes)
 
     return Layout(
-        nodes, head=rows(HEAD), begin=rows(inputs), end=rows(size), node=1, weight=1, a=nodes,
+        nodes, head=rows(HEAD), begin=rows(inputs), node=1, weight=1, a=nodes,
         known=max(1, len(_known(system))), s=size, f=size, old=size,
+        far=len(limits.outputs) if limits else 1, least=len(limits.outputs) if limits else 1,
     )  # fmt: skip
 
 
@@ -71,8 +73,8 @@ def _time_only(system: ODE) -> list[bool]:
     return [True, *(False,) * len(system.state), *(True,) * len(system.drive)]
 
 
-def _march(system: ODE, nodes: int) -> str:
-    at, size, inputs = _layout(system, nodes), len(system.state), len(system.program.inputs)
+def _march(system: ODE, nodes: int, limits: Program | None) -> str:
+    at, size, inputs = _layout(system, nodes, limits), len(system.state), len(system.program.inputs)
     everything, quaternion, rates = range(size), range(4), range(4, size)
     known = _known(system)
     _, after, results = split(system.program, _time_only(system))
@@ -141,23 +143,36 @@ def _march(system: ODE, nodes: int) -> str:
             ],
         ),
     ]
+    margins = range(len(limits.outputs) if limits else 0)
+
+    def nearer(m: int) -> str:
+        far, least = at.lane("far", m), at.lane("least", m)
+        return f"{least} = {far} if {far} < {least} else {least}"
+
+    checking = [] if limits is None else [
+        *kept(range(2)),
+        *kept(range(2, 4)),
+        *evaluated(limits, at.rows("s", 7), at, "far"),
+        *loop(at, [nearer(m) for m in margins]),
+    ]  # fmt: skip
     lines = [
-        "def march(block):",
+        "def march(block, states):",
         "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
         *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
         *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
+        *indented(4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in margins] or ["pass"])),
         "    worst = 0.0",
         "    for step in range(count):",
         f"        begin = {at.lane('begin', 0, 0)} + step * h",
         *indented(8, first),
         "        for iteration in range(1, iterations):",
         *indented(12, [*turning, *evaluating]),
-        *indented(8, turning),
+        *indented(8, [*turning, *checking]),
         *(f"        worst = max(worst, abs({summed(j, '({f} - {old})')}))" for j in range(4, 7)),
         *(f"        y{j} = y{j} + {summed(j, '{f}')}" for j in everything),
         "        factor = 1.0 / sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)",
         *(f"        y{j} = y{j} * factor" for j in quaternion),
-        *(f"    {at.lane('end', 0, j)} = y{j}" for j in everything),
+        *(f"        states[{size} * step + {j}] = y{j}" for j in everything),
         f"    finite = {' + '.join(f'abs(y{j})' for j in everything)} < INFINITE",
         "    return worst if finite else INFINITE",
     ]

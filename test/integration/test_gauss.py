@@ -61,11 +61,11 @@ def apart(y, truth):
 def test_a_second_of_example_2_in_a_few_steps(truth, nodes, steps, iterations, error):
     system = ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque)
     method = Collocation(system, nodes, compiled=False)
-    flight = method.march(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
-    assert apart(flight.y, truth) < error
-    assert math.dist(flight.y[4:], truth[4:]) < 10.0 * error
-    assert math.hypot(*flight.y[:4]) == pytest.approx(1.0, abs=1e-15)
-    assert flight.change > apart(flight.y, truth)
+    end = method.solve(0.0, 1.0 / steps, steps, STATE, iterations=iterations)
+    assert apart(end.y, truth) < error
+    assert math.dist(end.y[4:], truth[4:]) < 10.0 * error
+    assert math.hypot(*end.y[:4]) == pytest.approx(1.0, abs=1e-15)
+    assert end.change > apart(end.y, truth)
 
 
 @pytest.mark.parametrize(("nodes", "steps"), [(2, 128), (3, 48), (4, 24)])
@@ -73,7 +73,7 @@ def test_measured_order_of_convergence_is_twice_the_nodes(truth, nodes, steps):
     """Iterated to the end. Eight nodes come to rounding before their limit."""
     method = Collocation(ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), nodes, compiled=False)
     coarse, fine = (
-        apart(method.march(0.0, 1.0 / n, n, STATE, iterations=20).y, truth)
+        apart(method.solve(0.0, 1.0 / n, n, STATE, iterations=20).y, truth)
         for n in (steps, 2 * steps)
     )
     assert fine > 1e-12
@@ -87,38 +87,38 @@ def methods(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
         compiled = Collocation(system, 4)
-        compiled.march(0.0, 0.1, 1, STATE)
+        compiled.solve(0.0, 0.1, 1, STATE)
     return {"compiled": compiled, "plain": Collocation(system, 4, compiled=False)}
 
 
 def test_numba_has_the_digits_of_plain_python(methods):
     """All but the last: compiled code may multiply and add in one."""
-    one, other = (m.march(0.1, 0.1, 5, STATE, iterations=4) for m in methods.values())
+    one, other = (m.solve(0.1, 0.1, 5, STATE, iterations=4) for m in methods.values())
     np.testing.assert_allclose(one.y, other.y, rtol=0, atol=1e-14)
     assert one.change == pytest.approx(other.change, rel=1e-9)
 
 
 @pytest.mark.parametrize("way", ["compiled", "plain"])
-def test_a_course_is_flown_again_and_again_and_from_elsewhere(truth, methods, way):
-    course = methods[way].course(0.0, 0.025, 20, STATE, iterations=6)
-    changes = [course.fly() for _ in range(3)]
+def test_a_motion_is_computed_again_and_again_and_from_elsewhere(truth, methods, way):
+    motion = methods[way].prepare(0.0, 0.025, 20, STATE, iterations=6)
+    changes = [motion.run() for _ in range(3)]
     assert changes == [changes[0]] * 3
-    course.begin(0.5, course.end)
-    course.fly()
-    assert apart(course.end, truth) < 1e-9
+    motion.begin(0.5, motion.end)
+    motion.run()
+    assert apart(motion.end, truth) < 1e-9
 
 
 @pytest.mark.parametrize("way", ["compiled", "plain"])
-def test_what_cannot_be_flown_is_refused(methods, way):
+def test_what_cannot_be_computed_is_refused(methods, way):
     with pytest.raises(InputError, match="nodes"):
         Collocation(ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), 0)
     method = methods[way]
     with pytest.raises(InputError, match=r"count(.|\n)*iterations"):
-        method.course(0.0, 0.1, 0, STATE, iterations=0)
+        method.prepare(0.0, 0.1, 0, STATE, iterations=0)
     with pytest.raises(InputError, match="must have 7 numbers"):
-        method.course(0.0, 0.1, 1, STATE, [0.0, 0.0, 0.0])
+        method.prepare(0.0, 0.1, 1, STATE, [0.0, 0.0, 0.0])
     with pytest.raises(ArithmeticError):
-        method.march(0.0, math.inf, 1, STATE)
+        method.solve(0.0, math.inf, 1, STATE)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9, 1e14])
@@ -142,5 +142,5 @@ def test_every_term_lag_and_a_drive_are_carried_along():
     drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]
     wanted = CompiledMethod(system, DOP853, compiled=False).step_fixed(0.0, 2.5e-4, 80, y, drive)
     method = Collocation(system, compiled=False)
-    found = method.march(0.0, 2e-3, 10, y, drive, iterations=9).y
+    found = method.solve(0.0, 2e-3, 10, y, drive, iterations=9).y
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)

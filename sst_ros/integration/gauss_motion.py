@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole motion of a scene by Gauss collocation: step and iterations chosen for a tolerance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sst_ros.dynamics import energy
+from sst_ros.dynamics.expression import Program, trace
+from sst_ros.dynamics.limits import Limit, limits_of
+from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
+from sst_ros.integration.events import first_met, meetings
+from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
+from sst_ros.integration.limit_source import margins
+from sst_ros.integration.ode import ODE
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.scene import Scene, SineTorque
+
+NEAR = 0.05
+"""Margin above which no limit is met between nodes that resolve the motion to the tolerance."""
+
+_ROUNDING = 1e-14
+_ITERATIONS = (5, 6, 8)
+_MOST_ITERATIONS = 10
+
+
+class NotSmooth(ArithmeticError):
+    """Collocation does not reach the tolerance with steps worth taking."""
+
+
+class Ending(NamedTuple):
+    """Where a limit ends a motion: step in which, time in it [s], and the limit."""
+
+    step: int
+    time: float
+    limit: Limit
+
+
+class GaussMotion:
+    """A motion over a span of time, prepared for a tolerance.
+
+    Args:
+        scene: what moves, without contacts.
+        torque: the sine that acts, or three constant torques within the actuators' limit [N m].
+        y: state at t = 0.
+        duration: length of the motion [s].
+        tolerance: largest error estimate of the orientation at the end [rad].
+        compiled: by numba; None where its machine code is there already.
+        finest: most steps that are tried.
+
+    Attributes:
+        count: steps.
+        iterations: evaluations of all nodes in a step.
+        h: length of a step [s].
+        error: estimated error of the orientation at the end [rad]: the distance from a finer
+            solution.
+        run: compute the motion; `states` then has it.
+
+    Raises:
+        NotSmooth: the tolerance is not reached.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        torque: SineTorque | tuple[float, float, float],
+        y: Sequence[float],
+        duration: float,
+        tolerance: float,
+        *,
+        compiled: bool | None = True,
+        finest: int = 4096,
+    ) -> None:
+        self._torque = torque
+        self._dynamics = Dynamics.of(scene)
+        self._limits = tuple(limits_of(scene, Geometry.of(scene)))
+        sine = torque if isinstance(torque, SineTorque) else None
+        held = () if isinstance(torque, SineTorque) else torque
+        self._drive = (*held, *(0.0,) * (len(self._dynamics.drive) - 3))
+        self._method = _collocation(self._dynamics, sine, self._limits, compiled)
+        self._y, self._duration, self._finest = list(y), duration, finest
+        self.count, self.iterations, self.error = self._settings(tolerance)
+        self.h = duration / self.count
+        self._motion = self._prepared(self.count, self.iterations)
+        self.run = self._motion.run
+        self.run()
+
+    @property
+    def states(self) -> Array:
+        """States at the ends of the steps of the last run, shape (count, numbers of the state)."""
+        return self._motion.states
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the derivative in a run."""
+        return self.count * self.iterations * NODES
+
+    @cached_property
+    def grid(self) -> Array:
+        """Times at which steps begin and the last one ends [s], shape (count + 1,)."""
+        times: Array = self.h * np.arange(self.count + 1.0)
+        times[-1] = self._duration
+        return times
+
+    @cached_property
+    def samples(self) -> Array:
+        """States at the times of `grid`."""
+        return np.vstack([self._y, self.states])
+
+    @cached_property
+    def ending(self) -> Ending | None:
+        """Where the first limit is met; None where none is."""
+        if not self._limits or self._motion.least_margins.min() > NEAR:
+            return None
+        for k in range(self.count):
+            met = first_met(meetings(self._limits, lambda x: self._joints(k, x)), self.h)  # noqa: B023
+            if met is not None:
+                return Ending(k, *met)
+        return None
+
+    def at(self, times: Array) -> Array:
+        """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
+        steps = np.clip(np.searchsorted(self.grid, times, side="right") - 1, 0, self.count - 1)
+        ends = (
+            self._inside(int(k), float(t) - float(self.grid[k]))
+            for k, t in zip(steps, times, strict=True)
+        )
+        return np.array(list(ends)).reshape(len(times), -1)
+
+    def energy_residual(self, end: float) -> float:
+        """Energy at `end` [s], less that at 0, less the work done, by Gauss quadrature [J]."""
+        model, rows = self._dynamics.model, tables(NODES)
+        last = max(1, math.ceil(end / self.h - 1e-9))
+        begins = self.grid[:last]
+        lengths = np.minimum(self.grid[1 : last + 1], end) - begins
+        times = (begins[:, None] + lengths[:, None] * rows[0]).ravel()
+        weights = (lengths[:, None] * rows[1]).ravel()
+        y = tuple(self.at(times).T)
+        torque: Any = tuple(self.torque(times).T)
+        work = float(np.sum(weights * energy.power(model, y, torque)))
+        start, stop = (self._stored(self.at(np.array([t]))[0]) for t in (0.0, end))
+        return stop - start - work
+
+    def torque(self, times: Array) -> Array:
+        """Torques that are commanded at times [s], shape (m, 3) [N m]."""
+        if isinstance(self._torque, SineTorque):
+            parts = self._torque.amplitude, self._torque.frequency, self._torque.phase
+            amplitude, frequency, phase = (np.array(part) for part in parts)
+            return np.asarray(amplitude * np.sin(np.multiply.outer(times, frequency) + phase))
+        return np.tile(self._torque, (len(times), 1))
+
+    def _stored(self, y: Array) -> float:
+        kinetic, potential, _ = self._dynamics.energies(
+            *y.tolist(), *(0.0,) * len(self._dynamics.drive)
+        )
+        return kinetic + potential
+
+    @cached_property
+    def _single(self) -> PreparedMotion:
+        return self._prepared(1, self.iterations + 1)
+
+    def _inside(self, k: int, x: float) -> Sequence[float]:
+        """State x [s] after step k began."""
+        begin: list[float] = self.samples[k].tolist()
+        if x == 0.0:
+            return begin
+        self._single.begin(float(self.grid[k]), begin, self._drive)
+        self._single.set_step(x)
+        self._single.run()
+        return self._single.end
+
+    def _joints(self, k: int, x: float) -> tuple[float, ...]:
+        return self._dynamics.joints(*self._inside(k, x)[:7])
+
+    def _prepared(self, count: int, iterations: int) -> PreparedMotion:
+        return self._method.prepare(
+            0.0, self._duration / count, count, self._y, self._drive, iterations=iterations
+        )
+
+    def _settings(self, tolerance: float) -> tuple[int, int, float]:
+        """Choose steps and iterations that reach the tolerance at the least cost; their error."""
+        fine = max(_ROUNDING, 0.01 * tolerance)
+        count, end = self._converged(fine)
+        if not end:
+            raise NotSmooth(f"{self._finest} steps of collocation do not reach {tolerance:g} rad")
+        best: tuple[int, int, int, float] | None = None
+        for iterations in _ITERATIONS:
+            steps, error = count, self._error(count, iterations, end)
+            while error <= 0.5 * max(tolerance, 2.0 * _ROUNDING):
+                if best is None or steps * iterations < best[0]:
+                    best = steps * iterations, steps, iterations, error
+                if steps == 1:
+                    break
+                steps = min(steps - 1, int(0.82 * steps))
+                error = self._error(steps, iterations, end)
+        if best is None:
+            return count, _MOST_ITERATIONS, fine
+        return best[1], best[2], max(best[3], _ROUNDING)
+
+    def _converged(self, fine: float) -> tuple[int, list[float]]:
+        """Double the steps until two ends are the same to `fine`; no end where they never are."""
+        count, before = 1, [math.nan] * 7
+        while count <= self._finest:
+            motion = self._prepared(count, _MOST_ITERATIONS)
+            end = motion.end if math.isfinite(_change(motion)) else [math.nan] * 7
+            if _apart(before, end) < fine:
+                return count, end
+            count, before = 2 * count, end
+        return count, []
+
+    def _error(self, count: int, iterations: int, reference: Sequence[float]) -> float:
+        motion = self._prepared(count, iterations)
+        return _apart(motion.end, reference) if math.isfinite(_change(motion)) else math.inf
+
+
+def _change(motion: PreparedMotion) -> float:
+    try:
+        return motion.run()
+    except (ArithmeticError, ValueError):
+        return math.inf
+
+
+def _apart(one: Sequence[float], other: Sequence[float]) -> float:
+    """Angle between two orientations, or the distance of the body rates where it is larger."""
+    first, second = one[:4], other[:4]
+    near = min(math.dist(first, second), math.dist(first, [-x for x in second]))
+    speed = max(1.0, math.hypot(*other[4:7]))
+    distance = max(2.0 * near, math.dist(one[4:7], other[4:7]) / speed)
+    return distance if math.isfinite(distance) else math.inf
+
+
+@lru_cache(maxsize=32)
+def _collocation(
+    dynamics: Dynamics, sine: SineTorque | None, limits: tuple[Limit, ...], compiled: bool | None
+) -> Collocation:
+    program: Program | None = None
+    if limits:
+        ends = [(math.cos(limit.end), math.sin(limit.end)) for limit in limits]
+        program = trace(
+            lambda *state: margins(limits, ends, dynamics.model, state), (*QUATERNION, *RATE)
+        )
+    ode = ODE(dynamics, sine)
+    if compiled is None:
+        compiled = has_code(ode, limits=program)
+    return Collocation(ode, limits=program, compiled=compiled)

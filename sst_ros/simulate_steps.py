@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions by the steps of `Simulation`: any torque, control periods, limits, stiff scenes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from sst_ros.errors import Diverged, RunStopped
+from sst_ros.progress import slices
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
+from sst_ros.torque import FeedbackFunction, TorqueProfile, TorqueTable, Triple, three
+from sst_ros.trajectory import Trajectory
+
+SAMPLES = 200
+"""Intervals of a motion whose times nobody has named."""
+
+
+class SteppedMotion:
+    """A motion by the steps of `Simulation`.
+
+    Args:
+        scene: what moves.
+        law: torques that act.
+        method, tolerance: see `Simulation`.
+        span: length of the motion [ns].
+        period: control period [ns]; None where torques are not held.
+        reason: why this method was chosen, for the trajectory; "" where the caller chose it.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        law: TorqueProfile | FeedbackFunction,
+        method: str,
+        tolerance: float,
+        span: int,
+        period: int | None,
+        reason: str,
+    ) -> None:
+        self._scene, self._law, self._span, self._period = scene, law, span, period
+        self._reason = reason
+        self._simulation = Simulation(
+            scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
+        )
+        self._method = self._simulation.method
+        self._samples: list[State] = []
+        self._held: list[tuple[int, Triple]] = []
+
+    def run(self, times: np.ndarray | None, progress: bool) -> Trajectory:
+        """Go to the end or a limit; times [ns] of the samples, None for the ends of all steps."""
+        simulation, status, message = self._simulation, 0, "reached the end"
+        ends = self._ends(times)
+        wanted = None if times is None else times.tolist()[::-1]
+        if wanted is None or wanted[-1] == 0:
+            self._samples.append(simulation.state)
+            if wanted:
+                wanted.pop()
+        try:
+            for part in slices(len(ends), 0, f"{self._scene.name}, simulating", progress):
+                for end in ends[part]:
+                    self._step(int(end), wanted)
+        except RunStopped as stopped:
+            status, message = (-1 if isinstance(stopped, Diverged) else 1), str(stopped)
+            self._approach(math.floor(stopped.time * NANOSECONDS), wanted)
+        return self._trajectory(status, message)
+
+    def _ends(self, times: np.ndarray | None) -> np.ndarray:
+        """Return the ends of the steps [ns]: control periods, breaks of the torque, samples."""
+        if self._period is not None:
+            ends = np.arange(self._period, self._span, self._period, dtype=np.int64)
+            return np.append(ends, self._span)
+        if times is None:
+            times = np.rint(np.linspace(0, self._span, SAMPLES + 1)).astype(np.int64)
+        breaks = self._law.breaks() if isinstance(self._law, TorqueProfile) else np.empty(0)
+        found = np.union1d(times, np.rint(breaks * NANOSECONDS).astype(np.int64))
+        return np.union1d(found[(found > 0) & (found < self._span)], self._span)
+
+    def _step(self, end: int, wanted: list[int] | None) -> None:
+        simulation = self._simulation
+        begin = simulation.time_ns
+        simulation.step(self._torque(begin, end), end - begin)
+        if wanted is None:
+            self._samples.append(simulation.state)
+            return
+        while wanted and wanted[-1] <= end:
+            self._samples.append(simulation.within(wanted.pop()))
+
+    def _approach(self, end: int, wanted: list[int] | None) -> None:
+        """Add the last valid state before a limit, whose time is known to the nanosecond."""
+        simulation = self._simulation
+        begin = simulation.time_ns
+        if end <= begin:
+            return
+        try:
+            torque = self._held[-1][1] if self._held else self._torque(begin, end)
+            simulation.step(torque, end - begin)
+        except RunStopped:
+            return
+        while wanted and wanted[-1] < end:
+            self._samples.append(simulation.within(wanted.pop()))
+        self._samples.append(simulation.state)
+
+    def _torque(self, begin: int, end: int) -> Any:
+        """Torques of the step from begin to end [ns]: numbers, or a function of time."""
+        law, start = self._law, begin / NANOSECONDS
+        if self._period is None:
+            assert isinstance(law, TorqueProfile)
+            piece = law.between(start, end / NANOSECONDS)
+            return getattr(piece, "torque", piece)
+        value = law(start) if isinstance(law, TorqueProfile) else law(start, self._simulation.state)
+        torque = three(value, f"torque({start:g})")
+        self._held.append((begin, torque))
+        return torque
+
+    def _trajectory(self, status: int, message: str) -> Trajectory:
+        simulation, samples = self._simulation, self._samples
+        law: Any = self._law
+        if self._held:
+            times, torques = zip(*self._held, strict=True)
+            law = TorqueTable(np.array(times) / NANOSECONDS, torques)
+        changes = [f"{to} from {at:g} s ({why})" for at, to, why in simulation.changes]
+        torque = np.array([state.torque for state in samples]).reshape(-1, 3)
+        if self._period is None and len(samples) and samples[0].time_ns == 0:
+            torque[0] = self._first(law)
+        return Trajectory(
+            self._scene,
+            np.array([state.time_ns for state in samples]) / NANOSECONDS,
+            np.array([state.quaternion for state in samples]).reshape(-1, 4),
+            np.array([state.body_rate for state in samples]).reshape(-1, 3),
+            torque,
+            joints=np.array([sum(state.joints, ()) for state in samples]).reshape(-1, 18),
+            status=status,
+            message=message,
+            method=", then ".join([self._method, *changes]) + self._reason,
+            error_estimate=simulation.error_estimate,
+            energy_residual=simulation.energy_residual,
+            law=law,
+        )
+
+    def _first(self, law: Any) -> Any:
+        """Torques that act at t = 0; a state before the first step does not know them."""
+        scene, lag = self._scene.actuators, 0.0
+        if scene is not None and scene.time_constant is not None:
+            return (lag,) * 3
+        limit = math.inf if scene is None or scene.torque_limit is None else scene.torque_limit
+        return np.clip(law(0.0), -limit, limit)
