@@ -116,7 +116,7 @@ def test_collocation_ends_at_a_limit_as_the_steps_do():
 
 
 def test_a_stiff_scene_is_stepped_by_rodas4():
-    found = simulate("stiff", duration=0.2)
+    found = simulate("stiff", duration=1.0, tolerance=1e-6)
     assert "rodas4" in found.method
     assert found.success
 

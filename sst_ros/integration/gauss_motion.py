@@ -14,7 +14,7 @@ from sst_ros.dynamics import energy
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
-from sst_ros.integration.events import first_met, meetings
+from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
 from sst_ros.integration.limit_source import margins
 from sst_ros.integration.ode import ODE
@@ -119,7 +119,7 @@ class GaussMotion:
         if not self._limits or self._motion.least_margins.min() > NEAR:
             return None
         for k in range(self.count):
-            met = first_met(meetings(self._limits, lambda x: self._joints(k, x)), self.h)  # noqa: B023
+            met = first_event(self._limits, lambda x: self._joints(k, x), self.h)  # noqa: B023
             if met is not None:
                 return Ending(k, *met)
         return None
