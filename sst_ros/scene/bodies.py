@@ -22,6 +22,9 @@ Vector = tuple[float, float, float]
 
 RELATIVE_ROUNDING = 1e-9
 
+SMALLEST_MOMENT = 1e-18
+"""Moment of inertia [kg m^2] of a microgram at a millimetre; its inverse must not overflow."""
+
 
 @dataclass(frozen=True)
 class Inertia(Section):
@@ -50,8 +53,11 @@ class Inertia(Section):
     def check(self) -> Iterator[Problem]:
         """Refuse what no rigid body has."""
         moments = [float(moment) for moment in np.linalg.eigvalsh(self.matrix)]
-        if moments[0] <= 0.0:
-            allowed = "principal moments of inertia must be > 0 (positive definite)"
+        if moments[0] < SMALLEST_MOMENT:
+            allowed = (
+                "principal moments of inertia must be > 0 (positive definite), "
+                f"at least {SMALLEST_MOMENT:g} kg m^2"
+            )
             yield Problem("", moments, allowed)
         elif moments[2] > (moments[0] + moments[1]) * (1.0 + RELATIVE_ROUNDING):
             allowed = "no principal moment may exceed the sum of the other two"

@@ -15,13 +15,16 @@ from sst_ros.errors import Problem
 from sst_ros.scene.bodies import Vector
 from sst_ros.scene.schema import Section, number, section, sections, specs, text
 
+NANOSECOND = 1e-9
+"""Resolution of time [s]."""
+
 
 @dataclass(frozen=True)
 class ToAngles(Section):
     """The actuators go straight from their initial angles to others, with minimum jerk."""
 
     gamma: Vector = number("actuator angles at the end", "rad", shape=(3,))
-    duration: float = number("time that it takes", "s", above=0.0)
+    duration: float = number("time that it takes", "s", least=NANOSECOND)
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class ToOrientation(Section):
     orientation: tuple[float, float, float, float] = number(
         "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1", shape=(4,)
     )
-    duration: float = number("time that it takes", "s", above=0.0)
+    duration: float = number("time that it takes", "s", least=NANOSECOND)
 
     def check(self) -> Iterator[Problem]:
         """Refuse a quaternion without direction."""
@@ -59,8 +62,8 @@ class Sweep(Section):
     centre: Vector | None = number(
         "centres; by default the initial angles", "rad", shape=(3,), default=None
     )
-    fade: float = number("time to grow and to fade", "s", above=0.0)
-    duration: float = number("time that it takes", "s", above=0.0)
+    fade: float = number("time to grow and to fade", "s", least=NANOSECOND)
+    duration: float = number("time that it takes", "s", least=NANOSECOND)
 
     def check(self) -> Iterator[Problem]:
         """Refuse to fade for longer than there is time."""
@@ -79,7 +82,7 @@ class Spiral(Section):
     phi: float = number("tilt at the end", "rad", least=0.0, most=3.141592653589793)
     theta: float = number("how far the direction of the tilt turns", "rad")
     psi: float = number("turn about E at the end", "rad", default=0.0)
-    duration: float = number("time that it takes", "s", above=0.0)
+    duration: float = number("time that it takes", "s", least=NANOSECOND)
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,6 @@ class DesiredMotion(Section):
             allowed = "give one of " + ", ".join(specs(DesiredMotion))
             yield Problem("", given or None, allowed)
         for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
-            if here.time <= before.time:
-                allowed = f"must be > {before.time:g} s, that of the point before"
+            if here.time < before.time + NANOSECOND:
+                allowed = f"must be > {before.time:g} s, that of the point before, by 1e-9 s"
                 yield Problem(f"waypoints[{index}].time", here.time, allowed)

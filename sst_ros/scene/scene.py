@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -27,14 +27,15 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.motions import DesiredMotion
-from sst_ros.scene.schema import Section, notes, number, section, sections, specs, text
+from sst_ros.scene.schema import Section, Spec, notes, number, section, sections, specs, text
 from sst_ros.scene.values import replaced
 from sst_ros.scene.yaml_document import from_values, read, values_of
 
 Matrix = NDArray[np.float64]
 
-LARGEST = 1e9
-"""No number of a scene is larger; anything beyond is a slip of units."""
+LARGEST, SMALLEST = 1e9, 1e-12
+"""No number of a scene is larger, none that must be positive smaller: it is a slip of units, and
+its powers leave the range of double precision."""
 
 __all__ = [
     "Actuators",
@@ -134,32 +135,26 @@ class Scene(Section):
         """Inertias of the intermediate links in {2k}, shape (3, 3, 3) [kg m^2]."""
         return np.stack([_matrix(link) for link in self.intermediate_links])
 
-    def checks(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
-        """Refuse what contradicts itself across sections."""
-        return (self._sizes, self._centres, self._weights, self._notes)
-
-    def _sizes(self) -> Iterator[Problem]:
-        for key, value in _numbers(self, ""):
+    def check(self) -> Iterator[Problem]:
+        """Refuse what contradicts itself across sections, and numbers of another unit."""
+        for key, value, spec in _numbers(self, ""):
             if abs(value) > LARGEST:
                 allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
                 yield Problem(key, value, allowed)
-
-    def _centres(self) -> Iterator[Problem]:
+            elif spec.above == 0.0 and value < SMALLEST:
+                allowed = f"must be at least {SMALLEST:g}: use m, kg, s, rad, N"
+                yield Problem(key, value, allowed)
         reach = max(self.base.radius, self.star.radius)
         for key, body in self._bodies():
             if np.linalg.norm(body.centre) > reach:
                 yield Problem(f"{key}.centre", body.centre, f"must lie within {reach:g} m of O")
-
-    def _weights(self) -> Iterator[Problem]:
         heavy = self.payload or any(body.mass for _, body in self._bodies())
         if self.gravity and not heavy:
             allowed = "acts on nothing: no body has a mass"
             yield Problem("gravity", self.gravity.acceleration, allowed)
-
-    def _notes(self) -> Iterator[Problem]:
-        for key, said in self.provenance:
+        for key, note in self.provenance:
             if not _has(type(self), key.split(".")):
-                yield Problem(f"provenance.{key}", said, "is about a key that no scene has")
+                yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
     def _bodies(self) -> Iterator[tuple[str, Star | Link]]:
         yield "star", self.star
@@ -220,17 +215,19 @@ def share_directory() -> Path:
     raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
 
 
-def _numbers(value: object, key: str) -> Iterator[tuple[str, float]]:
-    """Yield every number of a section with its key."""
+def _numbers(
+    value: object, key: str, spec: Spec | None = None
+) -> Iterator[tuple[str, float, Spec]]:
+    """Yield every number of a section with its key and its specification."""
     if isinstance(value, Section):
-        for name in specs(type(value)):
-            yield from _numbers(getattr(value, name), f"{key}.{name}" if key else name)
+        for name, inner in specs(type(value)).items():
+            yield from _numbers(getattr(value, name), f"{key}.{name}" if key else name, inner)
     elif isinstance(value, tuple):
         for index, entry in enumerate(value):
-            inner = f"{key}[{index}]" if isinstance(entry, Section) else key
-            yield from _numbers(entry, inner)
-    elif isinstance(value, float):
-        yield key, value
+            where = f"{key}[{index}]" if isinstance(entry, Section) else key
+            yield from _numbers(entry, where, spec)
+    elif isinstance(value, float) and spec is not None:
+        yield key, value, spec
 
 
 def _has(cls: type[Section], path: list[str]) -> bool:

@@ -9,12 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 from sst_ros.errors import InputError, Problem
+
+_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+"""A decimal number of YAML 1.2 and JSON: no 3_5, 0x10 or 1:30, of which YAML 1.1 makes others."""
+
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""What a terminal obeys, and halves of characters."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ class Spec:
         return {
             "integer": f"must be a whole number from {self.least:g} to {self.most:g} [{self.unit}]",
             "flag": "must be true or false",
-            "text": "must be text",
+            "text": "must be text without control characters",
             "texts": "must be a list of text",
             "choice": "must be one of " + ", ".join(self.choices),
             "section": "must be a mapping",
@@ -142,13 +149,9 @@ class Section:
             except ValueError:
                 problems.append(Problem(name, value, spec.refusal(value)))
         if not problems:
-            problems = [problem for check in self.checks() for problem in check()]
+            problems = list(self.check())
         if problems:
             raise InputError(type(self).__name__.lower(), problems)
-
-    def checks(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
-        """List the checks of several fields at once; override where some do without others."""
-        return (self.check,)
 
     def check(self) -> Iterator[Problem]:
         """Yield the faults that no single field shows; override where there can be some."""
@@ -197,6 +200,8 @@ def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
         return tuple(_numbers(spec, entry, shape[1:]) for entry in value)
     if isinstance(value, bool) or value is None:
         raise ValueError
+    if isinstance(value, str) and not _NUMBER.fullmatch(value):
+        raise ValueError
     try:
         result = float(value)
     except (TypeError, OverflowError):
@@ -212,7 +217,7 @@ def _fits(length: int, lengths: tuple[int, ...]) -> bool:
 
 def frozen_text(value: Any) -> str:
     """Return text without its outer blanks, or raise ValueError."""
-    if not isinstance(value, str) or not value.strip():
+    if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
         raise ValueError
     return value.strip()
 

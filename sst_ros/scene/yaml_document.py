@@ -1,24 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML text to a checked document and back; every fault is told, with its line."""
+"""YAML text to a checked document and back; reports every fault with its line."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import yaml
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.scene import partial
 from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
 from sst_ros.scene.values import plain
 
 S = TypeVar("S", bound=Section)
 
-DEEPEST = 20
-"""Levels of nesting in a document; PyYAML's time grows with their square."""
+LONGEST, MOST_NODES, DEEPEST = 1_000_000, 50_000, 20
+"""Characters, values and levels of nesting of a document: PyYAML reads 50,000 values in a second,
+and its time grows with the square of the levels."""
+
+
+class _Refused(Exception):
+    """A document breaks one of the limits; ends its reading at once."""
+
+    def __init__(self, event: yaml.Event, value: object, allowed: str) -> None:
+        self.problem = Problem("", value, allowed, _line(event))
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's reader, which ends at the first event that breaks a limit."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(source)
+        self.depth = self.nodes = 0
+
+    def get_event(self) -> yaml.Event:
+        """Return the next event.
+
+        Raises:
+            _Refused: it is an alias, or there is too much in the document.
+
+        """
+        event: yaml.Event = super().get_event()  # type: ignore[no-untyped-call]
+        self.depth += isinstance(event, yaml.CollectionStartEvent)
+        self.depth -= isinstance(event, yaml.CollectionEndEvent)
+        self.nodes += isinstance(event, yaml.NodeEvent)
+        if isinstance(event, yaml.AliasEvent):
+            allowed = "aliases are not allowed; write the value out"
+            raise _Refused(event, f"*{event.anchor}", allowed)
+        if self.depth > DEEPEST:
+            raise _Refused(event, "nested", f"no more than {DEEPEST} levels are allowed")
+        if self.nodes > MOST_NODES:
+            raise _Refused(event, "long", f"no more than {MOST_NODES} values are allowed")
+        return event
 
 
 def read(cls: type[S], source: str, origin: str) -> S:
@@ -28,25 +64,19 @@ def read(cls: type[S], source: str, origin: str) -> S:
         InputError: the text is no YAML or breaks the schema; lists every fault with its line.
 
     """
-    problems: list[Problem] = []
+    if len(source) > LONGEST:
+        allowed = f"no more than {LONGEST} characters are allowed"
+        raise InputError(origin, [Problem("", f"{len(source)} characters", allowed)])
     try:
-        depth = 0
-        for event in yaml.parse(source, Loader=yaml.SafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent):
-                allowed = "aliases are not allowed; write the value out"
-                problem = Problem("", f"*{event.anchor}", allowed, _line(event))
-                raise InputError(origin, [problem])
-            if depth > DEEPEST:
-                allowed = f"no more than {DEEPEST} levels are allowed"
-                raise InputError(origin, [Problem("", "nested", allowed, _line(event))])
-        node = yaml.compose(source, Loader=yaml.SafeLoader)
+        node = yaml.compose(source, Loader=_Loader)
+    except _Refused as refused:
+        raise InputError(origin, [refused.problem]) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = None if mark is None else mark.line + 1
-        said = getattr(error, "problem", None) or str(error)
-        raise InputError(origin, [Problem("", said, "must be YAML", line)]) from None
+        reason = getattr(error, "problem", None) or str(error)
+        raise InputError(origin, [Problem("", reason, "must be YAML", line)]) from None
+    problems: list[Problem] = []
     result = _build(cls, node, "", problems)
     if problems or result is None:
         raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
@@ -84,7 +114,7 @@ def dump(document: Section) -> str:
 
 def line_of(source: str, key: str) -> int | None:
     """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
-    node = yaml.compose(source, Loader=yaml.SafeLoader)
+    node = yaml.compose(source, Loader=_Loader)
     return None if node is None else _line_at(node, key)
 
 
@@ -127,18 +157,15 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
             key = f"{path}.{field.name}" if path else field.name
             allowed = "is missing; " + known[field.name].allowed()
             problems.append(Problem(key, None, allowed, _line(node)))
-    found: Iterable[Problem]
     if len(problems) > before:
-        found = partial.problems(cls, values)
-    else:
-        try:
-            return cls(**values)
-        except InputError as error:
-            found = error.problems
-    for problem in found:
-        key = ".".join(filter(None, [path, problem.key]))
-        line = _line_at(node, problem.key)
-        problems.append(dataclasses.replace(problem, key=key, line=line))
+        return None
+    try:
+        return cls(**values)
+    except InputError as error:
+        for problem in error.problems:
+            key = ".".join(filter(None, [path, problem.key]))
+            line = _line_at(node, problem.key)
+            problems.append(dataclasses.replace(problem, key=key, line=line))
     return None
 
 
@@ -174,7 +201,7 @@ def _notes(node: yaml.MappingNode, path: str, problems: list[Problem]) -> dict[s
 
 
 def _plain(node: yaml.Node | None) -> Any:
-    """Give the node's value; numbers stay text, so that 1e-3 means what it says."""
+    """Return the node's value; numbers stay text: YAML 1.1, which PyYAML reads, has others."""
     if isinstance(node, yaml.ScalarNode):
         return None if node.tag.endswith(":null") else node.value
     if isinstance(node, yaml.SequenceNode):
@@ -185,10 +212,10 @@ def _plain(node: yaml.Node | None) -> Any:
 
 
 def _typed(spec: Spec, node: yaml.Node, value: Any) -> Any:
-    """Turn the text of a plain YAML flag or whole number into what it says."""
+    """Convert the text of a plain flag or whole number, by the rules of YAML 1.2."""
     if spec.kind == "flag" and node.tag.endswith(":bool"):
         return {"true": True, "false": False}.get(value.lower(), value)
-    if spec.kind == "integer" and node.tag.endswith(":int"):
+    if spec.kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
         return int(value)
     return value
 
