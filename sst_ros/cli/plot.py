@@ -26,9 +26,9 @@ def add(commands: Commands) -> None:
 
 def _plot(options: argparse.Namespace) -> int:
     if options.list:
-        from sst_ros.plot import catalogue, compare
+        from sst_ros.plot import compare, pictures
 
-        for name, picture in catalogue.PICTURES.items():
+        for name, picture in pictures.PICTURES.items():
             print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
         print(f"{'with --compare':<18}{', '.join(compare.PICTURES)}")
         return 0
@@ -37,7 +37,7 @@ def _plot(options: argparse.Namespace) -> int:
         options.parser.error("name one BAG, or several with --compare")
     out = options.out or results_folder(bags[0], "plots")
     require_free(out, "plot", force=options.force)
-    from sst_ros.plot import catalogue, compare
+    from sst_ros.plot import compare, pictures
     from sst_ros.recording import signals
 
     runs = [signals.read(bag) for bag in bags]
@@ -45,7 +45,7 @@ def _plot(options: argparse.Namespace) -> int:
         print(compare.table(runs))
         paths, missing = compare.draw(runs, out, options.only)
     else:
-        paths, missing = catalogue.draw(runs[0], out, options.only)
+        paths, missing = pictures.draw(runs[0], out, options.only)
     for path in paths:
         print(path)
     for name, why in missing.items():

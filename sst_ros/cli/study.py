@@ -53,10 +53,10 @@ def _feedforward(options: argparse.Namespace) -> None:
         raise InputError("study", problems)
     out = require_free(options.out or Path("feedforward_out"), "study", force=options.force)
     from sst_ros.scene.scene import load
-    from sst_ros.studies.feedforward import Plan
+    from sst_ros.studies.feedforward import FeedforwardPlan
     from sst_ros.studies.feedforward_report import report
 
-    plan = Plan(
+    plan = FeedforwardPlan(
         load(options.scene),
         period_ns=round(options.period * 1e9),
         bandwidths=tuple(dict.fromkeys(options.bandwidths)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several runs in one picture, and how far they are apart.
+"""Several runs in one picture, and the differences between them.
 
 Runs are laid on each other by the time since the start of each, in whole nanoseconds; only samples
 that both have are compared, nothing is interpolated.
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -20,22 +19,11 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import sphere
-from sst_ros.plot.catalogue import known, save
-from sst_ros.plot.control import torques
-from sst_ros.plot.panels import legend, stack, three
-from sst_ros.plot.paper_figures import BLUE, GREEN, STYLE, VERMILION
+from sst_ros.plot.joints import applied
+from sst_ros.plot.pictures import known, save
+from sst_ros.plot.style import LINES, legend, positive, stack, styled, three
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
-
-STYLES: tuple[dict[str, Any], ...] = (
-    {"color": BLUE, "linestyle": "-", "linewidth": 3.0},
-    {"color": VERMILION, "linestyle": "--", "linewidth": 1.9},
-    {"color": GREEN, "linestyle": ":", "linewidth": 2.0},
-    {"color": "#CC79A7", "linestyle": "-.", "linewidth": 1.5},
-    {"color": "#E69F00", "linestyle": (0, (5, 1)), "linewidth": 1.2},
-    {"color": "#000000", "linestyle": "-", "linewidth": 0.8},
-)
-"""A run each; thinner above thicker, so that runs that coincide can all be seen."""
 
 
 class Difference(NamedTuple):
@@ -82,18 +70,18 @@ PICTURES = {
 }
 
 
+@styled
 def draw(
     runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of several runs into `out`, as `catalogue.draw` does of one.
+    """Write the pictures of several runs into `out`, as `pictures.draw` does of one.
 
     Raises:
-        InputError: there are more runs than can be told apart, a name is unknown, or `out` cannot
-            be written.
+        InputError: there are too many runs, a name is unknown, or `out` cannot be written.
 
     """
-    if not 2 <= len(runs) <= len(STYLES):
-        allowed = f"must be 2 to {len(STYLES)} bags, which can be told apart"
+    if not 2 <= len(runs) <= len(LINES):
+        allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
         raise InputError("plot", [Problem("compare", len(runs), allowed)])
     names = labels(runs)
     paths: list[Path] = []
@@ -110,11 +98,10 @@ def draw(
         make = {"difference": _difference, "sphere": _sphere}.get(name, _overlay)
         drawn = [
             (run, label, style)
-            for run, label, style, can in zip(runs, names, STYLES, able, strict=False)
+            for run, label, style, can in zip(runs, names, LINES, able, strict=False)
             if can
         ]
-        with mpl.rc_context(STYLE):
-            paths += save(make(picture, drawn), picture.title, out, f"compare_{name}")
+        paths += save(make(picture, drawn), picture.title, out, f"compare_{name}")
     return paths, missing
 
 
@@ -126,7 +113,7 @@ def _overlay(picture: Overlay, runs: Drawn) -> Figure:
     figure, panels = stack(labels)
     for run, label, style in runs:
         if picture.quantity == "tau":
-            seconds, values = torques(run)
+            seconds, values = applied(run)
         else:
             seconds, values = run.seconds(), picture.scale * run.legs(picture.quantity)
         for axes, column in zip(panels, values.T, strict=True):
@@ -144,8 +131,7 @@ def _difference(_: Overlay, runs: Drawn) -> Figure:
             here, there = _common(first, run)
             apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
             largest = apart.max(axis=1, initial=0.0)
-            shown = np.where(largest > 0.0, largest, np.nan)
-            axes.plot(run.seconds()[there], shown, label=label, **style)
+            axes.plot(run.seconds()[there], positive(largest), label=label, **style)
             some |= bool((apart > 0.0).any())
         if some:
             axes.set_yscale("log")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of power and energy: what the actuators give, and where it is."""
+"""Figures of power and energy of a run."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from sst_ros.dynamics import energy as physics
 from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.panels import lines, span, stack
-from sst_ros.plot.paper_figures import BLUE, GREY, LINES
+from sst_ros.plot.style import BLUE, GREY, lines, span, stack
 from sst_ros.recording.body_rates import body_rates
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import Integers
@@ -48,7 +47,7 @@ def actuator_work(run: Signals, _: Scene | None) -> Figure:
     """Draw the work that each actuator has done."""
     figure, panels = stack(["work [J]"], 3.2)
     names = [f"actuator {leg}" for leg in (1, 2, 3)]
-    lines(panels[0], run.seconds(), work(run), names, LINES)
+    lines(panels[0], run.seconds(), work(run), names)
     span(panels, run.seconds())
     return figure
 

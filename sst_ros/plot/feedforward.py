@@ -1,73 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a study of feedforward: errors of all loops, order of the hold, limits."""
+"""Figure of the study of feedforward: errors of all loops, order of the hold, bandwidth limits."""
 
 from __future__ import annotations
 
-import textwrap
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sst_ros.control.controller_settings import INSTANTS, MODES
-from sst_ros.plot.paper_figures import BLUE, GREEN, GREY, STYLE, VERMILION
-from sst_ros.studies.feedforward import OPEN_LOOP, Study
-from sst_ros.studies.feedforward_table import failed, made, of_instant, order, title
-from sst_ros.studies.sampled_data import ORDERS
+from sst_ros.control.controller_settings import MODES
+from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, free_figure, note, styled
 
-ORANGE = "#E69F00"
-LOOKS = dict(
-    zip(
-        MODES,
-        ((GREY, "D"), (BLUE, "o"), (GREEN, "^"), (VERMILION, "s"), (ORANGE, "v")),
-        strict=True,
-    )
-)
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_LOOKS = ((GREY, "D"), (BLUE, "o"), (GREEN, "^"), (VERMILION, "s"), (ORANGE, "v"))
+MARKERS = dict(zip(MODES, _LOOKS, strict=True))
 """Colour and marker of each mode."""
 
-_FAILED, _SPREAD, _REASONS = 12.0, 0.13, 4
+_FAILED, _SPREAD = 12.0, 0.13
 
 
-def draw(study: Study, path: Path) -> None:
-    """Write the picture as PNG."""
-    with mpl.rc_context({**STYLE, "figure.constrained_layout.use": False}):
-        figure = Figure(figsize=(12.5, 10.6))
-        count = len(study.plan.bandwidths)
-        upper = figure.add_gridspec(1, count, left=0.13, right=0.985, top=0.895, bottom=0.475,
-                                    wspace=0.05)  # fmt: skip
-        lower = figure.add_gridspec(1, 2, left=0.08, right=0.985, top=0.38, bottom=0.09,
-                                    wspace=0.2)  # fmt: skip
-        first: Axes | None = None
-        for column, bandwidth in enumerate(study.plan.bandwidths):
-            axes = figure.add_subplot(upper[0, column], sharey=first, sharex=first)
-            _errors(axes, study, bandwidth, labelled=first is None)
-            first = first or axes
-        _holds(figure.add_subplot(lower[0, 0]), study)
-        _limits(figure.add_subplot(lower[0, 1]), study)
-        figure.legend(handles=_legend(study), loc="center", bbox_to_anchor=(0.5, 0.945), ncol=7,
-                      fontsize=9, frameon=False)  # fmt: skip
-        figure.suptitle(title(study), fontsize=12, y=0.985)
-        figure.text(0.01, 0.01, _note(study), fontsize=6.8, color="#555555", va="bottom")
-        figure.savefig(path)
+@styled
+def draw_feedforward(
+    loops: DataFrame,
+    holds: DataFrame,
+    limits: DataFrame,
+    *,
+    bandwidths: Sequence[float],
+    orders: Mapping[str, tuple[float, int]],
+    unheld: float,
+    title: str,
+    footnote: str,
+) -> Figure:
+    """Draw a study of feedforward.
+
+    Args:
+        loops: error, mode, bandwidth_rad_per_s, rms_rad, failure of each loop.
+        holds: at, period_s, error [rad] of feedforward alone.
+        limits: delay, theory, ideal, real: bandwidths [rad/s].
+        bandwidths: a panel each [rad/s].
+        orders: measured order and that of the theory, by instant of the hold.
+        unheld: error where nothing is held [rad].
+        title: of the figure.
+        footnote: small print.
+
+    """
+    figure = free_figure(12.5, 10.6)
+    upper = figure.add_gridspec(1, len(bandwidths), left=0.13, right=0.985, top=0.895,
+                                bottom=0.475, wspace=0.05)  # fmt: skip
+    lower = figure.add_gridspec(1, 2, left=0.08, right=0.985, top=0.38, bottom=0.09, wspace=0.2)
+    first: Axes | None = None
+    for column, bandwidth in enumerate(bandwidths):
+        axes = figure.add_subplot(upper[0, column], sharey=first, sharex=first)
+        _errors(axes, loops, bandwidth, labelled=first is None)
+        first = first or axes
+    _holds(figure.add_subplot(lower[0, 0]), holds, orders, unheld)
+    _limits(figure.add_subplot(lower[0, 1]), limits)
+    failed = int((loops.failure != "").sum())
+    figure.legend(handles=_legend(failed), loc="center", bbox_to_anchor=(0.5, 0.945), ncol=7,
+                  fontsize=9, frameon=False)  # fmt: skip
+    figure.suptitle(title, fontsize=12, y=0.985)
+    note(figure, footnote, 200)
+    return figure
 
 
-def _errors(axes: Axes, study: Study, bandwidth: float, *, labelled: bool) -> None:
-    names = list(dict.fromkeys(outcome.error for outcome in study.outcomes))
-    reached = [outcome.rms for outcome in study.outcomes if outcome.rms]
-    low, high = 0.5 * min(reached, default=1e-6), 2.0 * max(reached, default=1e-1)
+def _errors(axes: Axes, loops: DataFrame, bandwidth: float, *, labelled: bool) -> None:
+    names = list(loops.error.unique())
+    low, high = 0.5 * loops.rms_rad.min(), 2.0 * loops.rms_rad.max()
     axes.set_xscale("log")
-    for row, name in enumerate(names):
-        for place, (mode, (colour, marker)) in enumerate(LOOKS.items()):
-            outcome = study.of(name, mode, None if mode == OPEN_LOOP else bandwidth)
-            y = row + (place - 2) * _SPREAD
-            x = outcome.rms if outcome.rms else high * _FAILED ** ((place + 0.5) / len(LOOKS))
-            face = colour if outcome.rms else "white"
-            axes.plot(x, y, marker, color=colour, markerfacecolor=face, markersize=5.5, zorder=3)
-            if not outcome.rms:
-                axes.plot(x, y, "x", color="#222222", markersize=4, zorder=4)
+    own = loops.bandwidth_rad_per_s
+    for loop in loops[(own == bandwidth) | own.isna()].itertuples():
+        colour, marker = MARKERS[loop.mode]
+        place = list(MARKERS).index(loop.mode)
+        y = names.index(loop.error) + (place - 2) * _SPREAD
+        failed = loop.failure != ""
+        x = high * _FAILED ** ((place + 0.5) / len(MARKERS)) if failed else loop.rms_rad
+        axes.plot(x, y, marker, color=colour, markerfacecolor="white" if failed else colour,
+                  markersize=5.5, zorder=3)  # fmt: skip
+        if failed:
+            axes.plot(x, y, "x", color=INK, markersize=4, zorder=4)
+    for row in range(len(names)):
         axes.axhline(row + 0.5, color="#cccccc", linewidth=0.6)
     axes.axvspan(high, high * _FAILED, color="#f4e3d7", linewidth=0)
     axes.set_xlim(low, high * _FAILED)
@@ -75,71 +91,61 @@ def _errors(axes: Axes, study: Study, bandwidth: float, *, labelled: bool) -> No
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", labelleft=labelled, length=0)
     axes.grid(axis="y", visible=False)
-    axes.set_title(f"feedback at {bandwidth:g} rad/s", loc="left")
+    axes.set_title(f"feedback at {bandwidth:g} rad/s")
     axes.set_xlabel("RMS error of γ [rad]")
 
 
-def _holds(axes: Axes, study: Study) -> None:
+def _holds(
+    axes: Axes, holds: DataFrame, orders: Mapping[str, tuple[float, int]], unheld: float
+) -> None:
     """Error over period, each with the line of its theory through the shortest period."""
-    for at, colour, marker in zip(INSTANTS, (BLUE, VERMILION), ("o", "s"), strict=True):
-        found = of_instant(study, at)
-        x = np.array([1e3 * hold.period_s for hold in found])
-        y = np.array([hold.error for hold in found])
-        axes.plot(x, y[0] * (x / x[0]) ** ORDERS[at], color=colour, linewidth=1.0)
+    for (at, group), colour, marker in zip(
+        holds.groupby("at", sort=False), (BLUE, VERMILION), ("o", "s"), strict=False
+    ):
+        x, y = 1e3 * group.period_s.to_numpy(), group.error.to_numpy()
+        order, theory = orders[at]
+        axes.plot(x, y[0] * (x / x[0]) ** theory, color=colour, linewidth=1.0)
         axes.plot(x, y, marker, color=colour, markersize=7,
-                  label=f"torque of the {at} of the hold: order {order(found):.3f} "
-                        f"(line: {ORDERS[at]})")  # fmt: skip
-    axes.axhline(study.exact.error, color=GREEN, linewidth=2.0,
-                 label=f"nothing held: {study.exact.error:.0e} rad")  # fmt: skip
+                  label=f"torque at the {at} of the hold: order {order:.3f} "
+                        f"(line: {theory})")  # fmt: skip
+    axes.axhline(unheld, color=GREEN, linewidth=2.0, label=f"nothing held: {unheld:.0e} rad")
+    periods = 1e3 * np.unique(holds.period_s.to_numpy())
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
-    axes.set_xticks(x, [f"{period:g}" for period in x])
-    axes.set_ylim(0.2 * study.exact.error, 10.0 * max(h.error for h in study.holds))
+    axes.set_xticks(periods, [f"{period:g}" for period in periods])
+    axes.set_ylim(0.2 * unheld, 10.0 * holds.error.max())
     axes.set_xlabel("control period [ms]")
     axes.set_ylabel("largest error of γ [rad]")
-    axes.set_title("Right model, feedforward alone", loc="left")
+    axes.set_title("Exact model, feedforward alone")
     axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.33), fontsize=8.5)
 
 
-def _limits(axes: Axes, study: Study) -> None:
+def _limits(axes: Axes, limits: DataFrame) -> None:
     """Largest stable bandwidth over delay: theory as a line, simulations as markers."""
-    delays = [ideal.delay for ideal, _ in study.limits]
-    theory = [ideal.theory for ideal, _ in study.limits]
-    axes.fill_between(delays, 1.0, theory, color=GREEN, alpha=0.12, linewidth=0.0)
-    axes.plot(delays, theory, color=GREEN, label="poles of the sampled double integrator")
-    axes.plot(delays, [ideal.simulated for ideal, _ in study.limits], "^", color=GREEN,
-              markersize=8, label="simulated, without friction and lag")  # fmt: skip
-    axes.plot(delays, [real.simulated for _, real in study.limits], "o", color=BLUE, markersize=8,
-              markerfacecolor="none", label="simulated, the plant as it is")  # fmt: skip
-    axes.set_yscale("log")
-    axes.set_ylim(0.5 * min(theory), 2.0 * max(theory))
-    axes.set_xticks(delays)
+    axes.set_title("computed_torque, exact model: stable below")
     axes.set_xlabel("delay of the command [samples]")
     axes.set_ylabel("largest stable bandwidth [rad/s]")
-    axes.set_title("computed_torque, right model: stable below", loc="left")
+    if limits.empty:
+        return
+    axes.fill_between(limits.delay, 1.0, limits.theory, color=GREEN, alpha=0.12, linewidth=0.0)
+    axes.plot(limits.delay, limits.theory, color=GREEN,
+              label="poles of the sampled double integrator")  # fmt: skip
+    axes.plot(limits.delay, limits.ideal, "^", color=GREEN, markersize=8,
+              label="simulated, without friction and lag")  # fmt: skip
+    axes.plot(limits.delay, limits.real, "o", color=BLUE, markersize=8, markerfacecolor="none",
+              label="simulated, the plant as it is")  # fmt: skip
+    axes.set_yscale("log")
+    axes.set_ylim(0.5 * limits.theory.min(), 2.0 * limits.theory.max())
+    axes.set_xticks(limits.delay)
     axes.legend(loc="upper right", fontsize=8.5)
 
 
-def _legend(study: Study) -> list[Line2D]:
+def _legend(failed: int) -> list[Line2D]:
     handles = [
         Line2D([], [], color=colour, marker=marker, linestyle="none", label=mode)
-        for mode, (colour, marker) in LOOKS.items()
+        for mode, (colour, marker) in MARKERS.items()
     ]
-    if failed(study):
-        handles.append(Line2D([], [], color="#222222", marker="x", linestyle="none",
-                              label=f"failed: {len(failed(study))}, see below"))  # fmt: skip
+    if failed:
+        handles.append(Line2D([], [], color=INK, marker="x", linestyle="none",
+                              label=f"failed: {failed}, see below"))  # fmt: skip
     return handles
-
-
-def _note(study: Study) -> str:
-    """Reasons of failures, alike ones once, and how the study was made."""
-    reasons: dict[str, int] = {}
-    for outcome in failed(study):
-        first, _, last = outcome.failure.partition(": ")
-        told = last if "stopped at" in first else first
-        reasons[told] = reasons.get(told, 0) + 1
-    lines = [made(study)]
-    if reasons:
-        listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:_REASONS])
-        lines.insert(0, f"Failed: {listed}. Each has its reason in the table and in the CSV.")
-    return "\n".join(part for line in lines for part in textwrap.wrap(line, 200))

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a run: the paper's Figs. 8 to 14, the torques, and error over run time."""
+"""Figs. 8 to 14 of the paper: the path and position of E and the ZYZ angles.
+
+Each takes any number of solutions: a run, the continuous solution, an independent engine. Several
+are drawn over each other, with their differences from the first below, on a logarithmic axis.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,90 +17,55 @@ from matplotlib.ticker import MaxNLocator
 
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.recording.recording import Recording
-from sst_ros.recording.time_series import NANOSECONDS, Integers
-from sst_ros.report.reference import Comparison, Deviation
+from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, lines, positive, span
 from sst_ros.scene.scene import Scene
-
-BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-"""Colours that the colour-blind can tell apart (Okabe and Ito); line styles tell them apart too."""
-
-LINES: tuple[dict[str, Any], ...] = (
-    {"color": BLUE, "linestyle": "-", "linewidth": 2.6},
-    {"color": VERMILION, "linestyle": "--", "linewidth": 1.8},
-    {"color": GREEN, "linestyle": ":", "linewidth": 1.8},
-)
-"""Curves that may coincide: each is thinner than the one below it, so that all can be seen."""
-
-STYLE: Any = {
-    "figure.dpi": 150,
-    "savefig.dpi": 150,
-    "figure.constrained_layout.use": True,
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.grid": True,
-    "axes.formatter.useoffset": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.alpha": 0.35,
-    "legend.framealpha": 0.85,
-    "lines.solid_capstyle": "butt",
-}
 
 NUMBERS = {
     "example1": {"position_of_E": 8, "psi": 9},
     "example2": {"path_of_E": 10, "position_of_E": 11, "theta": 12, "phi": 13, "psi": 14},
 }
-"""Which picture is which figure of the paper, by the name of the scene."""
+"""Number of a picture in the paper, by the name of the scene."""
 
-TITLES = {
-    "path_of_E": "Path of point E",
-    "position_of_E": "Position of point E",
-    "theta": "The angle θ",
-    "phi": "The angle φ",
-    "psi": "The angle ψ",
-    "torques": "Applied torques",
-    "error": "Error over the time of the run",
-}
+ASSUMPTION = "assumed inertias: the paper's are lost"
 
-SIZE = (7.0, 4.2)
-SMALLEST_SHOWN = 1e-17
+LEAST_POSITION_M, LEAST_ANGLE_DEG = 0.05, 1.0
+"""An axis never shows less than this, so that rounding is a flat line."""
 
 
-def draw(
-    recording: Recording, integration: Comparison, ideal: Comparison | None, out: Path
-) -> list[Path]:
-    """Write all pictures of a run as PNG files into the folder `out` and return their paths."""
-    scene, seconds, ticks = recording.scene, recording.seconds, recording.ticks
-    position = scene.star.radius * rotations(recording.quaternion)[:, :, 2]
-    degrees = angles(recording.quaternion, recording.euler)
-    pictures: dict[str, Callable[[], Figure]] = {
-        "path_of_E": lambda: path(scene, position),
-        "position_of_E": lambda: position_of_e(seconds, position),
-        "theta": lambda: angle(seconds, degrees, 0),
-        "phi": lambda: angle(seconds, degrees, 1),
-        "psi": lambda: angle(seconds, degrees, 2),
-        "torques": lambda: torques(ticks.start_ns, ticks.end_ns, ticks.torque),
-        "error": lambda: _errors(seconds, integration, ideal),
-    }
-    paths = []
-    with mpl.rc_context(STYLE):
-        for name, make in pictures.items():
-            figure = make()
-            numbered, title = named(name, scene.name)
-            figure.suptitle(title, fontsize=11)
-            paths.append(out / f"{numbered}.png")
-            figure.savefig(paths[-1])
-    return paths
+class Solution(NamedTuple):
+    """One solution of the motion: its name, times [s] (n,), quaternions (n, 4), ZYZ angles (n, 3).
+
+    Angles are in rad; where they are nan those of the quaternion are drawn.
+    """
+
+    name: str
+    seconds: Array
+    quaternion: Array
+    euler: Array | None = None
+
+    @property
+    def degrees(self) -> Array:
+        """ZYZ angles [deg] without jumps, shape (n, 3)."""
+        computed = zyz_angles(rotations(self.quaternion))
+        if self.euler is not None:
+            computed = np.where(np.isfinite(self.euler), self.euler, computed)
+        return np.asarray(np.degrees(_unwrapped(computed)))
+
+    def position(self, scene: Scene) -> Array:
+        """Position of E in {B} [m], shape (n, 3)."""
+        return np.asarray(scene.star.radius * rotations(self.quaternion)[:, :, 2])
 
 
-def named(name: str, scene: str | None) -> tuple[str, str]:
-    """Name the file and the title of one of TITLES; the paper's figures bear their numbers."""
-    title = TITLES[name] + (f", {scene}" if scene else "")
+def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
+    """Return the stem of a picture's file and its title.
+
+    The paper's figures have their number and name the assumption behind them.
+    """
+    title += f", {scene}" if scene else ""
     number = NUMBERS.get(scene or "", {}).get(name)
     if number is None:
         return name, title
-    return f"fig{number:02d}_{name}", f"{title} (Fig. {number} of the paper)"
+    return f"fig{number:02d}_{name}", f"{title} (Fig. {number} of the paper; {ASSUMPTION})"
 
 
 def rotations(quaternion: Array) -> Array:
@@ -109,57 +76,77 @@ def rotations(quaternion: Array) -> Array:
     return result
 
 
-def angles(quaternion: Array, euler: Array) -> Array:
-    """ZYZ angles [deg] without jumps, shape (n, 3): as recorded, else of the orientation."""
-    recorded = np.where(np.isfinite(euler), euler, zyz_angles(rotations(quaternion)))
-    return np.asarray(np.degrees(_unwrapped(recorded)))
+def position_of_e(scene: Scene, solutions: Sequence[Solution]) -> Figure:
+    """Draw the coordinates of E over time."""
+    values = [each.position(scene) for each in solutions]
+    return _over_time(solutions, values, "xyz", "position of E in {B} [m]", "m", LEAST_POSITION_M)
 
 
-def position_of_e(seconds: Array, position: Array) -> Figure:
-    """Draw the coordinates of E [m], shape (n, 3), over time."""
-    return curves(seconds, position, ("x", "y", "z"), "position of E in {B} [m]", 0.05)
-
-
-def angle(seconds: Array, degrees: Array, which: int) -> Figure:
-    """Draw one of the ZYZ angles [deg], shape (n, 3), over time."""
+def angle(solutions: Sequence[Solution], which: int) -> Figure:
+    """Draw one of the ZYZ angles over time: 0 theta, 1 phi, 2 psi."""
     letter = "θφψ"[which]
-    return curves(seconds, degrees[:, which : which + 1], (letter,), f"{letter} [deg]", 1.0)
+    values = [each.degrees[:, which : which + 1] for each in solutions]
+    return _over_time(solutions, values, letter, f"{letter} [deg]", "deg", LEAST_ANGLE_DEG)
 
 
-def curves(
-    seconds: Array, values: Array, names: Sequence[str], label: str, least_span: float
+def _over_time(
+    solutions: Sequence[Solution],
+    values: Sequence[Array],
+    letters: str,
+    label: str,
+    unit: str,
+    least_span: float,
 ) -> Figure:
-    """Draw columns over time; an axis never shows less than `least_span`, so rounding is flat."""
-    figure = Figure(figsize=SIZE)
-    axes = figure.subplots()
-    for column, name, line in zip(values.T, names, LINES, strict=False):
-        axes.plot(seconds, column, label=name, **line)
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if high - low < least_span:
-        middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * least_span, middle + 0.5 * least_span)
-    axes.set_xlim(seconds[0], seconds[-1])
-    axes.set_xlabel("time t [s]")
-    axes.set_ylabel(label)
-    if len(names) > 1:
-        legend_above(axes)
+    """Draw columns over time; differences from the first solution below where there are several."""
+    first = solutions[0]
+    if len(solutions) == 1:
+        figure = Figure(figsize=(7.0, 4.2))
+        axes = figure.subplots()
+        lines(axes, first.seconds, values[0], list(letters), least_span=least_span)
+        axes.set_xlabel("time t [s]")
+        axes.set_ylabel(label)
+        return figure
+    figure = Figure(figsize=(7.0, 6.4))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for solution, columns, style in zip(solutions, values, LINES, strict=False):
+        above.plot(solution.seconds, columns, label=solution.name, **style)
+    _name_columns(above, first.seconds, values[0], letters)
+    handles, names = above.get_legend_handles_labels()
+    unique = dict(zip(names, handles, strict=True))
+    above.legend(unique.values(), unique.keys(), loc="lower right", bbox_to_anchor=(1.0, 1.0),
+                 ncol=len(unique), fontsize=8, frameon=False, borderaxespad=0.1)  # fmt: skip
+    above.set_ylabel(label)
+    for solution, columns, style in list(zip(solutions, values, LINES, strict=False))[1:]:
+        at, here, there = np.intersect1d(
+            np.round(first.seconds, 9), np.round(solution.seconds, 9), return_indices=True
+        )
+        apart = np.abs(columns[there] - values[0][here]).max(axis=1)
+        below.plot(at, positive(apart), label=f"{solution.name}: {_largest(apart, unit)}", **style)
+    below.set_yscale("log")
+    below.set_ylabel(f"difference from\n{first.name} [{unit}]")
+    below.set_xlabel("time t [s]")
+    below.legend(fontsize=8, loc="best", title="largest difference", title_fontsize=8)
+    span([above, below], first.seconds)
     return figure
 
 
-def torques(start_ns: Integers, end_ns: Integers, torque: Array) -> Figure:
-    """Draw the torques of ticks [N m], shape (n, 3), as they were held."""
-    return curves(*held(start_ns, end_ns, torque), ("τ₁", "τ₂", "τ₃"), "torque τ [N m]", 0.1)
+def _largest(apart: Array, unit: str) -> str:
+    return f"{np.nanmax(apart):.1e} {unit}" if np.isfinite(apart).any() else "no common times"
 
 
-def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:
-    """Return times [s] and values that draw what each tick held; a gap is nan."""
-    times = np.stack([start_ns, end_ns], axis=1).ravel() / NANOSECONDS
-    steps = np.repeat(values, 2, axis=0)
-    gaps = 2 * (np.flatnonzero(start_ns[1:] != end_ns[:-1]) + 1)
-    return np.insert(times, gaps, times[gaps]), np.insert(steps, gaps, np.nan, axis=0)
+def _name_columns(axes: Axes, seconds: Array, columns: Array, letters: str) -> None:
+    """Write the letter of each column beside its last value, where there are several."""
+    if len(letters) == 1:
+        return
+    for letter, column in zip(letters, columns.T, strict=True):
+        known = np.flatnonzero(np.isfinite(column))
+        if len(known):
+            axes.annotate(letter, (seconds[known[-1]], column[known[-1]]), (4, 0),
+                          textcoords="offset points", va="center",
+                          annotation_clip=False)  # fmt: skip
 
 
-def path(scene: Scene, position: Array) -> Figure:
+def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
     figure = Figure(figsize=(6.4, 5.8))
     axes = figure.add_subplot(projection="3d")
@@ -168,17 +155,22 @@ def path(scene: Scene, position: Array) -> Figure:
     outline = triangle(geometry)
     axes.plot(*(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃")
     if star != base:
-        image = "its image on the sphere of E"
-        axes.plot(*(star * outline).T, color=GREY, linewidth=0.9, linestyle=":", label=image)
+        axes.plot(*(star * outline).T, color=GREY, linewidth=0.9, linestyle=":",
+                  label="its image on the sphere of E")  # fmt: skip
     for index, point in enumerate(1.08 * max(base, star) * geometry.v):
         axes.text(*point, f"P{'₁₂₃'[index]}", ha="center", va="center")
-    axes.plot(*position.T, color=BLUE, linewidth=1.8, label="path of E")
-    whole = position[np.isfinite(position[:, 0])]
-    axes.plot(*whole[:1].T, "o", color=GREEN, markersize=7, label="start", linestyle="none")
-    axes.plot(*whole[-1:].T, "s", color=VERMILION, markersize=5, label="end", linestyle="none")
+    several = len(solutions) > 1
+    for solution, style in zip(solutions, LINES, strict=False):
+        name = solution.name if several else "path of E"
+        looks = style if several else {"color": BLUE, "linewidth": 1.8}
+        axes.plot(*solution.position(scene).T, label=name, **looks)
+    position = solutions[0].position(scene)
+    known = position[np.isfinite(position[:, 0])]
+    axes.plot(*known[:1].T, "o", color=GREEN, markersize=7, label="start", linestyle="none")
+    axes.plot(*known[-1:].T, "s", color=VERMILION, markersize=5, label="end", linestyle="none")
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect((1, 1, 1))
-    shown = np.concatenate([base * outline, star * outline, whole])
+    shown = np.concatenate([base * outline, star * outline, known])
     middle = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
     reach = 0.5 * float(np.ptp(shown, axis=0).max())
     low, high = middle - reach, middle + reach
@@ -193,49 +185,14 @@ def path(scene: Scene, position: Array) -> Figure:
     return figure
 
 
-def _errors(seconds: Array, integration: Comparison, ideal: Comparison | None) -> Figure:
-    """Draw (a) and (b), each over the error of its reference, on logarithmic axes."""
-    panels = [("(a) integration error, against the same torques", integration)]
-    if ideal is not None:
-        panels.append(("(b) against continuous torques", ideal))
-    figure = Figure(figsize=(7.0, 1.0 + 3.1 * len(panels)))
-    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
-    for axes, (title, comparison) in zip(grid[:, 0], panels, strict=True):
-        floor = np.fmax.reduce(_columns(comparison.own))
-        axes.fill_between(
-            seconds, SMALLEST_SHOWN, np.fmax(floor, SMALLEST_SHOWN), color=GREY, alpha=0.3,
-            linewidth=0.0, label="reference's own error (largest of the three)",
-        )  # fmt: skip
-        names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
-        for values, name, line in zip(_columns(comparison.error), names, LINES, strict=True):
-            axes.plot(seconds, np.where(values > 0.0, values, np.nan), label=name, **line)
-        axes.set_yscale("log")
-        axes.set_title(title, loc="left")
-        axes.set_ylabel("largest difference")
-        axes.set_xlim(seconds[0], seconds[-1])
-        axes.set_ylim(bottom=SMALLEST_SHOWN)
-    grid[-1, 0].set_xlabel("time t [s]")
-    grid[0, 0].legend(loc="lower right", fontsize=8, ncol=2)
-    return figure
-
-
-def _columns(deviation: Deviation) -> tuple[Array, Array, Array]:
-    return deviation.gamma, deviation.gamma_dot, deviation.orientation
-
-
-def legend_above(axes: Axes) -> None:
-    """Put the legend where no curve can be."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=3, borderaxespad=0.2)
-
-
 def triangle(geometry: Geometry) -> Array:
     """Points of the closed base triangle on the unit sphere, shape (n, 3)."""
     share = np.linspace(0.0, 1.0, 40)[:, None]
     sides = []
     for k in range(3):
-        angle: Array = geometry.arc[k] * share
+        along: Array = geometry.arc[k] * share
         across = np.cross(geometry.w[k], geometry.v[k])
-        sides.append(np.cos(angle) * geometry.v[k] + np.sin(angle) * across)
+        sides.append(np.cos(along) * geometry.v[k] + np.sin(along) * across)
     return np.asarray(np.concatenate(sides))
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.paper_figures import BLUE, GREEN, VERMILION, rotations
+from sst_ros.plot.paper_figures import rotations
+from sst_ros.plot.style import BLUE, GREEN, VERMILION
 from sst_ros.plot.workspace import View, frame
 from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene

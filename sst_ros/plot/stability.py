@@ -1,49 +1,109 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of stability: which steps are stable at which stiffness, method by method."""
+"""Figures of stability: largest stable steps, and regions of absolute stability."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
-from sst_ros.plot.paper_figures import STYLE
-from sst_ros.plot.work_precision import MARKERS as LOOKS
-from sst_ros.studies.stability import LONGEST_S, Stable
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import GREY, INK, free_figure, note, styled
+from sst_ros.plot.work_precision import MARKERS
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: springs"}
 
 
-def draw(steps: Sequence[Stable], made: str, path: Path) -> None:
-    """Write the picture as PNG."""
-    with mpl.rc_context({**STYLE, "figure.constrained_layout.use": False}):
-        figure = Figure(figsize=(8.6, 6.0))
-        axes = figure.subplots()
-        figure.subplots_adjust(left=0.1, right=0.97, top=0.9, bottom=0.17)
+@styled
+def draw_largest_steps(steps: DataFrame, longest: float, footnote: str) -> Figure:
+    """Draw the largest stable step over the fastest rate, a panel for each family.
+
+    Args:
+        steps: family, method, rate [1/s] and step [s].
+        longest: the longest step that was tried [s].
+        footnote: small print.
+
+    """
+    families = list(steps.family.unique())
+    figure = free_figure(6.2 * len(families) + 0.6, 6.0)
+    panels = figure.subplots(1, len(families), squeeze=False)[0]
+    figure.subplots_adjust(left=0.07, right=0.985, top=0.91, bottom=0.16, wspace=0.18)
+    for axes, family in zip(panels, families, strict=True):
+        own = steps[steps.family == family]
         axes.set_xscale("log")
         axes.set_yscale("log")
-        lowest = min(step.step for step in steps)
-        for name, (colour, marker) in LOOKS.items():
-            rows = [step for step in steps if step.method == name]
-            if not rows:
-                continue
-            x, y = (np.array(v) for v in zip(*((r.decay, r.step) for r in rows), strict=True))
-            everywhere = bool(np.all(y >= LONGEST_S))
-            reached = f"every step tried, up to {LONGEST_S:g} s"
-            if not everywhere:
-                reached = f"step × decay ≤ {y[-1] * x[-1]:.2f}"
-            if not everywhere:
-                axes.fill_between(x, 0.1 * lowest, y, color=colour, alpha=0.10, linewidth=0.0)
+        for name, rows in own.groupby("method", sort=False):
+            colour, marker = MARKERS[name]
+            x, y = rows.rate.to_numpy(), rows.step.to_numpy()
+            reached = f"every step tried, up to {longest:g} s"
+            if not (y >= longest).all():
+                reached = f"step × rate ≤ {x[-1] * y[-1]:.2f}"
+                axes.fill_between(x, 1e-12, y, color=colour, alpha=0.10, linewidth=0.0)
             axes.plot(x, y, color=colour, marker=marker, linewidth=2.0, markersize=7,
                       clip_on=False, zorder=4, label=f"{name}: {reached}")  # fmt: skip
-        axes.set_ylim(0.3 * lowest, 2.0 * LONGEST_S)
-        axes.set_xlim(min(s.decay for s in steps), max(s.decay for s in steps))
-        axes.set_xlabel("fastest decay of the stiff family [1/s]")
-        axes.set_ylabel("step [s]; below its line a method is stable")
-        axes.set_title("Largest stable step over stiffness", loc="left")
+        axes.set_ylim(0.3 * own.step.min(), 2.0 * longest)
+        axes.set_xlim(own.rate.min(), own.rate.max())
+        axes.set_xlabel("largest |λ| of the family [1/s]")
+        axes.set_title(TITLES.get(family, family))
         axes.legend(loc="lower left", fontsize=9)
-        figure.text(0.01, 0.015, "\n".join(textwrap.wrap(made, 140)), fontsize=6.5,
-                    color="#555555")  # fmt: skip
-        figure.savefig(path)
+    panels[0].set_ylabel("step [s]; a method is stable below its line")
+    note(figure, footnote, 60 + 80 * len(families))
+    return figure
+
+
+@styled
+def draw_regions(
+    x: Array,
+    y: Array,
+    growth: Mapping[str, Array],
+    points: Mapping[str, NDArray[np.complex128]],
+    footnote: str,
+) -> Figure:
+    """Draw regions of absolute stability with the eigenvalues of scenes times their steps in them.
+
+    Args:
+        x: real part of z = h lambda, shape (n,).
+        y: imaginary part, shape (m,).
+        growth: modulus of the stability function by method, shape (m, n).
+        points: eigenvalues times steps by scene.
+        footnote: small print.
+
+    """
+    figure = free_figure(11.0, 8.6)
+    panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    figure.subplots_adjust(left=0.07, right=0.79, top=0.95, bottom=0.1, hspace=0.14, wspace=0.06)
+    markers = "osD^v<>phX*P"
+    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
+              for name, z in points.items()}  # fmt: skip
+    for axes, (method, modulus) in zip(panels.flat, growth.items(), strict=True):
+        colour = MARKERS[method][0]
+        axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
+        axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
+        for k, (name, z) in enumerate(points.items()):
+            some = z[inside[name]]
+            axes.plot(some.real, some.imag, markers[k % len(markers)], markersize=5,
+                      color=INK if k < len(markers) else GREY, markerfacecolor="none")  # fmt: skip
+        axes.axhline(0.0, color=INK, linewidth=0.6)
+        axes.axvline(0.0, color=INK, linewidth=0.6)
+        axes.set_title(f"{method}: stable where coloured")
+    for axes in panels[1]:
+        axes.set_xlabel("Re hλ")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("Im hλ")
+    handles = [
+        Line2D([], [], marker=markers[k % len(markers)], linestyle="none", markersize=5,
+               color=INK if k < len(markers) else GREY, markerfacecolor="none",
+               label=name if inside[name].all() else f"{name} (some lie outside)")
+        for k, name in enumerate(points)
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="center left", bbox_to_anchor=(0.795, 0.55), fontsize=8.5,
+                  frameon=False, title="hλ of the scenes,\nstep as advised")  # fmt: skip
+    note(figure, footnote, 170)
+    return figure

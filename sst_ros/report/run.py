@@ -8,11 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
-
 from sst_ros.output_folder import writing
 from sst_ros.plot import paper_figures
-from sst_ros.plot.downsampling import thinned
+from sst_ros.plot.downsampling import envelope
+from sst_ros.plot.paper_figures import Solution
+from sst_ros.plot.pictures import PICTURES, save
+from sst_ros.plot.run_overview import draw_errors, draw_torques
+from sst_ros.plot.style import save_figure, styled
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import formulation, page, reference, summary, timing
@@ -61,13 +63,37 @@ def report(bag: Path, out: Path) -> dict[str, Any]:
     run = recording.read(bag)
     with writing(out, "report"):
         told, integration, ideal, result = judge(run)
-        # Long jagged curves in one piece take hundreds of megabytes to draw.
-        with mpl.rc_context({"agg.path.chunksize": 1000}):
-            pictures = paper_figures.draw(*thinned(run, integration, ideal), out)
-            page.draw(run, integration, told, result, out / PAGE)
+        pictures = _pictures(run, integration, ideal, out)
+        save_figure(page.overview(run, integration, told, result), out / PAGE)
         result["pictures"] = [path.name for path in pictures]
         result["page"] = [PAGE, HTML]
         page.write(result, out / PAGE, pictures, out / HTML)
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(text, encoding="utf-8")
     return result
+
+
+@styled
+def _pictures(
+    run: Recording, integration: Comparison, ideal: Comparison | None, out: Path
+) -> list[Path]:
+    """Write the paper's figures of a run, its torques and its errors as PNG files."""
+    scene, ticks = run.scene, run.ticks
+    rows = envelope([*run.quaternion.T, *run.euler.T], len(run.time_ns))
+    motion = [Solution("run", run.seconds[rows], run.quaternion[rows], run.euler[rows])]
+    errors = {"(a) integration error, against the same torques": page.error_curves(integration)}
+    if ideal is not None:
+        errors["(b) against continuous torques"] = page.error_curves(ideal)
+    figures = {
+        "path_of_E": paper_figures.path(scene, motion),
+        "position_of_E": paper_figures.position_of_e(scene, motion),
+        **{name: paper_figures.angle(motion, k) for k, name in enumerate(("theta", "phi", "psi"))},
+        "torques": draw_torques(ticks.start_ns, ticks.end_ns, ticks.torque),
+        "error": draw_errors(run.seconds, errors),
+    }
+    paths = []
+    for name, figure in figures.items():
+        title = PICTURES[name].title if name in PICTURES else "Error against run time"
+        stem, title = paper_figures.caption(name, title, scene.name)
+        paths += save(figure, title, out, stem, ["png"])
+    return paths

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a run that followed a reference, from its bag alone."""
+"""The report of a run that tracked a reference, from its bag alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sst_ros.control.tracking import table
-from sst_ros.plot import tracking as tracking_plot
+from sst_ros.plot.run_overview import draw_tracking
+from sst_ros.plot.style import save_figure
 from sst_ros.report import tracking
 
 PICTURE, TABLE = "tracking.png", "tracking.txt"
@@ -18,7 +19,7 @@ def report(bag: Path, out: Path) -> str:
     """Evaluate a recorded run: write the table and the picture into `out`, return the table.
 
     Raises:
-        InputError: the bag is no whole recording of a run that followed a reference.
+        InputError: the bag is no whole recording of a run that tracked a reference.
 
     """
     tracked = tracking.read(bag)
@@ -32,5 +33,10 @@ def report(bag: Path, out: Path) -> str:
     text = "\n".join(lines)
     (out / TABLE).write_text(text, encoding="utf-8")
     title = f"Tracking of {name}: {found.seconds:g} s, {found.samples} samples"
-    tracking_plot.draw(tracked, title, out / PICTURE)
+    track = tracked.track
+    figure = draw_tracking(
+        track.time, track.gamma, track.error, tracked.orientation_error,
+        (track.feedforward, track.feedback), title,
+    )  # fmt: skip
+    save_figure(figure, out / PICTURE)
     return text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands between a plant and its controller: encoders, noise, and the way of a command."""
+"""The channel between plant and controller: encoders, noise, delay of commands."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Channel:
-    """What is lost on the way; all zeros loses nothing.
+    """What a channel changes; all zeros change nothing.
 
     Attributes:
-        delay: samples by which commands come late. Until the first one comes, it acts already, as
+        delay: delay of commands in samples. Until the first one arrives, it acts already, as
             if the controller had been there before.
         counts: steps of the encoders per turn; 0 for exact angles. An encoder measures no rate:
             that is the difference of the last two angles over the period.
@@ -31,11 +31,11 @@ class Channel:
     noise: tuple[float, float] = (0.0, 0.0)
 
 
-class Wire:
-    """A channel at work.
+class ChannelState:
+    """The memory of a channel during a run.
 
     Args:
-        channel: what it does.
+        channel: its properties.
         period_s: time between samples [s].
         seed: of the noise.
 
@@ -45,10 +45,10 @@ class Wire:
         self._channel, self._period = channel, period_s
         self._random = np.random.default_rng(seed)
         self._before: Triple | None = None
-        self._under_way: deque[Triple] = deque()
+        self._queue: deque[Triple] = deque()
 
-    def measured(self, gamma: Triple, gamma_dot: Triple) -> tuple[Triple, Triple]:
-        """Return what the controller sees of gamma [rad] and gamma_dot [rad/s] at a sample."""
+    def measure(self, gamma: Triple, gamma_dot: Triple) -> tuple[Triple, Triple]:
+        """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
         if self._channel.counts:
             step = 2.0 * math.pi / self._channel.counts
             if self._before is None:
@@ -67,12 +67,12 @@ class Wire:
             gamma_dot = self._noisy(gamma_dot, self._channel.noise[1])
         return gamma, gamma_dot
 
-    def acting(self, command: Triple) -> Triple:
+    def delayed(self, command: Triple) -> Triple:
         """Return the torques [N m] that act when this command has been sent."""
-        if not self._under_way:
-            self._under_way.extend([command] * self._channel.delay)
-        self._under_way.append(command)
-        return self._under_way.popleft()
+        if not self._queue:
+            self._queue.extend([command] * self._channel.delay)
+        self._queue.append(command)
+        return self._queue.popleft()
 
     def _noisy(self, values: Triple, deviation: float) -> Triple:
         a, b, c = (self._random.standard_normal(3) * deviation).tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One controller on one plant, in lockstep in this process, and how well it followed."""
+"""A control loop: one controller on one plant, in lockstep in this process."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation import NANOSECONDS, Simulation
-from sst_ros.studies.channel import Channel, Wire
+from sst_ros.studies.channel import Channel, ChannelState
 
 WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
 
 
 @dataclass(frozen=True)
-class Loop:
+class ControlLoop:
     """A controller and a plant.
 
     Attributes:
         plant: what moves.
-        model: what the controller takes it for.
-        motion: what is wanted.
+        model: the controller's model of it.
+        motion: reference motion.
         settings: mode and gains.
         period_ns: time between samples, over which a torque is held [ns].
-        channel: what stands between them.
+        channel: between plant and controller.
         seed: of the noise.
         rest_s: time for which the loop goes on after the motion [s].
         offset: by how much the plant's gamma is off at the start [rad].
-        lost: error of gamma beyond which the run is given up [rad].
+        lost: error of gamma beyond which the run is aborted [rad].
 
     """
 
@@ -53,7 +53,7 @@ class Loop:
     lost: float = math.inf
 
 
-def follow(loop: Loop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
+def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
     """Run a loop to its end.
 
     Returns:
@@ -63,10 +63,10 @@ def follow(loop: Loop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
     """
     period = loop.period_ns / NANOSECONDS
     simulation = Simulation(
-        started(loop.plant, loop.motion, loop.offset), compiled=numba_version() is not None
+        at_start(loop.plant, loop.motion, loop.offset), compiled=numba_version() is not None
     )
     controller = Controller(loop.model, loop.motion, loop.settings, period)
-    wire = Wire(loop.channel, period, loop.seed)
+    channel = ChannelState(loop.channel, period, loop.seed)
     rows, limited, failure = [], [], ""
     torque = (0.0, 0.0, 0.0)
     for k in range(round((loop.motion.duration + loop.rest_s) / period) + 1):
@@ -75,9 +75,9 @@ def follow(loop: Loop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
             if k > 0:
                 simulation.step(torque, loop.period_ns)
             joints = simulation.state.joints
-            measured = Measurement(*wire.measured(joints.gamma, joints.gamma_dot))
+            measured = Measurement(*channel.measure(joints.gamma, joints.gamma_dot))
             command = controller.command(time, measured)
-            torque = wire.acting(command.torque)
+            torque = channel.delayed(command.torque)
             wanted = command.desired
             rows.append(
                 (time, *wanted.gamma, *wanted.gamma_dot, *joints.gamma, *joints.gamma_dot,
@@ -97,7 +97,7 @@ def follow(loop: Loop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
     return track, np.array(limited, dtype=bool), failure
 
 
-def started(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scene:
+def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scene:
     """Return the plant at the start of a motion, its gamma off by `offset` [rad]."""
     start = motion.at(0.0)
     a, b, c = (angle + offset for angle in start.gamma)

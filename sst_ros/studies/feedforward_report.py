@@ -3,11 +3,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sst_ros.output_folder import writing
-from sst_ros.studies.feedforward import Plan, Study, study
-from sst_ros.studies.feedforward_table import as_csv, as_json, made, notes, rows, shown, text, title
+import numpy as np
+
+from sst_ros.control.controller_settings import MODES
+from sst_ros.plot.feedforward import draw_feedforward
+from sst_ros.studies.feedforward import (
+    OPEN_LOOP,
+    FeedforwardPlan,
+    FeedforwardStudy,
+    LoopResult,
+    feedforward_study,
+)
+from sst_ros.studies.model_errors import SHARE
+from sst_ros.studies.results import markdown, provenance, table, write
+from sst_ros.studies.sampled_data import ORDERS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+COLUMNS = (
+    "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s", "seed",
+    "rms_rad", "largest_rad", "settling_s", "torque_rms_Nm", "torque_largest_Nm",
+    "feedforward_share", "feedback_share", "samples_limited", "failure",
+)  # fmt: skip
 
 INTRODUCTION = """\
 # How good feedforward is
@@ -15,44 +39,183 @@ INTRODUCTION = """\
 Written by `python -m sst_ros study feedforward`; all figures are from the machine and the date
 below.
 
-Every mode of control follows the motion of the scene against everything that a controller may have
-wrong: bodies 20 % too heavy or too light in its model (masses and inertias together), friction or
-gravity that its model has not, commands that act some samples late, encoders of so many steps a
-turn (they measure no rate: it is the difference of the last two angles), and noise on angle (1e-4
-rad) and rate (1e-2 rad/s). Plant and controller run in lockstep in one process. Errors are those of
-the true state. A loop with feedback that swings by more than 2 % of the longest way of a joint, or
-has a torque at its limit, long after the motion has ended does not come to rest: it has failed, as
-one that leaves its stroke or its workspace. `sst_ros/studies/feedforward.py` and `sampled_data.py`
-derive what is to be expected.
+Every control mode tracks the reference motion of the scene with every model error: bodies 20 % too
+heavy or too light in the controller's model (masses and inertias together), friction or gravity
+missing from it, commands delayed by some samples, encoders with a finite number of counts a turn
+(they measure no rate: it is the difference of the last two angles), and noise on angle (1e-4 rad)
+and rate (1e-2 rad/s). Plant and controller run in lockstep in one process. Errors are those of the
+true state. A loop with feedback that, long after the motion has ended, swings by more than 2 % of
+the longest path of a joint, or has a torque at its limit, does not come to rest: it has failed,
+as one that leaves its stroke or its workspace. `sst_ros/studies/feedforward.py` and
+`sampled_data.py` derive the theory.
 """
 
 
-def report(plan: Plan, out: Path, *, workers: int | None = None) -> Study:
-    """Do a study; print it, and write feedforward.csv, .json, .md and .png into `out`.
+def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> FeedforwardStudy:
+    """Run a study; print it, and write feedforward.csv, .json, .md and .png into `out`.
 
     Raises:
         SstError: the scene has no motion or cannot start, or `out` cannot be written.
 
     """
-    from sst_ros.plot.feedforward import draw
-
-    found = study(plan, workers=workers, shown=True)
-    print(text(found), flush=True)
-    with writing(out, "study"):
-        draw(found, out / "feedforward.png")
-        (out / "feedforward.csv").write_text(as_csv(found), encoding="utf-8")
-        (out / "feedforward.json").write_text(as_json(found), encoding="utf-8")
-        (out / "feedforward.md").write_text(page(found), encoding="utf-8")
-    return found
+    study = feedforward_study(plan, workers=workers, shown=True)
+    print(text(study), flush=True)
+    write(out, "feedforward", csv=frame(study), document=document(study), page=page(study),
+          figures={"feedforward": figure(study)})  # fmt: skip
+    return study
 
 
-def page(found: Study) -> str:
+def frame(study: FeedforwardStudy) -> DataFrame:
+    """Return a row for each loop, columns as in COLUMNS."""
+    return table(_rows(study), COLUMNS)
+
+
+def _rows(study: FeedforwardStudy) -> Iterator[dict[str, Any]]:
+    plan = study.plan
+    for loop in study.loops:
+        found = loop.tracking
+        numbers: list[Any] = [None] * 8
+        if found is not None:
+            power = found.torque_rms**2
+            shares = [
+                float(np.nansum(share * power) / power.sum()) if power.any() else None
+                for share in (found.feedforward, found.feedback)
+            ]
+            numbers = [loop.rms, float(found.largest.max()), found.settling,
+                       float(np.sqrt(power.mean())), float(found.torque_largest.max()), *shares,
+                       found.limited]  # fmt: skip
+        values = (plan.scene.name, loop.error, loop.mode, loop.bandwidth, plan.damping_ratio,
+                  plan.period_ns / 1e9, plan.seed, *numbers, loop.failure)  # fmt: skip
+        yield dict(zip(COLUMNS, values, strict=True))
+
+
+def rms_table(study: FeedforwardStudy) -> DataFrame:
+    """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
+    footnote = {id(loop): f"[{n}]" for n, loop in enumerate(failed(study), start=1)}
+    rows = []
+    for error in dict.fromkeys(loop.error for loop in study.loops):
+        for bandwidth in study.plan.bandwidths:
+            row = {"error": error, "rad/s": f"{bandwidth:g}"}
+            for mode in MODES:
+                loop = study.of(error, mode, bandwidth)
+                again = mode == OPEN_LOOP and bandwidth != study.plan.bandwidths[0]
+                row[mode] = "" if again else footnote.get(id(loop)) or f"{loop.rms:.1e}"
+            benefit = study.benefit(error, bandwidth)
+            rows.append({**row, "pd / feedforward_pd": f"{benefit:.3g}" if benefit else "-"})
+    return table(rows)
+
+
+def failed(study: FeedforwardStudy) -> list[LoopResult]:
+    """Return the loops that failed, in the order of their footnotes."""
+    return [loop for loop in study.loops if loop.failure]
+
+
+def title(study: FeedforwardStudy) -> str:
+    """Return scene and settings in one line."""
+    plan = study.plan
+    return (
+        f"Feedforward on {plan.scene.name}: {study.seconds:g} s of motion, control period "
+        f"{plan.period_ns / 1e6:g} ms, damping ratio {plan.damping_ratio:g}, seed {plan.seed}"
+    )
+
+
+def findings(study: FeedforwardStudy) -> Iterator[str]:
+    """Yield predictions of the theory beside what was found, line by line."""
+    for at, order in study.orders().items():
+        cells = ", ".join(f"{hold.error:.2e} rad at {1e3 * hold.period_s:g} ms"
+                          for hold in study.holds if hold.at == at)  # fmt: skip
+        yield (
+            f"Exact model, feedforward alone, torque at the {at} of the hold: {cells}; order "
+            f"{order:.3f}, theory {ORDERS[at]}"
+        )
+    yield (
+        f"Torque as a function of time, nothing held: {study.unheld.error:.1e} rad; error estimate "
+        f"of the integrator {study.unheld.estimate:.1e} rad"
+    )
+    for sign in "+-":
+        error = f"inertia {sign}{SHARE:.0%}"
+        for bandwidth in study.plan.bandwidths:
+            benefit, bound = study.benefit(error, bandwidth), study.least_benefit(error, bandwidth)
+            if benefit is not None and bound is not None:
+                yield (
+                    f"{error}, {bandwidth:g} rad/s: the error of feedforward_pd is {benefit:.2f} "
+                    f"times smaller than that of pd with equal gains; theory: at least {bound:.2f}"
+                )
+    yield "Largest stable bandwidth of computed_torque [rad/s]: theory; without friction; as it is"
+    for ideal, real in study.limits:
+        yield (
+            f"  delay {ideal.delay}: {ideal.theory:8.1f} {ideal.simulated:9.1f} "
+            f"({ideal.simulated / ideal.theory - 1.0:+.2%}) {real.simulated:9.1f}"
+        )
+
+
+def notes(study: FeedforwardStudy) -> Iterator[str]:
+    """Yield what failed and what was left out, line by line."""
+    for number, loop in enumerate(failed(study), start=1):
+        at = "" if loop.bandwidth is None else f" at {loop.bandwidth:g} rad/s"
+        yield f"[{number}] {loop.error}, {loop.mode}{at}: {loop.failure}"
+    for name in study.left_out:
+        yield f"Left out: {name}, which this scene cannot have."
+
+
+def text(study: FeedforwardStudy) -> str:
+    """Format a study for the terminal."""
+    lines = [
+        title(study), "", "RMS error of gamma [rad], by model error and bandwidth of the feedback",
+        rms_table(study).to_string(index=False), "", *notes(study), "", *findings(study),
+        provenance(),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def page(study: FeedforwardStudy) -> str:
     """Write a study as one Markdown page."""
-    heads, *table = rows(found)
-    lines = [INTRODUCTION, f"**{title(found)}.**", "", "![the study](feedforward.png)", ""]
-    lines += ["## What holds", "", *(f"- {line.strip()}" for line in shown(found)), ""]
-    lines += ["## RMS error of gamma [rad]", "", "| " + " | ".join(heads) + " |"]
-    lines.append("| --- |" + " --- |" * (len(heads) - 1))
-    lines += ["| " + " | ".join(row) + " |" for row in table]
-    lines += ["", *(f"- {line}" for line in notes(found)), "", made(found), ""]
+    lines = [
+        INTRODUCTION, f"**{title(study)}.**", "", "![the study](feedforward.png)", "",
+        "## Theory and findings", "", *(f"- {line.strip()}" for line in findings(study)), "",
+        "## RMS error of gamma [rad]", "", markdown(rms_table(study)), "",
+        *(f"- {line}" for line in notes(study)), "", provenance(), "",
+    ]  # fmt: skip
     return "\n".join(lines)
+
+
+def document(study: FeedforwardStudy) -> dict[str, Any]:
+    """Return everything as JSON has it."""
+    return {
+        "scene": study.plan.scene.name,
+        "motion_s": study.seconds,
+        "left_out": list(study.left_out),
+        "loops": list(_rows(study)),
+        "holds": [
+            {"at": at, "order": None if np.isnan(order) else order, "order_of_theory": ORDERS[at],
+             "errors": [asdict(hold) for hold in study.holds if hold.at == at]}
+            for at, order in study.orders().items()
+        ],
+        "exact_holds": asdict(study.unheld),
+        "limits": [{"ideal": asdict(a), "as_it_is": asdict(b)} for a, b in study.limits],
+    }  # fmt: skip
+
+
+def figure(study: FeedforwardStudy) -> Figure:
+    """Draw the study."""
+    reasons: dict[str, int] = {}
+    for loop in failed(study):
+        first, _, last = loop.failure.partition(": ")
+        reason = last if "stopped at" in first else first
+        reasons[reason] = reasons.get(reason, 0) + 1
+    lines = [provenance()]
+    if reasons:
+        listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:4])
+        lines.insert(0, f"Failed: {listed}. The table and the CSV have the reason of each.")
+    limits = table({"delay": ideal.delay, "theory": ideal.theory, "ideal": ideal.simulated,
+                    "real": real.simulated} for ideal, real in study.limits)  # fmt: skip
+    return draw_feedforward(
+        frame(study),
+        table(asdict(hold) for hold in study.holds),
+        limits,
+        bandwidths=study.plan.bandwidths,
+        orders={at: (order, ORDERS[at]) for at, order in study.orders().items()},
+        unheld=study.unheld.error,
+        title=title(study),
+        footnote="\n".join(lines),
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller may have wrong: its model of the plant, or what it sees and when it acts."""
+"""Model errors of a controller: a wrong model, or a channel that changes its signals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
 
 DELAYS = (1, 2, 3, 4, 5)
-"""Samples by which commands come late."""
+"""Delays of commands in samples."""
 
 COUNTS = (65536, 16384)
 """Steps of an encoder per turn of the joint."""
@@ -31,10 +31,10 @@ def _same(scene: Scene) -> Scene:
 
 @dataclass(frozen=True)
 class ModelError:
-    """One thing that a controller has wrong.
+    """One error of a controller.
 
     Attributes:
-        name: what it is called in tables.
+        name: its name in tables.
         model: the controller's model, of the plant's scene.
         channel: what stands between the plant and the controller.
 

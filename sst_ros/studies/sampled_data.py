@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sampling does to a control loop, in theory: the largest bandwidth, and the error of a hold.
+"""Sampled-data theory of a control loop: the largest stable bandwidth, and the error of a hold.
 
 **Bandwidth.** Exact computed torque leaves a double integrator for each axis, x'' = u, and asks for
 u = -(omega^2 x + 2 zeta omega x'). The state is sampled every T, u acts d samples later and is held
@@ -50,12 +50,12 @@ def pole(product: float, damping: float, delay: int) -> float:
     return float(np.abs(np.roots(polynomial)).max())
 
 
-def largest(damping: float, delay: int) -> float:
+def stability_limit(damping: float, delay: int) -> float:
     """Largest bandwidth times period [rad] below which every loop is stable."""
-    return first_lost(lambda product: pole(product, damping, delay) < 1.0, _FINEST, 1.02)
+    return largest_stable(lambda product: pole(product, damping, delay) < 1.0, _FINEST, 1.02)
 
 
-def first_lost(
+def largest_stable(
     stable: Callable[[float], bool], start: float, factor: float, to: float = 1e-6
 ) -> float:
     """Go up from `start` by factors until it is not stable; bisect the last one.

@@ -10,8 +10,8 @@ from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros import scene
-from sst_ros.plot import catalogue, energy
-from sst_ros.plot.catalogue import PICTURES, draw
+from sst_ros.plot import energy, pictures
+from sst_ros.plot.pictures import PICTURES, draw
 from sst_ros.recording import recording, signals
 from sst_ros.report import energy_balance
 from sst_ros.simulation import Simulation
@@ -34,14 +34,14 @@ def run(tmp_path_factory, bags, example2):
 def drawn(run, tmp_path_factory):
     """All pictures of a run: the figures by name, and the folder."""
     kept, out = {}, tmp_path_factory.mktemp("pictures")
-    whole = catalogue.save
+    whole = pictures.save
 
     def keep(figure, title, folder, stem):
         kept[stem] = figure
         return whole(figure, title, folder, stem)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalogue, "save", keep)
+        patch.setattr(pictures, "save", keep)
         paths, missing = draw(run, out)
     assert missing == {}
     assert {path.stem for path in paths} == set(kept) and len(kept) == len(PICTURES)

@@ -111,7 +111,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     assert base64.b64decode(pictures[0]) == (out / "page.png").read_bytes()
     assert "http" not in re.sub(r"base64,[^']+", "", text)
     assert "command to its step, mean" in text
-    assert "What the recording does not tell" in text
+    assert "What the recording does not contain" in text
     assert "Not told: no diagnostics" in table(summary)
 
 

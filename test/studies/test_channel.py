@@ -4,32 +4,32 @@
 import numpy as np
 import pytest
 
-from sst_ros.studies.channel import Channel, Wire
+from sst_ros.studies.channel import Channel, ChannelState
 
 GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 
 
 def test_a_channel_that_loses_nothing_changes_nothing():
-    wire = Wire(Channel(), 1e-3, 0)
-    assert wire.measured(GAMMA, RATE) == (GAMMA, RATE)
-    assert wire.acting((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
+    wire = ChannelState(Channel(), 1e-3, 0)
+    assert wire.measure(GAMMA, RATE) == (GAMMA, RATE)
+    assert wire.delayed((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 5])
 def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
-    wire = Wire(Channel(delay=delay), 1e-3, 0)
-    came = [wire.acting((float(k), 0.0, 0.0))[0] for k in range(10)]
+    wire = ChannelState(Channel(delay=delay), 1e-3, 0)
+    came = [wire.delayed((float(k), 0.0, 0.0))[0] for k in range(10)]
     assert came == [max(k - delay, 0) for k in range(10)]
 
 
 def test_an_encoder_counts_and_knows_rates_from_counts_alone():
     period, counts = 1e-3, 1000
     step = 2.0 * np.pi / counts
-    wire = Wire(Channel(counts=counts), period, 0)
+    wire = ChannelState(Channel(counts=counts), period, 0)
     seen, rates = [], []
     for k in range(200):
         angle = 0.5 + 3.0 * k * period
-        gamma, rate = wire.measured((angle,) * 3, (3.0,) * 3)
+        gamma, rate = wire.measure((angle,) * 3, (3.0,) * 3)
         assert abs(gamma[0] - angle) <= 0.5 * step * (1.0 + 1e-9)
         assert gamma[0] / step == pytest.approx(round(gamma[0] / step), abs=1e-9)
         seen.append(gamma[0])
@@ -40,8 +40,8 @@ def test_an_encoder_counts_and_knows_rates_from_counts_alone():
 
 def test_noise_has_its_deviation_and_repeats_by_seed():
     def drawn(seed):
-        wire = Wire(Channel(noise=(1e-3, 0.1)), 1e-3, seed)
-        return np.array([wire.measured(GAMMA, RATE) for _ in range(4000)])
+        wire = ChannelState(Channel(noise=(1e-3, 0.1)), 1e-3, seed)
+        return np.array([wire.measure(GAMMA, RATE) for _ in range(4000)])
 
     first = drawn(3)
     # The deviation of 12 000 numbers is known to 1 / sqrt(2 n) = 0.65 %.

@@ -42,19 +42,19 @@ def finite(state):
 @pytest.mark.parametrize("case", CASES, ids=[case.name.replace(" ", "-") for case in CASES])
 def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     began = time.perf_counter()
-    outcome = extreme_cases.run(case)
+    done = extreme_cases.run(case)
     assert time.perf_counter() - began < LONGEST
-    if outcome.simulation is not None:
-        assert finite(outcome.simulation.state)
-        assert all(map(math.isfinite, outcome.simulation.conditioning.values()))
-        assert math.isfinite(outcome.simulation.error_estimate)
-    assert type(outcome.error).__name__ == (case.refusal or "NoneType"), str(outcome.error)
+    if done.simulation is not None:
+        assert finite(done.simulation.state)
+        assert all(map(math.isfinite, done.simulation.conditioning.values()))
+        assert math.isfinite(done.simulation.error_estimate)
+    assert type(done.error).__name__ == (case.refusal or "NoneType"), str(done.error)
     if case.deviation is not None:
-        assert case.deviation(outcome.simulation) < case.bound
-    if isinstance(outcome.error, RunStopped):
-        assert outcome.error.state is outcome.simulation.state
+        assert case.deviation(done.simulation) < case.bound
+    if isinstance(done.error, RunStopped):
+        assert done.error.state is done.simulation.state
     if case.stop_time is not None:
-        assert outcome.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
+        assert done.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
 
 
 def test_names_of_cases_are_distinct():

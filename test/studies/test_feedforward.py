@@ -15,17 +15,16 @@ from matplotlib import image
 from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
-from sst_ros.plot.feedforward import draw
 from sst_ros.scene.scene import load
-from sst_ros.studies import bandwidth
-from sst_ros.studies.bandwidth import ideal, limit, stable
+from sst_ros.studies import bandwidth_limits
+from sst_ros.studies.bandwidth_limits import bandwidth_limit, ideal_plant, stable
 from sst_ros.studies.channel import Channel
-from sst_ros.studies.control_loop import Loop, follow
-from sst_ros.studies.feedforward import RESTLESS, Plan, study
-from sst_ros.studies.feedforward_report import page
-from sst_ros.studies.feedforward_table import COLUMNS, as_csv, as_json, of_instant, order, text
+from sst_ros.studies.control_loop import ControlLoop, run_loop
+from sst_ros.studies.feedforward import RESTLESS, FeedforwardPlan, feedforward_study
+from sst_ros.studies.feedforward_report import COLUMNS, document, figure, frame, page, text
 from sst_ros.studies.model_errors import SHARE, model_errors
-from sst_ros.studies.sampled_data import ORDERS, largest
+from sst_ros.studies.results import write
+from sst_ros.studies.sampled_data import ORDERS, stability_limit
 
 REACH = load("reach")
 SPIRAL = dataclasses.replace(REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4)
@@ -39,28 +38,30 @@ def errors(*names):
 
 def held(scene, delay, damping=1.0):
     settings = ControllerSettings(mode="computed_torque", damping_ratio=damping)
-    return Loop(scene, scene, reference_motion(scene), settings, PERIOD_NS, Channel(delay=delay))
+    return ControlLoop(
+        scene, scene, reference_motion(scene), settings, PERIOD_NS, Channel(delay=delay)
+    )
 
 
 @pytest.fixture(scope="module")
 def small():
     """A study of 0.4 s with one failure in it: delay 5 at 180 rad/s."""
-    plan = Plan(
+    plan = FeedforwardPlan(
         SHORT, bandwidths=(180.0,), errors=errors("inertia +20%", "inertia -20%", "delay 5"),
         delays=(0,),
     )  # fmt: skip
-    return study(plan, workers=1)
+    return feedforward_study(plan, workers=1)
 
 
 @pytest.mark.parametrize("at", ORDERS)
 def test_the_error_of_held_torques_falls_at_the_order_of_theory(small, at):
-    assert order(of_instant(small, at)) == pytest.approx(ORDERS[at], abs=0.1)
+    assert small.orders()[at] == pytest.approx(ORDERS[at], abs=0.1)
 
 
 def test_torques_that_are_not_held_reach_the_floor_of_the_integrator(small):
     """Both are rounding: some 1e4 operations at 1e-16 each."""
-    assert small.exact.error < 1e-12 and small.exact.estimate < 1e-11
-    assert small.exact.error < 10.0 * small.exact.estimate + 1e-14
+    assert small.unheld.error < 1e-12 and small.unheld.estimate < 1e-11
+    assert small.unheld.error < 10.0 * small.unheld.estimate + 1e-14
 
 
 @pytest.mark.parametrize("sign", "+-")
@@ -79,14 +80,14 @@ def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
 
 
 def test_with_delay_the_limit_lies_where_theory_says():
-    loop, bound = held(ideal(SHORT), 2), largest(1.0, 2) * 1e9 / PERIOD_NS
+    loop, bound = held(ideal_plant(SHORT), 2), stability_limit(1.0, 2) * 1e9 / PERIOD_NS
     assert stable(loop, 0.97 * bound) and not stable(loop, 1.03 * bound)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", range(6))
 def test_the_limit_is_found_at_every_delay(delay):
-    found = limit(held(ideal(SHORT), delay))
+    found = bandwidth_limit(held(ideal_plant(SHORT), delay))
     assert found.simulated == pytest.approx(found.theory, rel=0.02)
 
 
@@ -94,8 +95,8 @@ def test_the_limit_is_found_at_every_delay(delay):
 @pytest.mark.parametrize("damping", [0.7, 1.0])
 @pytest.mark.parametrize("delay", range(6))
 def test_every_bandwidth_up_to_the_limit_is_stable(delay, damping):
-    loop = held(ideal(SHORT), delay, damping)
-    bound = largest(damping, delay) * 1e9 / PERIOD_NS
+    loop = held(ideal_plant(SHORT), delay, damping)
+    bound = stability_limit(damping, delay) * 1e9 / PERIOD_NS
     assert all(stable(loop, share * bound) for share in (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.98))
     assert not any(stable(loop, share * bound) for share in (1.02, 1.1, 1.5, 3.0))
 
@@ -103,11 +104,11 @@ def test_every_bandwidth_up_to_the_limit_is_stable(delay, damping):
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", range(6))
 def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
-    bound = largest(1.0, delay) * 1e9 / PERIOD_NS
+    bound = stability_limit(1.0, delay) * 1e9 / PERIOD_NS
     near, beyond = (
-        follow(
+        run_loop(
             dataclasses.replace(
-                held(ideal(SHORT), delay),
+                held(ideal_plant(SHORT), delay),
                 settings=ControllerSettings(mode="computed_torque", bandwidth=share * bound),
                 lost=0.05,
             )
@@ -120,7 +121,7 @@ def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
 
 def test_a_loop_that_is_lost_says_so():
     loop = dataclasses.replace(held(SHORT, 5), lost=0.01, offset=1e-3)
-    track, limited, failure = follow(
+    track, limited, failure = run_loop(
         dataclasses.replace(loop, settings=dataclasses.replace(loop.settings, bandwidth=400.0))
     )
     assert failure.endswith("off by more than 0.01 rad")
@@ -128,58 +129,60 @@ def test_a_loop_that_is_lost_says_so():
 
 
 def test_the_same_bits_on_any_number_of_workers():
-    plan = Plan(
+    plan = FeedforwardPlan(
         SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2), delays=(),
     )  # fmt: skip
-    first, second = (study(plan, workers=n) for n in (1, 2))
-    assert as_csv(first) == as_csv(second)
-    assert first.holds == second.holds and first.exact == second.exact
-    other = study(dataclasses.replace(plan, seed=9), workers=1)
-    assert as_csv(first).replace(",8,", ",9,") != as_csv(other)
+    first, second = (feedforward_study(plan, workers=n) for n in (1, 2))
+    assert frame(first).to_csv() == frame(second).to_csv()
+    assert first.holds == second.holds and first.unheld == second.unheld
+    other = feedforward_study(dataclasses.replace(plan, seed=9), workers=1)
+    assert frame(first).drop(columns="seed").to_csv() != frame(other).drop(columns="seed").to_csv()
 
 
 def test_failures_stay_with_their_reason(small):
-    failed = [outcome for outcome in small.outcomes if outcome.failure]
+    failed = [loop for loop in small.loops if loop.failure]
     assert {(o.error, o.bandwidth) for o in failed} == {("delay 5", 180.0)}
     assert {o.mode for o in failed} == set(MODES) - {"feedforward"}
     assert all(RESTLESS in o.failure or "stopped" in o.failure for o in failed)
     said = text(small)
     assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed[-1].failure}" in said
-    assert sum(row["failure"] != "" for row in csv.DictReader(io.StringIO(as_csv(small)))) == 4
+    assert (frame(small).failure != "").sum() == 4
 
 
 def test_what_it_writes_can_be_read(small, tmp_path):
-    rows = list(csv.DictReader(io.StringIO(as_csv(small))))
+    write(tmp_path, "feedforward", csv=frame(small), document=document(small), page=page(small),
+          figures={"picture": figure(small)})  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
     assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
-    document = json.loads(as_json(small))
+    written = json.loads((tmp_path / "feedforward.json").read_text())
     assert [float(row["rms_rad"] or "nan") for row in rows] == pytest.approx(
-        [row["rms_rad"] or np.nan for row in document["loops"]], nan_ok=True
+        [row["rms_rad"] or np.nan for row in written["loops"]], nan_ok=True
     )
-    assert {row["seed"] for row in document["loops"]} == {8}
-    assert document["report"]["numpy"] == np.__version__
+    assert {row["seed"] for row in written["loops"]} == {8}
+    assert written["report"]["numpy"] == np.__version__
     for said in (text(small), page(small)):
         assert "seed 8" in said and f"NumPy {np.__version__}" in said and "theory 2" in said
-    draw(small, tmp_path / "picture.png")
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
 
 
-def test_errors_that_a_scene_cannot_have_are_told():
+def test_errors_that_a_scene_cannot_have_are_listed():
     bare = dataclasses.replace(SHORT, friction=None)
-    plan = Plan(bare, 4 * PERIOD_NS, (40.0,), errors=errors("friction unknown"), multiples=(1,),
-                delays=())  # fmt: skip
-    found = study(plan, workers=1)
+    plan = FeedforwardPlan(
+        bare, 4 * PERIOD_NS, (40.0,), errors=errors("friction unknown"), multiples=(1,), delays=()
+    )
+    found = feedforward_study(plan, workers=1)
     assert found.left_out == ("friction unknown",)
     assert "Left out: friction unknown" in text(found)
 
 
 def test_a_scene_without_a_motion_is_refused():
     with pytest.raises(InputError, match="the scene has no desired motion"):
-        study(Plan(load("example2")))
+        feedforward_study(FeedforwardPlan(load("example2")))
 
 
 def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
-    rest = bandwidth.Rest(reference_motion(SHORT), 0.1)
+    rest = bandwidth_limits.RestMotion(reference_motion(SHORT), 0.1)
     assert (
         rest.at(0.05) == rest.at(0.0)
         and rest.at(0.0).gamma == reference_motion(SHORT).at(0.0).gamma

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from sst_ros.studies.sampled_data import first_lost, largest, pole, slope
+from sst_ros.studies.sampled_data import largest_stable, pole, slope, stability_limit
 
 
 def matrix(product, damping, delay):
@@ -33,7 +33,7 @@ def test_the_poles_are_the_eigenvalues_of_the_sampled_loop(damping, delay):
 
 @pytest.mark.parametrize("damping", [0.1, 0.4, 0.5, 0.7, 1.0, 3.0])
 def test_without_delay_the_limit_is_that_of_jury(damping):
-    assert largest(damping, 0) == pytest.approx(min(4.0 * damping, 1.0 / damping), rel=3e-6)
+    assert stability_limit(damping, 0) == pytest.approx(min(4.0 * damping, 1.0 / damping), rel=3e-6)
 
 
 @pytest.mark.parametrize("damping", [0.5, 1.0])
@@ -45,19 +45,19 @@ def test_with_long_delay_the_limit_is_that_of_continuous_time(damping):
 
     x = brentq(gain, 0.5, 10.0)
     margin = np.arctan(2.0 * damping * x) / x
-    assert largest(damping, 30) * 30.5 == pytest.approx(margin, rel=1e-3)
+    assert stability_limit(damping, 30) * 30.5 == pytest.approx(margin, rel=1e-3)
 
 
 @pytest.mark.parametrize("delay", range(6))
 def test_every_bandwidth_below_the_limit_is_stable_and_none_above(delay):
-    limit = largest(1.0, delay)
+    limit = stability_limit(1.0, delay)
     assert all(pole(share * limit, 1.0, delay) < 1.0 for share in np.linspace(0.001, 0.999, 500))
     assert all(pole(share * limit, 1.0, delay) > 1.0 for share in np.linspace(1.001, 5.0, 500))
 
 
 def test_a_limit_is_found_and_nan_where_nothing_is_stable():
-    assert first_lost(lambda x: x < 3.7, 1.0, 1.3, 1e-4) == pytest.approx(3.7, rel=1e-4)
-    assert np.isnan(first_lost(lambda x: False, 1.0, 1.3))
+    assert largest_stable(lambda x: x < 3.7, 1.0, 1.3, 1e-4) == pytest.approx(3.7, rel=1e-4)
+    assert np.isnan(largest_stable(lambda x: False, 1.0, 1.3))
 
 
 def test_a_slope_is_the_power():

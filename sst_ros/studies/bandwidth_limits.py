@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The largest stable bandwidth of computed torque: simulated, beside what the theory says."""
+"""The largest stable bandwidth of computed torque: simulated, beside sampled-data theory."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS
-from sst_ros.studies.control_loop import Loop, follow
-from sst_ros.studies.sampled_data import first_lost, largest
+from sst_ros.studies.control_loop import ControlLoop, run_loop
+from sst_ros.studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
 """Error at the start [rad]: so small that the plant is linear around it."""
@@ -23,12 +23,12 @@ _GONE, _LOST = 1e-3, 1e2 * OFFSET
 
 
 @dataclass(frozen=True)
-class Limit:
+class BandwidthLimit:
     """Bandwidths below which computed torque with an exact model is stable [rad/s].
 
     Attributes:
         delay: samples by which commands are late.
-        theory: of the sampled double integrator, `sampled.largest`.
+        theory: of the sampled double integrator, `sampled_data.stability_limit`.
         simulated: of the simulation, the pose at the start of the motion held at rest.
 
     """
@@ -38,7 +38,7 @@ class Limit:
     simulated: float
 
 
-class Rest(ReferenceMotion):
+class RestMotion(ReferenceMotion):
     """A motion that stays where another one begins."""
 
     def __init__(self, motion: ReferenceMotion, duration: float) -> None:
@@ -50,7 +50,7 @@ class Rest(ReferenceMotion):
         return self._pose
 
 
-def ideal(scene: Scene) -> Scene:
+def ideal_plant(scene: Scene) -> Scene:
     """Return the plant of the theory: no friction, which acts between samples too, and no lag."""
     actuators = scene.actuators
     if actuators is not None:
@@ -59,23 +59,23 @@ def ideal(scene: Scene) -> Scene:
     return dataclasses.replace(scene, friction=None, actuators=actuators)
 
 
-def limit(loop: Loop) -> Limit:
+def bandwidth_limit(loop: ControlLoop) -> BandwidthLimit:
     """Find the limit of a loop in mode computed_torque by bisection on its bandwidth."""
     delay, period = loop.channel.delay, loop.period_ns / NANOSECONDS
-    theory = largest(loop.settings.damping_ratio, delay) / period
-    found = first_lost(
+    theory = stability_limit(loop.settings.damping_ratio, delay) / period
+    found = largest_stable(
         lambda bandwidth: stable(loop, bandwidth), _FIRST * theory, _FACTOR, _ACCURACY
     )
-    return Limit(delay, theory, found)
+    return BandwidthLimit(delay, theory, found)
 
 
-def stable(loop: Loop, bandwidth: float) -> bool:
-    """Whether a small error fades: it is less in the last quarter of a run than in the second."""
+def stable(loop: ControlLoop, bandwidth: float) -> bool:
+    """Return whether a small error is less in the last quarter of a run than in the second."""
     ticks = _TICKS + _TICKS_OF_DELAY * loop.channel.delay
-    rest = Rest(loop.motion, ticks * loop.period_ns / NANOSECONDS)
+    rest = RestMotion(loop.motion, ticks * loop.period_ns / NANOSECONDS)
     settings = dataclasses.replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
     held = dataclasses.replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)
-    track, _, failure = follow(held)
+    track, _, failure = run_loop(held)
     if failure:
         return False
     second, last = (

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of joints and torques of a run: motion, phase portraits, limits, control."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.plot.style import BLUE, GREEN, GREY, VERMILION, legend, lines, span, stack, three
+from sst_ros.recording.signals import Signals
+from sst_ros.recording.time_series import NANOSECONDS, Integers
+from sst_ros.scene.scene import Scene
+
+KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
+
+
+def joint_angles(run: Signals, _: Scene | None) -> Figure:
+    """Draw the angles of all nine joints."""
+    return _of_kinds(run, "{}", "{} [deg]", "{}", np.degrees(1.0))
+
+
+def joint_rates(run: Signals, _: Scene | None) -> Figure:
+    """Draw the rates of all nine joints, actuated and passive."""
+    return _of_kinds(run, "{}_dot", "{}̇ [rad/s]", "{}̇", 1.0)
+
+
+def _of_kinds(run: Signals, quantity: str, label: str, name: str, scale: float) -> Figure:
+    figure, panels = stack([label.format(letter) for letter in KINDS.values()])
+    for axes, (kind, letter) in zip(panels, KINDS.items(), strict=True):
+        values = scale * run.legs(quantity.format(kind))
+        lines(axes, run.seconds(), values, three(name.format(letter)))
+    return figure
+
+
+def phase(run: Signals, _: Scene | None) -> Figure:
+    """Draw each actuator's rate over its angle, from the circle to the square."""
+    figure = Figure(figsize=(10.5, 3.8))
+    angle, rate = np.degrees(run.legs("gamma")), run.legs("gamma_dot")
+    for leg, axes in enumerate(figure.subplots(1, 3)):
+        known = np.isfinite(angle[:, leg])
+        x, y = angle[known, leg], rate[known, leg]
+        axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
+        axes.plot(x[:1], y[:1], "o", color=GREEN, markersize=7, label="start")
+        axes.plot(x[-1:], y[-1:], "s", color=VERMILION, markersize=6, label="end")
+        axes.set_xlabel(f"{three('γ')[leg]} [deg]")
+        axes.set_ylabel(f"{three('γ̇')[leg]} [rad/s]")
+    figure.axes[-1].legend(loc="best", fontsize=8)
+    return figure
+
+
+def margins(run: Signals, scene: Scene) -> Figure:
+    """Draw the distance of each leg to the nearest limit of its joints."""
+    geometry = Geometry.of(scene)
+    gamma, beta = run.legs("gamma"), run.legs("beta")
+    stroke = np.degrees(np.minimum(gamma, geometry.arc - gamma))
+    reach = np.degrees(np.minimum(beta, geometry.beta_max - beta))
+    figure, panels = stack(["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6)
+    for axes, values in zip(panels, (stroke, reach), strict=True):
+        lines(axes, run.seconds(), values, [f"leg {leg}" for leg in (1, 2, 3)])
+        axes.axhline(0.0, color="black", linewidth=0.8)
+    return figure
+
+
+def tracking(run: Signals, _: Scene | None) -> Figure:
+    """Draw the desired angle of each actuator, and the measured one over it."""
+    figure, panels = stack([f"{name} [deg]" for name in three("γ")])
+    desired, measured = (np.degrees(run.legs(name)) for name in ("gamma_desired", "gamma"))
+    for leg, axes in enumerate(panels):
+        axes.plot(run.seconds(), desired[:, leg], color=GREY, linewidth=3.2, label="desired")
+        axes.plot(run.seconds(), measured[:, leg], "--", color=BLUE, linewidth=1.5,
+                  label="measured")  # fmt: skip
+    legend(panels[0])
+    span(panels, run.seconds())
+    return figure
+
+
+def tracking_error(run: Signals, _: Scene | None) -> Figure:
+    """Draw desired less measured, as the controller received it."""
+    figure, panels = stack(["γ desired − γ [rad]", "γ̇ desired − γ̇ [rad/s]"], 2.6)
+    lines(panels[0], run.seconds(), run.legs("gamma_error"), three("γ"))
+    lines(panels[1], run.seconds(), run.legs("gamma_dot_error"), three("γ̇"))
+    return figure
+
+
+def control_torques(run: Signals, _: Scene | None) -> Figure:
+    """Draw the torques of the controller's model, and of its feedback."""
+    figure, panels = stack(["feedforward [N m]", "feedback [N m]"], 2.6)
+    for axes, name in zip(panels, ("tau_feedforward", "tau_feedback"), strict=True):
+        lines(axes, run.seconds(), run.legs(name), three("τ"))
+    return figure
+
+
+def applied_and_commanded(run: Signals, _: Scene | None) -> Figure:
+    """Draw the torque of each tick, and the commands over it where they were recorded.
+
+    Commands without a stamp are drawn where the recorder received them, by its clock.
+    """
+    figure, panels = stack([f"{name} [N m]" for name in three("τ")])
+    times, torque = applied(run)
+    at, commands = _commands(run, float(times[0]), float(times[-1]))
+    for leg, axes in enumerate(panels):
+        axes.plot(times, torque[:, leg], color=BLUE, linewidth=3.0, label="applied")
+        if len(at):
+            axes.plot(at, commands[:, leg], ".", markersize=1.5, color=VERMILION, label="commanded")
+    legend(panels[0])
+    span(panels, times)
+    return figure
+
+
+def applied(run: Signals) -> tuple[Array, Array]:
+    """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held."""
+    start = run.time_ns("ticks")
+    length = run.take("length", table="ticks")[:, 0].astype(np.int64)
+    return held(start, start + length, run.legs("tau", "ticks"))
+
+
+def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:
+    """Return times [s] and values that draw a zero-order hold; a gap between ticks is nan."""
+    times = np.stack([start_ns, end_ns], axis=1).ravel() / NANOSECONDS
+    steps = np.repeat(values, 2, axis=0)
+    gaps = 2 * (np.flatnonzero(start_ns[1:] != end_ns[:-1]) + 1)
+    return np.insert(times, gaps, times[gaps]), np.insert(steps, gaps, np.nan, axis=0)
+
+
+def _commands(run: Signals, begin: float, end: float) -> tuple[Array, Array]:
+    table = next((name for name in ("commands_stamped", "commands") if name in run.tables), None)
+    if table is None:
+        return np.empty(0), np.empty((0, 3))
+    at, values = run.seconds(table), run.legs("tau", table)
+    inside = (at >= begin) & (at <= end)
+    return at[inside], values[inside]

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Absolute stability of the methods: stability functions, and the largest stable steps found.
+
+Applied to y' = lambda y with steps h, a method multiplies y by its stability function R(z),
+z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and
+IV.3). The largest stable step is found by bisection on two families of scenes: `stiff` with other
+viscous coefficients, whose fastest eigenvalue is real, and a star on springs, whose eigenvalues are
+imaginary.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros import scene as scenes
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper
+from sst_ros.integration.compiled_method import CompiledMethod, Method
+from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.integration.ode import ODE
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
+from sst_ros.scene.scene import Scene
+from sst_ros.studies.parallel import evaluate_grid
+from sst_ros.studies.step_advice import step_advice
+
+VISCOSITIES = tuple(10.0**n for n in range(6))
+"""Viscous coefficients of the damped family [N m s/rad]."""
+
+STIFFNESSES = tuple(10.0**n for n in range(1, 9))
+"""Stiffnesses of the springs of the oscillating family [N m/rad]."""
+
+LONGEST_S = 1.0
+"""Longer steps are not tried [s]."""
+
+AMPLITUDE = 1e-4
+"""Distance of the springs' start from their rest [rad]: so small that the motion is linear."""
+
+_SHORTEST_S, _STEPS, _GROWTH = 1e-9, 400, 10.0
+
+
+@dataclass(frozen=True)
+class LargestStep:
+    """Largest stable step of a method; LONGEST_S where every step was stable.
+
+    Attributes:
+        family: decay or oscillation.
+        method: its name.
+        coefficient: viscous coefficient [N m s/rad] or stiffness [N m/rad].
+        rate: largest modulus of the eigenvalues at the start [1/s].
+        step: the step [s]; nan where the shortest was unstable.
+
+    """
+
+    family: str
+    method: str
+    coefficient: float
+    rate: float
+    step: float
+
+
+def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Evaluate R(z) of a method from its coefficients, for any shape of z."""
+    stages: list[Any] = []
+    one = np.ones_like(z)
+    if isinstance(method, Rosenbrock):
+        for a, c in zip(method.a, method.c, strict=True):
+            at = one + _weighted(a, stages)
+            stages.append((z * at + _weighted(c, stages)) / (4.0 - z))
+        return np.asarray(at + stages[-1])
+    for row in method.a:
+        stages.append(one + z * _weighted(row, stages))
+    return np.asarray(one + z * _weighted(method.b, stages))
+
+
+def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:
+    return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)
+
+
+def damped(coefficient: float) -> Scene:
+    """Return the scene `stiff` with another viscous coefficient of the actuators [N m s/rad]."""
+    friction = JointFriction(gamma=Friction(viscous=coefficient))
+    return dataclasses.replace(scenes.load("stiff"), friction=friction)
+
+
+def oscillating(stiffness: float) -> Scene:
+    """Return the star of example2 on springs [N m/rad], close to their rest."""
+    start = (0.7, 0.8, 0.75)
+    springs = tuple(Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=rest - AMPLITUDE)
+                    for k, rest in enumerate(start))  # fmt: skip
+    return dataclasses.replace(
+        scenes.load("example2"), springs=springs, initial=Initial(gamma=start), torque=None,
+        stroke=Stroke(at_end="ignore"), workspace=Workspace(at_edge="ignore"),
+    )  # fmt: skip
+
+
+FAMILIES: dict[str, tuple[Callable[[float], Scene], tuple[float, ...]]] = {
+    "decay": (damped, VISCOSITIES),
+    "oscillation": (oscillating, STIFFNESSES),
+}
+
+
+def eigenvalues(scene: Scene) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised dynamics at the start [1/s]."""
+    dynamics = Dynamics.of(scene)
+    start = initial_state(scene, Geometry.of(scene))
+    lagged = (0.0,) * (len(dynamics.state) - 7)
+    stepper = AdaptiveStepper(ODE(dynamics), "dopri5", 1.0, compiled=False)
+    return np.asarray(
+        stepper.spectrum(0.0, (*start, *lagged), (0.0,) * len(dynamics.drive)), dtype=complex
+    )
+
+
+def largest_step(family: str, method: Method, coefficient: float) -> LargestStep:
+    """Find the longest stable step by bisection: the rates do not grow tenfold in 400 steps."""
+    scene = FAMILIES[family][0](coefficient)
+    dynamics = Dynamics.of(scene)
+    rate = float(np.abs(eigenvalues(scene)).max())
+    integrator = CompiledMethod(ODE(dynamics), method, compiled=False)
+    start = list(initial_state(scene, Geometry.of(scene)))
+    drive = (0.0,) * len(dynamics.drive)
+    # Rates of the oscillation at its amplitude; at rest the damped family has a rate of its own.
+    bound = _GROWTH * (1.0 if family == "decay" else AMPLITUDE * rate)
+
+    def stable(h: float) -> bool:
+        try:
+            with np.errstate(all="ignore"):
+                y = integrator.step_fixed(0.0, h, _STEPS, start, drive)
+        except (ArithmeticError, ValueError):
+            return False
+        return all(map(math.isfinite, y)) and math.hypot(*y[4:7]) < bound
+
+    return LargestStep(family, method.name, coefficient, rate, bisect_step(stable))
+
+
+def bisect_step(stable: Callable[[float], bool]) -> float:
+    """Return the largest h for which `stable` holds, to one per cent; nan where there is none."""
+    if stable(LONGEST_S):
+        return LONGEST_S
+    low, high = math.log(_SHORTEST_S), math.log(LONGEST_S)
+    if not stable(_SHORTEST_S):
+        return math.nan
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(math.exp(middle)) else (low, middle)
+    return math.exp(low)
+
+
+def largest_steps(*, workers: int | None = None, shown: bool = False) -> list[LargestStep]:
+    """Find the largest stable step of every method in both families."""
+    points = [
+        (family, name, coefficient)
+        for family, (_, coefficients) in FAMILIES.items()
+        for coefficient in coefficients
+        for name in METHODS
+    ]
+    return evaluate_grid(_point, points, workers=workers, label="largest steps   ", shown=shown)
+
+
+def _point(point: tuple[str, str, float]) -> LargestStep:
+    family, name, coefficient = point
+    return largest_step(family, METHODS[name], coefficient)
+
+
+def scene_points() -> dict[str, NDArray[np.complex128]]:
+    """Eigenvalues of the shipped scenes times the steps that `step_advice` recommends."""
+    found = {}
+    for name in scenes.names():
+        step = step_advice(scenes.load(name)).step
+        if step is not None:
+            found[name] = step * eigenvalues(scenes.load(name))
+    return found
+
+
+def regions(
+    x: tuple[float, float] = (-8.0, 2.0), y: tuple[float, float] = (-6.0, 6.0), points: int = 401
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return a grid of z, shapes (points,), and abs(R) of every method on it."""
+    real, imaginary = np.linspace(*x, points), np.linspace(*y, points)
+    z = real[None, :] + 1j * imaginary[:, None]
+    found = {name: np.abs(stability_function(method, z)) for name, method in METHODS.items()}
+    return real, imaginary, found
