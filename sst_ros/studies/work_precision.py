@@ -40,6 +40,10 @@ ROUNDING = 2e-14
 LONGEST_RUN_S = 0.4
 """No finer settings are tried after a run that took longer than this [s]."""
 
+LEAST_SETTINGS = 3
+"""So many settings of each method are tried even where they take longer: a busy machine slows one
+run, but must not empty the grid."""
+
 SLOWER = 5.0
 """`Simulation` under torques that are functions is plain Python and may take so much longer."""
 
@@ -184,12 +188,12 @@ def _refined(
 ) -> Iterator[SolverResult]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
-    for setting in settings:
+    for number, setting in enumerate(settings, start=1):
         row = _result(setting, problem, truth)
         yield row
         below += row.error < max(floor, ROUNDING)
         slower = SLOWER if problem.kinked and setting.kind == TOLERANCE else 1.0
-        if row.wall_s[0] > longest_s * slower or below > 1:
+        if (row.wall_s[0] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
             return
 
 
