@@ -8,7 +8,7 @@ EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: help demo demo-feedforward docs view test test-all test-jazzy test-ros lint format clean
+.PHONY: help demo demo-feedforward docs view test test-all test-jazzy test-ros test-slow lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -35,9 +35,11 @@ test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment o
 test-ros: $(VENV)/.ros  ## run the tests of the nodes
 	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
 
-test-all: $(VENV)/.test lint test-jazzy  ## run all tests, the slow ones too
-	$(PYTEST) $(PARALLEL) --ignore test/ros --timeout 600
-	$(PYTEST) test/ros --timeout 600
+test-slow: $(VENV)/.test  ## run the slow tests: sweeps, long pages, packages, fresh environments
+	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600
+	$(PYTEST) -m slow test/ros --timeout 600
+
+test-all: test test-slow test-jazzy  ## run all tests
 
 lint: $(VENV)/.test  ## check style and types
 	$(VENV)/bin/ruff check .

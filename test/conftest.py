@@ -6,6 +6,7 @@ from bags import bags, example2, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
 
+pytest_plugins = ["unexpected_skips"]
 __all__ = ["bags", "example2", "written", "wrong_kernel"]
 
 
