@@ -47,7 +47,7 @@ def film(path: Path) -> None:
             assert process.stdout is not None
             found = re.search(r"http://\S+", process.stdout.readline())
             if found is None:
-                raise SstError("`view` did not say where its page is")
+                raise SstError("`view` printed no address")
             with browse(found.group(), WINDOW) as page:
                 taken = [Image.open(io.BytesIO(png)).convert("RGB") for png in _pictures(page)]
         finally:

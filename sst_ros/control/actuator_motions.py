@@ -27,28 +27,28 @@ STEP = 0.03
 """Distance in gamma [rad] between orientations that are kept."""
 
 LONGEST = 100.0
-"""No motion goes further in gamma [rad] from one of its points to the next."""
+"""Longest path in gamma [rad] within a piece of a motion."""
 
 _SAMPLES = 16
 
 
 class ActuatorMotion(ReferenceMotion):
-    """A path of the actuators and the assembly that is carried along.
+    """A path of the actuators, and the orientation of one assembly mode along it.
 
-    Orientations are followed once, by `continuation`, in steps that cannot leave the assembly, and
-    kept; any other one is found from the nearest of these. So `at` does not depend on what was
-    asked before.
+    Orientations are computed once along the path, by `continuation` in steps that cannot leave the
+    assembly mode; any other orientation is computed from the nearest of these. `at` therefore does
+    not depend on earlier calls.
 
     Args:
         geometry: base triangle and star.
-        path: what the actuators do between 0 and the duration.
+        path: gamma and its two derivatives between time 0 and the duration.
         pieces: see `ReferenceMotion`.
         start: quaternion (x, y, z, w) of {E} in {B} at time 0.
 
     Raises:
-        SingularConfiguration: a parallel singularity lies in the way; the error says when.
-        InputError: the path goes too far to be followed.
-        AssemblyError: start is no orientation that the path begins with.
+        SingularConfiguration: the path meets a parallel singularity; the message has the time.
+        InputError: a piece of the path is longer than LONGEST.
+        AssemblyError: start is not an orientation of the manipulator at the begin of the path.
 
     """
 
@@ -95,7 +95,7 @@ def _spaced(path: Path, pieces: tuple[float, ...]) -> Iterator[float]:
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
         if not length < LONGEST:
             allowed = f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
-            raise InputError("motion", [Problem("way of gamma", length, allowed)])
+            raise InputError("motion", [Problem("path length of gamma", length, allowed)])
         count = max(_SAMPLES, math.ceil(2.0 * length / STEP))
         for time in np.linspace(begin, end, count + 1).tolist()[1:]:
             here = path(time)[0]
@@ -116,11 +116,11 @@ def _alike(quaternions: list[list[float]], before: Quadruple) -> Iterator[Quadru
 
 def straight_path(start: Triple, goal: ToAngles) -> Path:
     """From one gamma straight to another, with minimum jerk."""
-    way = [b - a for a, b in zip(start, goal.gamma, strict=True)]
+    span = [b - a for a, b in zip(start, goal.gamma, strict=True)]
 
     def path(time: float) -> tuple[Triple, Triple, Triple]:
         s, rate, acceleration = timed(time, goal.duration)
-        (p1, p2, p3), (w1, w2, w3) = start, way
+        (p1, p2, p3), (w1, w2, w3) = start, span
         return (
             (p1 + s * w1, p2 + s * w2, p3 + s * w3),
             (rate * w1, rate * w2, rate * w3),

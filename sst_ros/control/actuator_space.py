@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the star to the actuators and back: positions, rates and accelerations, to rounding.
 
-One equation serves both ways: gamma_dot_k = g_k.W and, differentiated, gamma_ddot_k = g_k.W_dot +
-(what there is at W_dot = 0), which is Eq. 40 solved for gamma_ddot. Orientations of given actuator
-angles come from Newton's method, started so near that it cannot leave the assembly.
+One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k =
+g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The orientation at
+given actuator angles comes from Newton's method, started so close that it stays in the assembly
+mode.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, cross, dot, rotation_rows, scaled, turned_back
 
 ROUNDING = 4e-16
-"""Residual abs(r_k . t_k) that needs no further step."""
+"""Residual abs(r_k . t_k) at which Newton's method ends: rounding."""
 
 _STEPS = 20
 _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
@@ -29,7 +30,7 @@ _CARRIAGES = tuple(f"r{k}{axis}" for k in range(3) for axis in "xyz")
 
 
 class ActuatorSpaceMap:
-    """Traced kinematics of one geometry."""
+    """Map between star and actuators: traced kinematics of one geometry."""
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -44,7 +45,7 @@ class ActuatorSpaceMap:
         self._newton = compiled(trace(self._improved, (*QUATERNION, *_CARRIAGES)))
 
     def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Reference:
-        """Add gamma, in (-pi, pi], and its derivatives to a motion of the star.
+        """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
 
         Raises:
             ArithmeticError: serial singularity.
@@ -65,7 +66,7 @@ class ActuatorSpaceMap:
     def of_actuators(
         self, near: Quadruple, gamma: Triple, gamma_dot: Triple, gamma_ddot: Triple
     ) -> Reference:
-        """Add the orientation that is next to `near`, and its derivatives, to the actuators'.
+        """Return the reference of a state of the actuators, in the assembly mode closest to `near`.
 
         Raises:
             ArithmeticError: singularity.
@@ -76,7 +77,7 @@ class ActuatorSpaceMap:
         return Reference(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
 
     def orientation(self, near: Quadruple, gamma: Triple) -> Quadruple:
-        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma that is next to `near`.
+        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
 
         Raises:
             ArithmeticError: parallel singularity.
@@ -124,7 +125,7 @@ class ActuatorSpaceMap:
         rate = _solved(reach, gamma_dot)
         moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         rest = [kernel.rest_accelerations(at, rate)[1] for at in moving]
-        missing = [asked - has for asked, has in zip(gamma_ddot, rest, strict=True)]
+        missing = [total - part for total, part in zip(gamma_ddot, rest, strict=True)]
         return (*rate, *_solved(reach, missing))
 
     def _improved(self, *inputs: Any) -> tuple[Any, ...]:

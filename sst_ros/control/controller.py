@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques that make the manipulator follow a motion: by its model, by feedback, or by both.
+"""Controllers that track a reference motion: by the model, by feedback, or by both.
 
-With e = desired - measured, in gamma:
+The five schemes, with e = desired - measured in gamma:
 
     feedforward         tau = ID(desired)
     pd                  tau = K e + D e_dot
@@ -9,12 +9,14 @@ With e = desired - measured, in gamma:
     feedforward_pd      tau = ID(desired) + K e + D e_dot
     computed_torque     tau = ID(measured state, gamma_ddot + kd e_dot + kp e)
 
-ID is the inverse dynamics with all terms of the model. On SO(3) the error of computed_torque is
-the rotation vector phi = log(R^T R_d) in {E}, and W_dot = d/dt(R^T R_d W_d) + kd e_W + kp phi
-with e_W = R^T R_d W_d - W. As phi is an eigenvector of its own differential, kp phi^2 + e_W^2 falls
-at the rate 2 kd e_W^2 from every error below half a turn (Bullo and Murray 1995).
+ID is the inverse dynamics (Eq. 90) with all terms of the model, G its gravity torque.
 
-Integral action adds K r times the sum of e. The sum stands still while a torque is at its limit and
+On SO(3) the error of computed_torque is the rotation vector phi = log(R^T R_d) in {E}, and W_dot =
+d/dt(R^T R_d W_d) + kd e_W + kp phi with e_W = R^T R_d W_d - W. As phi is an eigenvector of its own
+differential, kp phi^2 + e_W^2 falls at the rate 2 kd e_W^2 from every error below half a turn
+(Bullo and Murray 1995).
+
+Integral action adds K r times the integral of e. It is frozen while a torque is at its limit and
 the error would drive it further (conditional integration, Astrom and Hagglund 2006, section 3.5).
 """
 
@@ -43,10 +45,10 @@ __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
 
 class ControlStopped(SstError):
-    """The controller has no torque any more; it says so to every later call until a reset.
+    """No torque can be computed; every later call raises the same until a reset.
 
     Attributes:
-        time: when, in the time of the motion [s].
+        time: of the motion [s].
 
     """
 
@@ -57,7 +59,7 @@ class ControlStopped(SstError):
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the encoders give: angles [rad] and rates [rad/s] of the actuators."""
+    """Angles [rad] and rates [rad/s] of the actuators, as encoders measure them."""
 
     gamma: Triple
     gamma_dot: Triple
@@ -65,13 +67,13 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Command:
-    """What the actuators are told at one instant.
+    """Output of a controller at one instant.
 
     Attributes:
-        torque: what to apply [N m]: the sum of the next two, limited.
-        feedforward: what the model gives without an error [N m]; for gravity_pd the weight.
-        feedback: what the measurement adds [N m].
-        desired: the motion at this instant.
+        torque: command [N m]: feedforward + feedback, limited.
+        feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
+        feedback: torque due to the error [N m].
+        desired: the reference at this instant.
         saturated: a torque was limited.
 
     """
@@ -84,13 +86,13 @@ class Command:
 
 
 class Controller:
-    """A controller of one motion.
+    """A controller that tracks one reference motion by one of the five schemes above.
 
     Args:
-        model: what it takes the manipulator for; the manipulator itself may differ.
-        motion: what is wanted.
-        settings: mode and gains.
-        period_s: time from one command to the next, over which each is held [s].
+        model: the manipulator as the controller models it; the plant may differ.
+        motion: the reference motion.
+        settings: scheme (`mode`) and gains.
+        period_s: control period, over which a command is held [s].
 
     Raises:
         InputError: the integral action would be unstable.
@@ -120,21 +122,21 @@ class Controller:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: without what was summed, and without a failure."""
+        """Clear the integral, the observer and a failure."""
         self._observer.reset()
         self._sum: Triple = ZERO
         self._failure: ControlStopped | None = None
 
     def follow(self, motion: ReferenceMotion) -> None:
-        """Take another motion, which must begin where the present one is; gains and sum stay."""
+        """Track another motion, from the present reference on; gains and integral stay."""
         self._motion = motion
 
     def command(self, time: float, measured: Measurement) -> Command:
-        """Give the torques from `time` [s] of the motion on, to be held for a period.
+        """Return the command at a time of the motion [s], to be held for a period.
 
         Raises:
-            ControlStopped: what was measured is not finite, the branch of the assembly ends, or
-                the model is singular there. The error stays until a reset.
+            ControlStopped: the measurement is not finite, the assembly mode ends, or the model is
+                singular there.
 
         """
         if self._failure is not None:
@@ -151,22 +153,22 @@ class Controller:
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
 
     def _command(self, time: float, measured: Measurement) -> Command:
-        _refuse_what_is_not_finite((*measured.gamma, *measured.gamma_dot), "measured")
+        _require_finite((*measured.gamma, *measured.gamma_dot), "measured")
         mode, desired = self._settings.mode, self._motion.at(time)
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
         feedforward, feedback = ZERO, ZERO
         if mode == "gravity_pd":
-            feedforward = self._inverse.gravity_torque(self._observer.see(measured.gamma))
+            feedforward = self._inverse.gravity_torque(self._observer.update(measured.gamma))
         elif mode != "pd":
             feedforward = self._at_desired(desired)
         summed: Triple = ZERO
         if mode == "computed_torque":
-            asked, summed = self._computed(desired, measured, error)
-            feedback = axpy(1.0, asked, -1.0, feedforward)
+            total, summed = self._computed(desired, measured, error)
+            feedback = axpy(1.0, total, -1.0, feedforward)
         elif mode != "feedforward":
             rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
-            wanted, summed = self._wanted(error, rates)
-            feedback = _by_joint(self._inertia, wanted)
+            acceleration, summed = self._feedback(error, rates)
+            feedback = _by_joint(self._inertia, acceleration)
         if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
             feedforward = self._at_desired(self._motion.at(time + 0.5 * self._period_s))
         return self._limited(feedforward, feedback, desired, error, summed)
@@ -179,13 +181,13 @@ class Controller:
         error: Triple,
         summed: Triple,
     ) -> Command:
-        asked = added(feedforward, feedback)
-        _refuse_what_is_not_finite(asked, "torque")
-        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in asked)
+        total = added(feedforward, feedback)
+        _require_finite(total, "torque")
+        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in total)
         torque = (first, second, third)
-        if dot(axpy(1.0, asked, -1.0, torque), error) <= 0.0:
+        if dot(axpy(1.0, total, -1.0, torque), error) <= 0.0:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
-        return Command(torque, feedforward, feedback, desired, torque != asked)
+        return Command(torque, feedforward, feedback, desired, torque != total)
 
     def _at_desired(self, at: Reference) -> Triple:
         return self._inverse.reference_torque(at)
@@ -193,20 +195,20 @@ class Controller:
     def _computed(
         self, desired: Reference, measured: Measurement, error: Triple
     ) -> tuple[Triple, Triple]:
-        """Torques of computed_torque, and the error to sum."""
-        quaternion = self._observer.see(measured.gamma)
+        """Torque of computed_torque, and the error to integrate."""
+        quaternion = self._observer.update(measured.gamma)
         rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
-        wanted, summed = self._wanted(error, rates)
+        acceleration, summed = self._feedback(error, rates)
         now = self._observer.coordinates.of_actuators(
-            quaternion, measured.gamma, measured.gamma_dot, added(desired.gamma_ddot, wanted)
+            quaternion, measured.gamma, measured.gamma_dot, added(desired.gamma_ddot, acceleration)
         )
-        acceleration = now.body_acceleration
+        body_acceleration = now.body_acceleration
         if self._settings.space == "so3":
-            acceleration, summed = self._on_so3(desired, now)
-        return self._inverse.torque(now.quaternion, now.body_rate, acceleration), summed
+            body_acceleration, summed = self._on_so3(desired, now)
+        return self._inverse.torque(now.quaternion, now.body_rate, body_acceleration), summed
 
     def _on_so3(self, desired: Reference, now: Reference) -> tuple[Triple, Triple]:
-        """W_dot in {E}, and the rotation vector of the error."""
+        """W_dot in {E}, and the rotation vector of the error, which is integrated."""
         between = orientation_error.between(now.quaternion, desired.quaternion)
         turn = rotation_rows(between)
         rate, forward = (
@@ -215,11 +217,11 @@ class Controller:
         )
         moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
         phi = orientation_error.rotation_vector(between)
-        wanted, summed = self._wanted(phi, axpy(1.0, rate, -1.0, now.body_rate))
-        return added(moving, wanted), summed
+        acceleration, summed = self._feedback(phi, axpy(1.0, rate, -1.0, now.body_rate))
+        return added(moving, acceleration), summed
 
-    def _wanted(self, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
-        """Accelerations that the feedback asks for, and the error to sum."""
+    def _feedback(self, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
+        """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
         leaning = axpy(1.0, error, self._settings.integral_rate, self._sum)
         return added(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
 
@@ -248,6 +250,6 @@ def _by_joint(factors: Triple, values: Triple) -> Triple:
     return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
 
 
-def _refuse_what_is_not_finite(numbers: Sequence[float], what: str) -> None:
+def _require_finite(numbers: Sequence[float], what: str) -> None:
     if not all(map(math.isfinite, numbers)):
         raise InputError("control", [Problem(what, tuple(numbers), "must be finite numbers")])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller does with its model and its measurements, as a section."""
+"""Settings of a controller: scheme and gains."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ControllerSettings(Section):
         most=1e6,
     )
     torque_limit: float = number(
-        "largest torque that is asked for, beside that of the scene's actuators; 0 for none",
+        "largest torque that is commanded, beside that of the scene's actuators; 0 for none",
         "N m",
         default=0.0,
         least=0.0,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences of orientations, from quaternions (x, y, z, w) of length 1."""
+"""Orientation errors, from quaternions (x, y, z, w) of length 1."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sst_ros.control.star_motions import product
 
 
 def between(first: Quadruple, second: Quadruple) -> Quadruple:
-    """Quaternion of R1^T R2: the second orientation as seen from the first."""
+    """Quaternion of R1^T R2: the second orientation relative to the first."""
     x, y, z, w = first
     return product((-x, -y, -z, w), second)
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The orientation that encoders cannot see: it follows from gamma, by continuity from the last.
+"""Orientation observer: the orientation that follows from encoder angles, by continuity.
 
-The steps are those that `continuation` proves not to leave the branch. It needs sigma, the least
-singular value of J2. The rows of J2 are unit vectors, so its squared singular values sum to 3, the
-product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most steps, and
-cheap. Where a step is too long for that, `continuation` goes it in parts.
+Its steps are those that `continuation` proves to stay in the assembly mode. The proof needs sigma,
+the least singular value of J2. The rows of J2 are unit vectors, so its squared singular values sum
+to 3, the product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most
+steps, and cheap. Where a step is too long for that, `continuation` divides it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import axpy, cross, dot, rotation_rows
 
 CLOSED = 1e-14
-"""Largest abs(r_k . t_k) of an orientation that is told to be one."""
+"""Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
 
 
 class OrientationObserver:
-    """Follows one assembly, however far apart the angles are that it is shown.
+    """Tracks one assembly mode, however far apart successive angles are.
 
     Args:
         geometry: base triangle and star.
-        quaternion: orientation (x, y, z, w) in which it begins.
+        quaternion: initial orientation (x, y, z, w).
         gamma: actuator angles there [rad].
 
     """
@@ -43,15 +43,15 @@ class OrientationObserver:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to where it began."""
+        """Return to the initial orientation."""
         self._quaternion, self._gamma = self._begin
         self._sigma, _ = self._measures(self._quaternion, self._gamma)
 
-    def see(self, gamma: Triple) -> Quadruple:
+    def update(self, gamma: Triple) -> Quadruple:
         """Return the quaternion (x, y, z, w) at the next angles [rad].
 
         Raises:
-            BranchEnds: a parallel singularity lies in the way, as of angles that no assembly has.
+            BranchEnds: a parallel singularity lies between, or no assembly has these angles.
 
         """
         found = self._stepped(gamma)
@@ -61,7 +61,7 @@ class OrientationObserver:
         return found
 
     def _stepped(self, gamma: Triple) -> Quadruple | None:
-        """Go there in one step; None where it might lead to another assembly."""
+        """Newton's method in one step; None where it might reach another assembly mode."""
         step, sigma = math.dist(gamma, self._gamma), self._sigma
         if step > continuation.SAFE * sigma * sigma:
             return None
@@ -69,7 +69,7 @@ class OrientationObserver:
             found = self.coordinates.orientation(self._quaternion, gamma)
         except ArithmeticError:
             return None
-        # The theorem speaks of a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
+        # The theorem holds in a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
         half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, self._quaternion)) ** 2))
         next_sigma, residual = self._measures(found, gamma)
         if residual > CLOSED or half > 0.25 * (sigma - step):
@@ -86,7 +86,7 @@ class OrientationObserver:
         return x, y, z, w
 
     def _measures(self, quaternion: Quadruple, gamma: Triple) -> tuple[float, float]:
-        """Give a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
+        """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
         rows = rotation_rows(quaternion)
         normals, worst = [], 0.0
         for angle, (v, across, e) in zip(gamma, self._legs, strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The largest value of a function of time: sampled, then searched for between the samples."""
+"""Peaks of a function of time: sampled, then refined between the samples."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def maximum(
 ) -> Peak:
     """Return the maximum of a function of which samples are known.
 
-    Every sample that no neighbour exceeds is a summit. The function is searched about it, between
-    its neighbours, if it could there exceed the best sample: it rises from sample to sample by
-    less than it fell beside the summit, or there were wiggles between samples.
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
+    if the function could exceed the best sample there: extrapolated by its change to the lower
+    neighbour.
 
     Args:
         function: of time.
         times: of the samples, rising [s], shape (n,).
         values: the function there, shape (n,).
-        floor: what is certainly below it is not searched for.
+        floor: maxima that are certainly below it are not refined.
 
     """
     top = int(np.argmax(values))
@@ -63,6 +63,6 @@ def minimum(function: Callable[[float], float], times: Array, values: Array) -> 
 
 
 def peak_magnitude(function: Callable[[float], float], times: Array, values: Array) -> Peak:
-    """Return the value of the largest size, with its sign; see `maximum`."""
+    """Return the value of the largest magnitude, with its sign; see `maximum`."""
     high, low = maximum(function, times, values), minimum(function, times, values)
     return high if high.value >= -low.value else low

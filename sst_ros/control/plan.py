@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a desired motion asks of the manipulator, before any torque is sent."""
+"""Feasibility of a reference motion: torques, power and margins, before any torque is sent."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SINGULAR_J2 = 1e-6
 
 @dataclass(frozen=True)
 class ActuatorDemand:
-    """What a motion asks of one actuator; values of the largest size, with their signs.
+    """Demand of a motion on one actuator; values of the largest magnitude, with their signs.
 
     Attributes:
         torque: [N m].
@@ -49,15 +49,15 @@ class ActuatorDemand:
 
 @dataclass(frozen=True)
 class LimitMargin:
-    """How near a motion comes to an end of what is allowed.
+    """Distance of a motion to a limit.
 
     Attributes:
-        key: what the end is of.
-        end: its value.
-        sign: +1 for a lower end, -1 for an upper one.
+        key: the limited quantity.
+        end: value of the limit.
+        sign: +1 for a lower limit, -1 for an upper one.
         unit: of both.
-        reached: the value nearest to the end, or farthest beyond it.
-        refused: whether the motion must not go beyond.
+        reached: the value closest to the limit, or farthest beyond it.
+        refused: whether the motion is refused beyond it.
 
     """
 
@@ -76,36 +76,36 @@ class LimitMargin:
 
 @dataclass(frozen=True)
 class MotionPlan:
-    """A motion as it was checked.
+    """A reference motion with the result of its check.
 
     Attributes:
         motion: the motion.
         scene: the manipulator.
         times: where it was sampled [s], shape (n,).
-        desired: the motion there.
+        references: the motion there.
         torques: actuator torques there [N m], shape (n, 3).
         demands: on the actuators, by leg.
-        distances: to all ends.
-        problems: why it is refused; empty where it is not.
+        margins: distances to all limits.
+        problems: reasons of a refusal; empty where it is feasible.
 
     """
 
     motion: ReferenceMotion
     scene: Scene
     times: Array
-    desired: tuple[Reference, ...]
+    references: tuple[Reference, ...]
     torques: Array
     demands: tuple[ActuatorDemand, ActuatorDemand, ActuatorDemand]
-    distances: tuple[LimitMargin, ...]
+    margins: tuple[LimitMargin, ...]
     problems: tuple[Problem, ...]
 
 
 def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Examine a motion and refuse it if it cannot be.
+    """Examine a motion and raise if it is infeasible.
 
     Raises:
-        MotionRefused: it leaves the stroke or the workspace, or asks for more than the limits of
-            the actuators; lists everything.
+        MotionRefused: it leaves the stroke or the workspace, or exceeds a limit of the actuators;
+            lists every reason.
         SingularConfiguration: it meets a singularity.
 
     """
@@ -116,9 +116,9 @@ def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 
 
 def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Find out what a motion asks for, everywhere and not only at samples.
+    """Compute demands and margins of a motion, between samples too.
 
-    An external moment from a topic counts as zero; what the lag of actuators costs is not counted.
+    An external moment from a topic counts as zero; the lag of actuators is not included.
 
     Raises:
         SingularConfiguration: the motion meets a singularity; no torque is defined there.

@@ -27,7 +27,7 @@ def table(plan: MotionPlan, fastest: TimeScaling) -> str:
         *_demands(plan),
         "",
         _row("distance to an end", ["least", "at t [s]"]),
-        *map(_distance, plan.distances),
+        *map(_distance, plan.margins),
         "",
         *_verdict(plan, fastest),
     ]
@@ -67,7 +67,7 @@ def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
     if plan.scene.actuators is not None and plan.scene.actuators.time_constant is not None:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
-    if any(distance.refused and distance.margin < 0.0 for distance in plan.distances):
+    if any(distance.refused and distance.margin < 0.0 for distance in plan.margins):
         yield "At no speed: the path itself leaves what is allowed."
     elif fastest.highest is None:
         yield "At no speed: the torque limit is too small for this path."
@@ -98,7 +98,7 @@ def as_json(plan: MotionPlan, fastest: TimeScaling) -> str:
             "limits": {name: limit for name, limit, _ in limits(plan.scene.actuators)},
             "actuators": [_plain(demand) for demand in plan.demands],
             "distances": [
-                {**_plain(distance), "least": distance.margin} for distance in plan.distances
+                {**_plain(distance), "least": distance.margin} for distance in plan.margins
             ],
             "highest_speed": None if highest is None or math.isinf(highest) else highest,
             "any_speed": highest is not None and math.isinf(highest),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The desired motion of a scene."""
+"""The reference motion of a scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["MotionSamples", "ReferenceMotion", "recorded", "reference_motion", "
 def reference_motion(
     scene: Scene, samples: Callable[[str], MotionSamples] | None = None
 ) -> ReferenceMotion:
-    """Return the desired motion of a scene.
+    """Return the reference motion of a scene.
 
     Args:
         scene: has a `motion`.
@@ -29,7 +29,7 @@ def reference_motion(
     Raises:
         InputError: the scene has no motion, or one that cannot be made; see `waypoints`.
         AssemblyError: the initial gamma has no unique admissible assembly.
-        SingularConfiguration: a parallel singularity lies in the way.
+        SingularConfiguration: the motion meets a parallel singularity.
 
     """
     motion = scene.motion

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions that are given as motions of the star; the actuators follow by inverse kinematics."""
+"""Reference motions of the star; the actuators follow by inverse kinematics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ StarState = tuple[Quadruple, Triple, Triple]
 
 
 class StarMotion(ReferenceMotion):
-    """A motion of the star; a subclass says which, by `star`."""
+    """A motion of the star; a subclass defines it by `star`."""
 
     def __init__(self, geometry: Geometry, duration: float, turn: float) -> None:
         """Prepare a motion that turns the star by some `turn` [rad] in all."""
@@ -44,7 +44,7 @@ class StarMotion(ReferenceMotion):
 class GeodesicMotion(StarMotion):
     """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
 
-    Quaternions (x, y, z, w) may have any length > 0; the shorter way round is taken.
+    Quaternions (x, y, z, w) may have any length > 0; the shorter rotation is taken.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a motion may be run: the whole of it stretched or squeezed evenly in time.
+"""Time scaling: the factors by which a motion can be run faster or slower.
 
 At `factor` times the speed rates grow by the factor and accelerations by its square. Torques of
 inertia follow the square too, but weight and springs stay, and friction follows its own law: the
@@ -92,7 +92,7 @@ class _Torques:
         self._model = kernel.model_of(plan.scene)
         self._inverse = InverseDynamics(plan.scene)
         columns = [
-            np.array([getattr(at, name) for at in plan.desired]).T
+            np.array([getattr(at, name) for at in plan.references]).T
             for name in ("quaternion", "body_rate", "body_acceleration")
         ]
         self._quaternion, self._rate, self._acceleration = columns

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a motion was followed, as numbers and as a table. No ROS types."""
+"""Tracking metrics of a recorded or simulated motion, and their table."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from sst_ros.mechanism.geometry import Array
 
 BAND = 0.02
-"""Share of the longest way of a joint within which the error counts as settled."""
+"""Settling band: share of the largest range of a joint."""
 
 ROWS = 10
 
 
 @dataclass(frozen=True)
 class TrackingRecord:
-    """What was wanted, what was measured and what was done about it, by sample.
+    """Reference, error and torques, by sample.
 
     Attributes:
         time: since the start of the motion or of the run [s], rising, shape (n,).
         gamma, gamma_dot: desired [rad], [rad/s], shape (n, 3).
         error, error_rate: desired - measured [rad], [rad/s], shape (n, 3).
-        feedforward, feedback: what the controller asked for [N m], shape (n, 3).
-        torque: what the actuators were told, or gave [N m], shape (n, 3).
+        feedforward, feedback: parts of the controller's command [N m], shape (n, 3).
+        torque: commanded or applied [N m], shape (n, 3).
 
     """
 
@@ -42,15 +42,15 @@ class TrackingRecord:
 
 @dataclass(frozen=True)
 class TrackingMetrics:
-    """A track in numbers. Those of a joint have shape (3,).
+    """Metrics of a record. Those of joints have shape (3,).
 
     Attributes:
         samples: number of samples.
         seconds: from the first to the last [s].
         rms, largest, last: error [rad]: root of the mean square, largest, at the end.
-        settling: time after the end of the motion from which on no error leaves the band [s];
-            None where it does not settle, or nothing is known of the time after the motion.
-        band: the band [rad], BAND of the longest way of a joint.
+        settling: time after the end of the motion after which the error stays in the band [s];
+            None where it does not settle, or the record ends with the motion.
+        band: settling band [rad], BAND times the largest range of a joint.
         torque_rms, torque_largest: effort [N m].
         feedforward, feedback: shares of the torque, mean of (part x torque) over mean of torque^2;
             what a limit has cut off makes their sum differ from 1. nan where there was no torque.
@@ -75,7 +75,7 @@ class TrackingMetrics:
 
 
 def evaluate(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
-    """Put a track of one sample or more in numbers; `limited` is passed on."""
+    """Return the metrics of a record of one sample or more; `limited` is passed on."""
     error, torque = np.abs(track.error), track.torque
     worst, square = error.max(axis=1), np.mean(error**2, axis=1)
     rms_so_far = np.sqrt(np.cumsum(square) / np.arange(1, len(square) + 1))
@@ -104,7 +104,7 @@ def evaluate(track: TrackingRecord, limited: int | None = None) -> TrackingMetri
 
 
 def table(found: TrackingMetrics) -> str:
-    """Write the numbers as text; what is unknown is a dash."""
+    """Return the metrics as text; what is unknown is a dash."""
     return "\n".join(_lines(found)) + "\n"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions of the actuators through points in time: waypoints, and the samples of a recording."""
+"""Reference motions through points in time: waypoints, and the samples of a recording."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Points = Sequence[Sequence[float]]
 OpenPoints = Sequence[Sequence[float] | None]
 
 NEAR = 0.1
-"""How far from the start the first of several points may be [rad]."""
+"""Largest distance of a first point at time 0 from the start [rad]."""
 
 
 SAMPLES_A_PIECE = 8
@@ -73,7 +73,7 @@ def waypoints(
     Raises:
         InputError: no points, wrong shapes, numbers that are not finite, times that do not rise,
             a beginning or an end that moves, a first point that is not where the motion starts.
-        SingularConfiguration: a parallel singularity lies in the way.
+        SingularConfiguration: the motion meets a parallel singularity.
 
     """
     count = len(times)
@@ -114,7 +114,7 @@ def recorded(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
 
     Raises:
         AssemblyError: the recording is of another manipulator.
-        SingularConfiguration: a parallel singularity lies in the way.
+        SingularConfiguration: the motion meets a parallel singularity.
 
     """
     times = samples.times - samples.times[0]

@@ -75,7 +75,7 @@ def _payload(payload: Payload) -> Body:
 
 
 def _rotor(scene: Scene, leg: int) -> Body:
-    """Give what a rotor weighs behind its gear, as a thin disc: only the axis w ever matters."""
+    """Return a rotor behind its gear as a thin disc: only its inertia about w matters."""
     assert scene.actuators is not None
     behind = scene.actuators.gear_ratio**2 * scene.actuators.rotor_inertia
     tensor = np.diag([behind / 2.0, behind / 2.0, behind])

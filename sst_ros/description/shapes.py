@@ -94,7 +94,7 @@ Shape: TypeAlias = "Arc | Rod | Ball | Box"
 
 
 def shapes(scene: Scene) -> dict[str, list[Shape]]:
-    """Give the shapes of every link that has some, by the link's name."""
+    """Return the shapes of every link that has some, by the link's name."""
     geometry = Geometry.of(scene)
     base, star = scene.base.radius, scene.star.radius
     thick = 0.02 * base

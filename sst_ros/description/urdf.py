@@ -146,5 +146,5 @@ def _short(values: Iterable[float]) -> str:
 
 
 def _name(name: str) -> str:
-    """Give the scene's name as an XML name."""
+    """Return the scene's name as an XML name."""
     return "".join(letter if letter.isalnum() else "_" for letter in name)

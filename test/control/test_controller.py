@@ -299,7 +299,7 @@ def test_the_observer_sees_what_continuation_proves():
         way = sample.gamma + np.outer(np.sin([0.01, 0.02, 0.3, 0.31, 0.05]), (0.4, -0.3, 0.5))
         truth = continuation.follow(sample.geometry, [sample.gamma, *way], sample.rotation)
         for gamma, rotation in zip(way, truth.rotation[1:], strict=True):
-            found = rotation_matrix(observer.see(tuple(gamma.tolist())))
+            found = rotation_matrix(observer.update(tuple(gamma.tolist())))
             assert np.abs(found - rotation).max() < 1e-12
         observer.reset()
-        assert np.abs(np.abs(np.dot(observer.see(tuple(sample.gamma)), begin)) - 1.0) < 1e-14
+        assert np.abs(np.abs(np.dot(observer.update(tuple(sample.gamma)), begin)) - 1.0) < 1e-14

@@ -301,8 +301,8 @@ NAN, INF = math.nan, math.inf
         (r"accelerations = 1: .*each of 2", ([1.0, 2.0], GOOD, None, [[0.0] * 3])),
         (r"accelerations\[1\] = .*3 finite", ([1.0, 2.0], GOOD, None, [[], [INF, 0.0, 0.0]])),
         (r"positions\[0\] = .*within 0.1 rad of the start", ([0.0, 1.0], GOOD[::-1])),
-        (r"way of gamma = .*less than 100 rad", ([1.0], [[1e300, 0.0, 0.0]])),
-        (r"way of gamma = .*less than 100", ([1.0, 2.0], GOOD, [[1e12, 0.0, 0.0], []])),
+        (r"path length of gamma = .*less than 100 rad", ([1.0], [[1e300, 0.0, 0.0]])),
+        (r"path length of gamma = .*less than 100", ([1.0, 2.0], GOOD, [[1e12, 0.0, 0.0], []])),
     ],
 )
 def test_points_that_make_no_motion_are_refused_with_the_reason(named, arguments):
