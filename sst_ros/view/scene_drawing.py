@@ -147,7 +147,7 @@ def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
     scene = server.scene
     if isinstance(shape, Ball):
         opacity = shape.opacity if shape.opacity < 1.0 else None
-        subdivisions = 3 if shape.radius < 0.1 else 5
+        subdivisions = 3 if shape.radius < 0.1 else 20  # of an edge of the icosahedron
         scene.add_icosphere(
             name,
             shape.radius,
