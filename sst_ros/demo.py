@@ -19,7 +19,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.report import tracking_report
 from sst_ros.report.run import report
-from sst_ros.report.table import table
+from sst_ros.report.verdict import text
 
 EXAMPLES = ("example1", "example2")
 FOLLOWED = "reach"
@@ -40,7 +40,7 @@ def demo(out: Path) -> int:
         bag = _room(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
-        print(table(report(bag, folder)), flush=True)
+        print(text(report(bag, folder), str(folder)), flush=True)
     return 0
 
 

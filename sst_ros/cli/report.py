@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`report`: judge a recorded run, or the methods."""
+"""`report`: evaluate a recorded run, or the methods."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from sst_ros.output_folder import require_free, results_folder
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    kinds = group(commands.add_parser("report", help="judge a recorded run, or the methods"))
-    run = kinds.add_parser("run", help="error against run time of a bag")
+    kinds = group(commands.add_parser("report", help="evaluate a recorded run, or the methods"))
+    run = kinds.add_parser("run", help="evaluate a recorded run")
     run.add_argument("bag", type=Path, help="folder of the bag")
     add_out(run, "folder of the results", "BAG_report, beside the bag")
+    run.add_argument("--verbose", action="store_true", help="print all figures")
+    run.add_argument(
+        "--damaged", action="store_true", help="evaluate what is intact of a damaged recording"
+    )
     run.set_defaults(run=_run)
     accuracy = kinds.add_parser("accuracy", help="error against cost of every method and step")
     add_scene(
@@ -35,8 +39,12 @@ def _run(options: argparse.Namespace) -> None:
     require_free(out, "report", force=options.force)
     from sst_ros.report.run import report
     from sst_ros.report.table import table
+    from sst_ros.report.verdict import text
 
-    print(table(report(options.bag, out)))
+    summary = report(options.bag, out, damaged=options.damaged)
+    if options.verbose:
+        print(table(summary))
+    print(text(summary, str(out)), end="")
 
 
 def _accuracy(options: argparse.Namespace) -> None:

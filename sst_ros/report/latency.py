@@ -30,12 +30,16 @@ class Latency(NamedTuple):
         received_us: from the reception of the command to the step [us], shape (f,).
         stamped_us: from the stamp of the command to the beginning of the tick [us], shape (f,);
             nan where commands have no stamp.
+        answered: share of the samples after which a new command was received, None without any.
+        age_s: mean time for which ticks have held their command [s], None without any.
 
     """
 
     time_s: Array
     received_us: Array
     stamped_us: Array
+    answered: float | None = None
+    age_s: float | None = None
 
 
 def latency(recording: Recording, missing: list[str]) -> Latency:
@@ -58,7 +62,24 @@ def latency(recording: Recording, missing: list[str]) -> Latency:
     begins = ticks.start_ns[changed][tick]
     answered = np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan)
     passed = (step_ns[tick] - commands.received_ns[new][command]) / 1e3
-    return Latency(begins / NANOSECONDS, passed, answered)
+    # A torque that is commanded once and for all answers no samples.
+    share, age = _answered(recording, begins) if len(begins) > 1 else (None, None)
+    return Latency(begins / NANOSECONDS, passed, answered, share, age)
+
+
+def _answered(recording: Recording, begins: Integers) -> tuple[float, float]:
+    """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
+    received, commands = recording.received_ns, recording.commands
+    if commands.stamp_ns.any():
+        answered = np.isin(recording.time_ns + recording.start_ns, commands.stamp_ns)
+    else:
+        counts = np.searchsorted(commands.received_ns, received, side="left")
+        answered = np.append(np.diff(counts), 0) > 0
+    ticks = np.searchsorted(begins, recording.ticks.start_ns, side="right") - 1
+    held = recording.ticks.start_ns[ticks >= 0] - np.sort(begins)[ticks[ticks >= 0]]
+    # The last sample is the end of the run, which nothing answers.
+    share = float(np.mean(answered[:-1]))
+    return share, float(held.mean() / NANOSECONDS) if len(held) else 0.0
 
 
 def _received(recording: Recording, time_ns: Integers) -> Integers:

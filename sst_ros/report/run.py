@@ -17,54 +17,62 @@ from sst_ros.plot.run_overview import draw_errors, draw_torques
 from sst_ros.plot.style import save_figure, styled
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import formulation, page, reference, summary, timing
+from sst_ros.report import formulation, page, reference, summary, timing, verdict
 from sst_ros.report.reference import Comparison
 from sst_ros.report.timing import Timing
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
 
-class Judged(NamedTuple):
-    """A run in numbers: when what came, the two comparisons, and the summary of it all."""
+class RunEvaluation(NamedTuple):
+    """A run in numbers: timing, the two comparisons, and the summary of it all."""
 
-    told: Timing
+    timing: Timing
     integration: Comparison
     ideal: Comparison | None
     summary: dict[str, Any]
 
 
-def judge(run: Recording) -> Judged:
-    """Put a recorded run in numbers.
+def evaluate(run: Recording) -> RunEvaluation:
+    """Evaluate a recorded run.
 
     Raises:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    told = timing.timing(run)
+    measured = timing.timing(run)
     # Compiled loops let go of the interpreter: the two comparisons run beside each other.
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
     result = summary.summarise(run, integration, ideal, formulation.check(run))
-    return Judged(told, integration, ideal, result | timing.numbers(told))
+    result |= timing.numbers(measured)
+    found = verdict.reasons(result)
+    result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
+    return RunEvaluation(measured, integration, ideal, result)
 
 
-def report(bag: Path, out: Path) -> dict[str, Any]:
-    """Judge a recorded run; write summary.json, the page and the pictures into `out`.
+def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
+    """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
+
+    Args:
+        bag: a rosbag2 recording of a run.
+        out: folder, made if it is not there.
+        damaged: evaluate what is intact of a damaged recording.
 
     Returns:
-        The summary, as written; `table.table` makes it text.
+        The summary, as written; `verdict.text` makes the short text of it, `table.table` the whole.
 
     Raises:
         InputError: the bag is no whole recording of a run, or `out` cannot be written.
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    run = recording.read(bag)
+    run = recording.read(bag, damaged=damaged)
     with writing(out, "report"):
-        told, integration, ideal, result = judge(run)
+        measured, integration, ideal, result = evaluate(run)
         pictures = _pictures(run, integration, ideal, out)
-        save_figure(page.overview(run, integration, told, result), out / PAGE)
+        save_figure(page.overview(run, integration, measured, result), out / PAGE)
         result["pictures"] = [path.name for path in pictures]
         result["page"] = [PAGE, HTML]
         page.write(result, out / PAGE, pictures, out / HTML)

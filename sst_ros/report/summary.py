@@ -20,9 +20,11 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS
+from sst_ros.report import tracking
 from sst_ros.report.formulation import Formulation
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.states import begins, lags
+from sst_ros.report.verdict import ERROR_LIMIT_RAD
 
 QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 
@@ -37,6 +39,7 @@ def summarise(
     summary: dict[str, Any] = {"scene": recording.scene.name, "bag": str(recording.path)}
     summary |= _run(recording)
     summary |= _loss(recording)
+    summary |= _tracking(recording)
     summary |= _largest("integration_error", integration.error, recording.seconds)
     summary |= _largest("integration_reference_error", integration.own)
     summary |= {
@@ -51,7 +54,9 @@ def summarise(
         "formulation_difference_relative": formulation.relative,
         "formulation_states": formulation.states,
         **_effort(recording),
+        "actuators_lag": lags(recording.scene),
         "topics_missing": list(recording.missing),
+        "damage": list(recording.signals.damage),
         "notes": list(_notes(recording, integration, ideal)),
         "report": made_on(),
     }
@@ -72,9 +77,23 @@ def _run(recording: Recording) -> dict[str, Any]:
         "step_mean_us": _number(told, "step_mean_us"),
         "step_max_us": _number(told, "step_max_us"),
         "simulator_error_estimate": _number(told, "error_estimate"),
+        "error_limit_rad": _number(told, "tolerance") or ERROR_LIMIT_RAD,
+        "duration_s": float(recording.seconds[-1]),
         "commands_received": _count(told, "commands_received"),
         "commands_dropped": _count(told, "commands_dropped"),
         "commands_recorded": len(recording.commands.torque),
+    }
+
+
+def _tracking(recording: Recording) -> dict[str, Any]:
+    """Peak torques, and the tracking error where there is a reference."""
+    tracked = tracking.of(recording)
+    found = None if tracked is None else tracking.metrics(tracked)
+    return {
+        "torque_peak_N_m": np.abs(recording.ticks.torque).max(axis=0).tolist(),
+        "tracking_error_rms_rad": None if found is None else found.rms.tolist(),
+        "tracking_error_max_rad": None if found is None else found.largest.tolist(),
+        "settling_time_s": None if found is None else found.settling,
     }
 
 
@@ -156,6 +175,10 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
         notes.append("the scene has no torques: no ideal to compare with")
     if lags(recording.scene):
         notes.append("the actuators lag: efforts differ from the torques that are asked for")
+    if recording.signals.unverified:
+        notes.append(
+            f"{recording.signals.unverified} chunks have no checksum: damage would not be noticed"
+        )
     if "euler_zyz" in recording.missing:
         notes.append("euler_zyz is not recorded: its pictures show the orientation's angles")
     return notes

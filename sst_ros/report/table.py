@@ -17,7 +17,8 @@ def table(summary: dict[str, Any]) -> str:
 
 
 def _lines(summary: dict[str, Any]) -> Iterator[str]:
-    yield f"Run of {summary['scene']}, from {summary['bag']}"
+    yield f"{summary['verdict']}: run of {summary['scene']}, from {summary['bag']}"
+    yield from (f"  {reason}" for reason in summary["reasons"])
     yield ""
     yield _row("phase", summary["phase"])
     if summary["fault"]:

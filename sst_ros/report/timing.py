@@ -99,6 +99,10 @@ def numbers(timing: Timing) -> dict[str, Any]:
     known = energy is not None and bool(np.isfinite(energy).any())
     return result | {
         "commands_followed": len(timing.latency.time_s),
+        "samples_answered_percent": (
+            None if timing.latency.answered is None else 100.0 * timing.latency.answered
+        ),
+        "command_age_mean_s": timing.latency.age_s,
         "energy_residual_max_J": float(np.nanmax(energy)) if known and energy is not None else None,
         "not_told": list(timing.missing),
     }

@@ -13,7 +13,7 @@ from sst_ros import scene
 from sst_ros.control.torque_profiles import sine
 from sst_ros.recording import recording
 from sst_ros.report import reference, timing
-from sst_ros.report.run import judge, report
+from sst_ros.report.run import evaluate, report
 from sst_ros.report.table import table
 
 LATENCY_NS = 400_000
@@ -171,7 +171,7 @@ def test_ticks_that_were_missed_show_when_they_were(tmp_path, bags, example2):
 
 
 def numbers_of_run(folder):
-    return judge(recording.read(folder / "bag")).summary
+    return evaluate(recording.read(folder / "bag")).summary
 
 
 def test_an_altered_effort_of_joint_states_shows_when_it_was(tmp_path, bags, example2):

@@ -12,7 +12,7 @@ from matplotlib import image
 from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
-from sst_ros.report.run import judge, report
+from sst_ros.report.run import evaluate, report
 from sst_ros.report.table import table
 
 
@@ -20,7 +20,7 @@ from sst_ros.report.table import table
 def whole(tmp_path_factory, bags, example2):
     """Report of a whole run: summary and folder."""
     folder = tmp_path_factory.mktemp("report")
-    return report(bags.write(folder / "bag", example2), folder / "out"), folder / "out"
+    return report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
 
 
 def _numbers(value):
@@ -94,7 +94,7 @@ def test_loss_is_counted_and_survived(tmp_path, bags, example2):
 
 def test_what_is_not_recorded_is_unknown(tmp_path, bags, example2):
     kept = bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)
-    summary = judge(recording.read(bags.write(tmp_path / "bag", kept))).summary
+    summary = evaluate(recording.read(bags.write(tmp_path / "bag", kept))).summary
     assert summary["ticks"] is summary["real_time_factor"] is summary["phase"] is None
     assert summary["samples_lost"] == 0
     assert summary["topics_missing"] == ["euler_zyz", "diagnostics", "commands"]

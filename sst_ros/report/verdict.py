@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a recorded run, OK or WARNING with reasons, and the figures that matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+ERROR_LIMIT_RAD = 1e-9
+"""Integration error above which a run is warned of, where its tolerance was not recorded."""
+ANSWERED_PERCENT = 90.0
+"""Share of samples that a controller at the sample rate answers."""
+FORMULATION_LIMIT = 1e-9
+
+_LABEL = 34
+
+
+def reasons(summary: dict[str, Any]) -> list[str]:
+    """List what is wrong with a run, in order of weight; empty where nothing is."""
+    return list(_reasons(summary))
+
+
+def text(summary: dict[str, Any], folder: str) -> str:
+    """Format verdict, figures and the place of the files."""
+    found = summary["reasons"]
+    lines = [f"{summary['verdict']}: {summary['scene']}" + (": " if found else "")
+             + "; ".join(found)]  # fmt: skip
+    lines += [f"  {label:{_LABEL}}{value}" for label, value in _figures(summary)]
+    files = ", ".join([*summary["page"], "summary.json", f"{len(summary['pictures'])} pictures"])
+    return "\n".join([*lines, f"Files: {folder}: {files}", ""])
+
+
+def _reasons(summary: dict[str, Any]) -> Iterator[str]:
+    if summary["fault"]:
+        yield f"fault: {summary['fault']}"
+    elif summary["phase"] not in (None, "finished"):
+        yield f"the run was cut short, or its recording was: last phase {summary['phase']}"
+    yield from summary["damage"]
+    if lost := summary["samples_lost"]:
+        yield f"{lost} samples lost ({summary['samples_recorded_percent']:.2f} % recorded)"
+    if gaps := summary["tick_gaps"]:
+        yield f"{gaps} gaps between applied torques"
+    if missed := summary["ticks_missed"]:
+        yield f"{missed} ticks missed by the simulator"
+    share, age = summary["samples_answered_percent"], summary["command_age_mean_s"]
+    if share is not None and share < ANSWERED_PERCENT:
+        yield f"commands answered {share:.3g} % of samples, mean age {1e3 * age:.3g} ms"
+    error, limit = summary["integration_error_gamma_rad"], summary["error_limit_rad"]
+    if error is not None and error > limit:
+        yield f"integration error {error:.1e} rad above {limit:.0e} rad"
+    estimate = summary["simulator_error_estimate"]
+    if estimate is not None and estimate > limit:
+        yield f"error estimate {estimate:.1e} rad above {limit:.0e} rad"
+    difference = summary["effort_difference_max_N_m"]
+    if difference and not summary["actuators_lag"]:
+        yield f"efforts differ from applied torques by {difference:.1e} N m"
+    if (summary["formulation_difference_relative"] or 0.0) > FORMULATION_LIMIT:
+        difference = summary["formulation_difference_relative"]
+        yield f"equations of motion differ from the paper's by {difference:.1e} (relative)"
+
+
+def _figures(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    rate = 1.0 / summary["sample_period_s"]
+    yield (
+        "duration",
+        f"{summary['duration_s']:.6g} s, {summary['samples_recorded']} samples at {rate:.6g} Hz",
+    )
+    pairs = (
+        ("samples lost", "samples_lost", "d", ""),
+        ("ticks missed", "ticks_missed", "d", ""),
+        ("real-time factor", "real_time_factor", ".4f", ""),
+        ("computing time of a step, longest", "step_max_us", ".1f", " us"),
+        ("reception period, 99.9 %", "period_p99_9_us", ".1f", " us"),
+        ("integration error, gamma", "integration_error_gamma_rad", ".1e", " rad"),
+        ("error estimate of the simulator", "simulator_error_estimate", ".1e", " rad"),
+        ("effect of the zero-order hold", "ideal_difference_gamma_rad", ".1e", " rad"),
+        ("energy balance residual", "energy_residual_max_J", ".1e", " J"),
+    )
+    for label, key, form, unit in pairs:
+        if summary.get(key) is not None:
+            yield label, f"{summary[key]:{form}}{unit}"
+    yield "peak torques", _three(summary["torque_peak_N_m"], "N m")
+    if summary["tracking_error_rms_rad"] is not None:
+        yield "tracking error, RMS", _three(summary["tracking_error_rms_rad"], "rad")
+        yield "tracking error, maximum", _three(summary["tracking_error_max_rad"], "rad")
+        settling = summary["settling_time_s"]
+        yield "settling time", "not settled" if settling is None else f"{settling:.4g} s"
+    if summary["command_latency_mean_us"] is not None:
+        yield "delay of commands", delay(summary)
+
+
+def delay(summary: dict[str, Any]) -> str:
+    """Describe the delay of commands, and what a negative one means."""
+    mean, least, most = (summary[f"command_latency_{word}_us"] for word in ("mean", "min", "max"))
+    words = f"mean {mean:.1f} us, maximum {most:.1f} us"
+    if least < 0.0:
+        words += (
+            f"; minimum {least:.1f} us: the recorder received a command after the step that applied"
+            " it, so delays below its own are not resolved"
+        )
+    return words
+
+
+def _three(values: list[float], unit: str) -> str:
+    return ", ".join(f"{value:.3g}" for value in values) + f" {unit}"
