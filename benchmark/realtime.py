@@ -76,6 +76,8 @@ class Process:
     """A node in a process of its own, and the kernel's account of it."""
 
     def __init__(self, command: str, namespace: str = "/", **given: Any) -> None:
+        if command == "simulator":  # by default it would end with the scene's duration
+            given.setdefault("duration", 0.0)
         argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *child_process.words(given)]
         argv += ["-r", f"__ns:={namespace}"]
         self._process = subprocess.Popen(

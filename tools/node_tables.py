@@ -16,7 +16,7 @@ from typing import NamedTuple
 from sst_ros.nodes import inverse_dynamics, topics
 from sst_ros.nodes.topics import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.runtime import diagnostics
-from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.settings import (
     PlayerParameters,
     RecorderParameters,
@@ -58,7 +58,7 @@ class Described(NamedTuple):
 NODES = (
     Described("simulator", SIMULATOR, SimulatorParameters, topics.SIMULATOR),
     Described("torque_player", "sst_torque_player", PlayerParameters, topics.PLAYER),
-    Described("inverse_dynamics", "sst_inverse_dynamics", CompanionParameters, topics.COMPANION),
+    Described("inverse_dynamics", "sst_inverse_dynamics", ControllerNodeParameters, topics.INVERSE_DYNAMICS),
     Described("recorder", "sst_recorder", RecorderParameters, topics.RECORDER),
     Described("viewer", "sst_viewer", ViewerParameters, topics.VIEWER),
 )
@@ -90,7 +90,7 @@ def filled(text: str) -> str:
     for name, part in tables().items():
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
         pattern = re.escape(begin) + ".*?" + re.escape(end)
-        text, count = re.subn(pattern, lambda _, p=f"{begin}\n{part}{end}": p, text, flags=re.S)
+        text, count = re.subn(pattern, f"{begin}\n{part}{end}".replace("\\", r"\\"), text, flags=re.S)
         if count != 1:
             raise ValueError(f"the text has {count} parts {name}")
     return text
@@ -154,7 +154,9 @@ def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
         value = getattr(defaults, name)
         shown = str(value).lower() if isinstance(value, bool) else value
         if spec.kind == "texts":
-            shown = "those of config/topics.txt"
+            shown = "those of config/topics.txt" if value else "none"
+        elif (cls, name) == (SimulatorParameters, "duration"):
+            shown = "that of the scene"
         elif isinstance(value, tuple):
             shown = list(value)
         may = "yes" if name in changeable else "no"

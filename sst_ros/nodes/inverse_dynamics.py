@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The companion: answers every joint state with the torque that follows a desired motion."""
+"""The inverse-dynamics controller: answers every sample with the torque that follows a motion."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from sst_ros.nodes import middleware, parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.torque_commands import TorqueCommands
-from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.runtime.trajectory_following import Pursuit, Stage
+from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 
 KEYS = {
-    "stage": "what it does",
-    "mode": "the controller",
+    "stage": "stage of the motion",
+    "mode": "control law",
     "samples": "samples answered",
-    "samples_irregular": "samples that came at another time than rate says",
+    "samples_irregular": "samples that came at another period than that of rate",
     "samples_limited": "samples of the motion in which a torque was limited",
     "error_rms_rad": "root of the mean square of the error of gamma_1..3 since the motion began",
     "error_max_rad": "largest error of gamma_1..3 since then",
-    "trajectories_refused": "trajectories that were not taken",
-    "last_refusal": "why the last one was not",
+    "trajectories_refused": "trajectories that were refused",
+    "last_refusal": "reason of the last refusal",
 }
-"""Keys of the companion's /diagnostics, in order."""
+"""Keys of the controller's /diagnostics, in order."""
 
 
-class InverseDynamics:
-    """Worker of the process `inverse_dynamics`: messages and time; `Pursuit` does the work."""
+class InverseDynamicsController:
+    """Worker of the process `inverse_dynamics`: messages and time; `TrajectoryFollower` does the work."""
 
     def __init__(self) -> None:
         self.node = Node("sst_inverse_dynamics")
         self.done = threading.Event()
-        given = self._parameters = parameters.declare(self.node, CompanionParameters)
-        self._pursuit = Pursuit(scene.load(given.scene), given)
+        given = self._parameters = parameters.declare(self.node, ControllerNodeParameters)
+        self._follower = TrajectoryFollower(scene.load(given.scene), given)
         self._commands = TorqueCommands(self.node, given)
         self._reference = topics.REFERENCE.publisher(self.node)
         self._error = topics.TRACKING_ERROR.publisher(self.node)
@@ -65,13 +65,13 @@ class InverseDynamics:
         self.node.create_timer(1.0, self._report, clock=STEADY)
 
     def close(self) -> None:
-        """Leave the actuators without torque, and tell how well the motion was followed."""
+        """Leave the actuators without torque, and print the tracking errors."""
         if self._began and not self.done.is_set():
             self._commands.send(ZERO)
         self._report()
-        self._tell()
-        told = (self._commands.publisher, self._reference, self._error, self._diagnostics)
-        middleware.finish(told)
+        self._print()
+        published = (self._commands.publisher, self._reference, self._error, self._diagnostics)
+        middleware.finish(published)
 
     def _hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does."""
@@ -81,37 +81,37 @@ class InverseDynamics:
             self._finished = True
         if phase.data == "waiting" and self._began:
             self.node.get_logger().info("the simulator was reset: beginning anew")
-            self._tell()
-            self._pursuit.anew()
+            self._print()
+            self._follower.restart()
             self._began = False
 
     def _answer(self, state: JointState) -> None:
-        """Answer a sample; stamp zero means that it is of no run."""
-        self._commands.heard()
+        """Answer a state: of the run, or shown before it."""
+        self._commands.received()
         self._seen = self._measured(state)
-        if not self._is_read():
+        if not self._has_subscribers():
             return
         stamp_ns = self._commands.answering(state)
         if stamp_ns == 0:
-            command = None if self._began else self._pursuit.preview(self._seen)
+            command = None if self._began else self._follower.preview(self._seen)
             if command is not None:
                 self._commands.send(command.torque)
             return
-        command = self._pursuit.answer(stamp_ns, self._seen)
+        command = self._follower.answer(stamp_ns, self._seen)
         if command is None:
             return
         self._began = True
         self._commands.send(command.torque)
         self._publish(state, self._seen, command)
-        if self._pursuit.stage is Stage.ENDED:
+        if self._follower.stage is Stage.ENDED:
             self.done.set()
 
-    def _is_read(self) -> bool:
-        """Tell whether those are there whom the parameters say to wait for."""
-        if self._began or not self._commands.are_read():
+    def _has_subscribers(self) -> bool:
+        """Whether the subscribers are there that the parameters ask for."""
+        if self._began or not self._commands.subscribed():
             return self._began
-        told = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
-        return all(publisher.get_subscription_count() for publisher in told)
+        recorded = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
+        return all(publisher.get_subscription_count() for publisher in recorded)
 
     def _measured(self, state: JointState) -> Measurement:
         """Read the actuators, which may come in any order, among others.
@@ -133,33 +133,33 @@ class InverseDynamics:
         return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
 
     def _publish(self, state: JointState, seen: Measurement, command: Command) -> None:
-        """Tell what was wanted and what was missing, under the stamp of the sample."""
+        """Publish reference and tracking error under the stamp of the sample."""
         at = command.desired
         off = axpy(1.0, at.gamma, -1.0, seen.gamma), axpy(1.0, at.gamma_dot, -1.0, seen.gamma_dot)
         for publisher, (position, velocity), effort in (
             (self._reference, (at.gamma, at.gamma_dot), command.feedforward),
             (self._error, off, command.feedback),
         ):
-            message = JointState(name=ACTUATORS)
+            message = JointState(name=list(ACTUATORS))
             message.header.stamp = state.header.stamp
             message.position, message.velocity = array("d", position), array("d", velocity)
             message.effort = array("d", effort)
             publisher.publish(message)
 
     def _take(self, trajectory: JointTrajectory) -> None:
-        """Follow a trajectory, or say why not."""
+        """Follow a trajectory, or log why not."""
         log = self.node.get_logger()
         try:
-            judged = self._pursuit.judged()
-            self._pursuit.take(trajectory, self._seen)
+            tracking = self._follower.tracking()
+            self._follower.take(trajectory, self._seen)
         except SstError as error:
             log.error(f"trajectory refused: {error}")
             self._report()
             return
         finally:
-            self._commands.heard()  # nothing could be heard during the check
-        if judged is not None:
-            print(table(judged), flush=True)
+            self._commands.received()  # no message could be received during the check
+        if tracking is not None:
+            print(table(tracking), flush=True)
         log.info(f"trajectory of {len(trajectory.points)} points taken")
 
     def _watch(self) -> None:
@@ -170,43 +170,43 @@ class InverseDynamics:
 
     def _report(self) -> None:
         """Publish the diagnostics."""
-        pursuit = self._pursuit
-        stage = "waiting for joint_states" if self._seen is None else pursuit.stage.value
+        follower = self._follower
+        stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         values: dict[str, object] = {
             "stage": stage,
             "mode": self._parameters.mode,
-            "samples": pursuit.samples,
-            "samples_irregular": pursuit.irregular,
-            "samples_limited": pursuit.limited,
-            "error_rms_rad": pursuit.rms,
-            "error_max_rad": pursuit.largest,
-            "trajectories_refused": pursuit.refused,
-            "last_refusal": pursuit.last_refusal,
+            "samples": follower.samples,
+            "samples_irregular": follower.irregular,
+            "samples_limited": follower.limited,
+            "error_rms_rad": follower.rms,
+            "error_max_rad": follower.largest,
+            "trajectories_refused": follower.refused,
+            "last_refusal": follower.last_refusal,
         }
         doubts = [
             words
             for count, words in (
-                (pursuit.irregular, "samples do not come as rate says"),
-                (pursuit.limited, "torques are limited"),
-                (pursuit.refused, "a trajectory was refused"),
+                (follower.irregular, "samples do not come at rate"),
+                (follower.limited, "torques are limited"),
+                (follower.refused, "a trajectory was refused"),
             )
             if count
         ]
         level = DiagnosticStatus.WARN if doubts else DiagnosticStatus.OK
         name = f"{self.node.get_fully_qualified_name()}: control"
         stamp_ns = self.node.get_clock().now().nanoseconds
-        said = "; ".join([stage, *doubts])
-        self._diagnostics.publish(diagnostics(name, stamp_ns, level, said, values))
+        text = "; ".join([stage, *doubts])
+        self._diagnostics.publish(diagnostics(name, stamp_ns, level, text, values))
 
-    def _tell(self) -> None:
-        """Print how well the last motion was followed."""
-        if (judged := self._pursuit.judged()) is not None:
-            print(table(judged), flush=True)
+    def _print(self) -> None:
+        """Print the tracking errors of the last motion."""
+        if (tracking := self._follower.tracking()) is not None:
+            print(table(tracking), flush=True)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point of `inverse_dynamics`."""
-    return process.run("inverse_dynamics", InverseDynamics, args)
+    """Run the node; `args` begin with the name of the program."""
+    return process.run("inverse_dynamics", InverseDynamicsController, args)
 
 
 if __name__ == "__main__":

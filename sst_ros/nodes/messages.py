@@ -1,63 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the simulator, built once; afterwards only their numbers are written."""
+"""Messages of the simulator, laid out once; afterwards only their numbers are written."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from builtin_interfaces.msg import Duration, Time
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from sst_ros.description.frame_ids import BASE_FRAME
 from sst_ros.errors import SstError
-from sst_ros.nodes.raw_messages import Template, Write, marks
+from sst_ros.nodes.cdr import CdrMessage, Write
 from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation import NANOSECONDS, State
 
-JOINTS = [*ACTUATORS, "mu_1", "mu_2", "mu_3", "beta_1", "beta_2", "beta_3"]
-MOMENTS = ["moment_x", "moment_y", "moment_z"]
-BASE_FRAME = "base"
-_NO_JOINTS = (0.0,) * len(JOINTS)
+MOMENTS = ("moment_x", "moment_y", "moment_z")
+_ZEROS = (0.0,) * len(JOINTS)
 
 
 class NotFinite(SstError):
-    """A state with a number in it that is none; it is not published."""
+    """A state has a number that is not finite; it is not published."""
 
 
 class StateMessages:
     """joint_states, orientation and euler_zyz of one instant.
 
+    Args:
+        frame_id: of joint_states; the others are in base_link.
+
     Attributes:
-        templates: of these three messages, in this order.
+        joints, orientation, euler: the messages.
 
     """
 
-    def __init__(self) -> None:
-        count = len(JOINTS)
-        position, velocity, effort = (marks(count, k * count) for k in range(3))
-        quaternion, angles = marks(4), marks(3)
-        joints = JointState(name=JOINTS, position=position, velocity=velocity, effort=effort)
-        orientation, euler = QuaternionStamped(), Vector3Stamped()
-        orientation.header.frame_id = euler.header.frame_id = BASE_FRAME
-        q, vector = orientation.quaternion, euler.vector
-        q.x, q.y, q.z, q.w = quaternion
-        vector.x, vector.y, vector.z = angles
-        self.templates = Template(joints), Template(orientation), Template(euler)
-        first, second, third = self.templates
-        places = (first.place(values) for values in (position, velocity, effort))
-        self._position, self._velocity, self._effort = places
-        self._quaternion, self._angles = second.place(quaternion), third.place(angles)
-        for write in (self._position, self._velocity, self._effort):
-            write(*_NO_JOINTS)
+    def __init__(self, frame_id: str = "") -> None:
+        self.joints, self.orientation, self.euler = CdrMessage(), CdrMessage(), CdrMessage()
+        self.joints.header(frame_id)
+        self.joints.strings(JOINTS)
+        self._position, self._velocity, self._effort = (
+            self.joints.double_sequence(len(JOINTS)) for _ in range(3)
+        )
+        self.orientation.header(BASE_FRAME)
+        self._quaternion = self.orientation.doubles(4)
+        self.euler.header(BASE_FRAME)
+        self._angles = self.euler.doubles(3)
 
     def fill(self, state: State) -> None:
-        """Take over a state; the effort is the torque over the step that ended at it.
+        """Write a state; the effort is the torque over the step that ended at it.
 
         Raises:
-            NotFinite: nothing has been taken over.
+            NotFinite: nothing has been written.
 
         """
         gamma, mu, beta, gamma_dot, mu_dot, beta_dot = state.joints
@@ -68,30 +62,30 @@ class StateMessages:
             raise NotFinite(f"a state that is not finite is not published: {state}")
         self._position(*angles)
         self._velocity(*rates)
-        self._effort(*state.torque, *_NO_JOINTS[3:])
+        self._effort(*state.torque, *_ZEROS[3:])
         self._quaternion(*state.quaternion)
-        self._angles(*zyz_of(state.quaternion))
+        self._angles(*zyz_angles(state.quaternion))
 
-    def still(self) -> None:
-        """Set all rates and efforts to zero: a state that is held."""
-        self._velocity(*_NO_JOINTS)
-        self._effort(*_NO_JOINTS)
+    def set_at_rest(self) -> None:
+        """Set all rates and efforts to zero."""
+        self._velocity(*_ZEROS)
+        self._effort(*_ZEROS)
 
 
-def zyz_of(quaternion: Sequence[float]) -> tuple[float, float, float]:
-    """ZYZ angles of a quaternion (x, y, z, w), as `frames.zyz_angles` has them, of plain floats.
+def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
+    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `frames.zyz_angles`.
 
     z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
     """
     x, y, z, w = quaternion
-    aside, along = math.hypot(x, y), math.hypot(z, w)
-    total = math.atan2(z, w) if along else 0.0
-    difference = math.atan2(-x, y) if aside else 0.0
-    if not (aside and along):
+    sine, cosine = math.hypot(x, y), math.hypot(z, w)
+    total = math.atan2(z, w) if cosine else 0.0
+    difference = math.atan2(-x, y) if sine else 0.0
+    if not (sine and cosine):
         theta, psi = 0.0, 2.0 * (total - difference)
     else:
         theta, psi = total + difference, total - difference
-    return _wrapped(theta), 2.0 * math.atan2(aside, along), _wrapped(psi)
+    return _wrapped(theta), 2.0 * math.atan2(sine, cosine), _wrapped(psi)
 
 
 def _wrapped(angle: float) -> float:
@@ -102,70 +96,72 @@ def _wrapped(angle: float) -> float:
 
 
 class TorqueLog:
-    """applied_torques: what acted over every tick since the last publication.
+    """applied_torques: torque and moment of every tick since the last publication.
 
-    Point i holds over tick i and says when that tick ends, relative to the header's stamp.
+    Point i holds over tick i; its time is the end of that tick, relative to the header's stamp.
     """
 
     def __init__(self, usual: int, period_ns: int, *, moments: bool = False) -> None:
-        self._names = [*ACTUATORS, *(MOMENTS if moments else ())]
+        self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
         self._rows: list[tuple[float, ...]] = []
-        # One for each number of ticks: mostly the usual one, none where there is no run.
-        self._forms = {count: self._form(count) for count in (0, usual)}
+        # One layout for each number of ticks: mostly the usual one, none where there is no run.
+        self._layouts = {count: self._layout(count) for count in (0, usual)}
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def clear(self) -> None:
-        """Forget what was noted."""
+        """Forget the rows."""
         self._rows.clear()
 
     def append(self, torque: Sequence[float], moment: Sequence[float], ticks: int = 1) -> None:
-        """Note the torque and the moment of a tick, or of several."""
+        """Log the torque [N m] and the moment [N m] of some ticks."""
         row = (*torque, *moment) if self._moments else tuple(torque)
         self._rows.extend([row] * ticks)
 
     def take(self, stamp_ns: int) -> bytes:
-        """Return the message of the ticks noted since stamp_ns and begin anew."""
+        """Return the message of the ticks logged since stamp_ns and clear the log."""
         count = len(self._rows)
-        if count not in self._forms:
-            self._forms[count] = self._form(count)
-        template, places = self._forms[count]
-        for write, row in zip(places, self._rows, strict=True):
+        if count not in self._layouts:
+            self._layouts[count] = self._layout(count)
+        message, writes = self._layouts[count]
+        for write, row in zip(writes, self._rows, strict=True):
             write(*row)
         self._rows.clear()
-        return template.stamped(stamp_ns)
+        return message.stamped(stamp_ns)
 
-    def _form(self, count: int) -> tuple[Template, list[Write]]:
-        size = len(self._names)
-        efforts = [marks(size, i * size) for i in range(count)]
-        message = JointTrajectory(joint_names=self._names)
-        message.header.frame_id = BASE_FRAME
-        for i, effort in enumerate(efforts):
-            sec, nanosec = divmod((i + 1) * self._period_ns, NANOSECONDS)
-            after = Duration(sec=sec, nanosec=nanosec)
-            message.points.append(JointTrajectoryPoint(effort=effort, time_from_start=after))
-        template = Template(message)
-        return template, [template.place(effort) for effort in efforts]
+    def _layout(self, count: int) -> tuple[CdrMessage, list[Write]]:
+        message, writes = CdrMessage(), []
+        message.header(BASE_FRAME)
+        message.strings(self._names)
+        message.length(count)
+        for point in range(count):
+            for _ in ("positions", "velocities", "accelerations"):
+                message.length(0)
+            writes.append(message.double_sequence(len(self._names)))
+            message.time((point + 1) * self._period_ns)
+        return message, writes
 
 
-def diagnostics(
-    name: str, stamp_ns: int, level: bytes, said: str, values: dict[str, object]
-) -> DiagnosticArray:
-    """Build a DiagnosticArray of one status."""
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    status = DiagnosticStatus(level=level, name=name, message=said, hardware_id="", values=pairs)
-    message = DiagnosticArray(status=[status])
-    set_time(message.header.stamp, stamp_ns)
+def clock_message() -> CdrMessage:
+    """Lay out a rosgraph_msgs/Clock."""
+    message = CdrMessage()
+    message.time(0)
     return message
 
 
-def set_time(stamp: Time, nanoseconds: int) -> None:
-    """Write integer nanoseconds into a message's time."""
-    stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
+def diagnostics(
+    name: str, stamp_ns: int, level: bytes, text: str, values: dict[str, object]
+) -> DiagnosticArray:
+    """Build a DiagnosticArray of one status."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=pairs)
+    message = DiagnosticArray(status=[status])
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    return message
 
 
 def nanoseconds(stamp: Time) -> int:
-    """Read a message's time as integer nanoseconds."""
+    """Return a message's time as integer nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Fast DDS, the usual middleware, is asked for beyond its defaults. Others take no notice.
+"""Settings of Fast DDS, the default middleware, beyond its defaults. Others ignore them.
 
-By default a reliable writer asks its readers every 3 s what has arrived, and then strikes off 1500
-samples at once, while whoever publishes waits: one to three milliseconds, thus missed ticks. Asked
-ten times a second it is done in a few tens of microseconds.
+By default a reliable writer asks its readers every 3 s what has arrived, and then removes 1500
+samples at once while the publisher waits: one to three milliseconds, hence missed ticks. Ten times
+a second it takes a few tens of microseconds.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -20,11 +21,11 @@ from rclpy.publisher import Publisher
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
 """Of ROS 2 Kilted."""
 
-_ACKNOWLEDGE_S = 2.0
+ACKNOWLEDGE_S = 2.0
 
 
 def configure() -> None:
-    """Name our profile to Fast DDS, unless the user has named one. Before `rclpy.init`."""
+    """Select our profile of Fast DDS, unless the user has selected one. Before `rclpy.init`."""
     names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
     if any(os.environ.get(name) for name in names):
         return
@@ -42,9 +43,9 @@ def _generation() -> int:
     return 3 if major >= _FIRST_RCLPY_ON_FAST_DDS_3 else 2
 
 
-def finish(publishers: Iterable[Publisher]) -> None:
-    """Wait a while until readers have it all; what they have not yet taken outlives the writer."""
-    deadline = time.monotonic() + _ACKNOWLEDGE_S
+def finish(publishers: Iterable[Publisher[Any]], timeout_s: float = ACKNOWLEDGE_S) -> None:
+    """Wait a while until the subscribers have received what was published."""
+    deadline = time.monotonic() + timeout_s
     for publisher in publishers:
         left = max(0.0, deadline - time.monotonic())
         publisher.wait_for_all_acked(Duration(seconds=left))

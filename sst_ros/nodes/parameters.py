@@ -7,7 +7,7 @@ import dataclasses
 import math
 from array import array
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.nodes import arguments
 from sst_ros.scene.schema import Section, Spec, specs
 
 P = TypeVar("P", bound=Section)
@@ -35,23 +36,38 @@ _TYPES = {
 _WIDEST = 1e300
 
 
-def declare(node: Node, cls: type[P], changed: Callable[[P], None] | None = None) -> P:
+def declare(
+    node: Node,
+    cls: type[P],
+    changed: Callable[[P], None] | None = None,
+    more_defaults: Callable[[dict[str, Any]], dict[str, Any]] = lambda given: {},
+) -> P:
     """Declare every field of `cls` on the node and return the values.
 
-    Fields are read-only, but those that `cls.CHANGEABLE` names. When one of them is set, `changed`
-    gets all values anew, checked as at the start.
+    Fields are read-only, except those of `cls.CHANGEABLE`. When one of them is set, `changed` gets
+    all values, checked as at the start.
+
+    Args:
+        node: the node.
+        cls: its parameters.
+        changed: called with the values after a change.
+        more_defaults: returns defaults that depend on the values given at the start.
 
     Raises:
-        InputError: values given at start are refused; lists all of them.
+        InputError: values given at the start are refused, or names are unknown; lists all of them.
 
     """
     defaults = cls()
-    # rclpy has no public way to what was given; it is the same on Jazzy and Kilted.
-    given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
+    given: dict[str, Any] = {
+        name: parameter.value for name, parameter in node._parameter_overrides.items()
+    }
     changeable = getattr(cls, "CHANGEABLE", ())
-    values, problems = {}, []
+    values: dict[str, Any] = {}
+    problems: list[Problem] = []
+    more = more_defaults(given)
     for name, spec in specs(cls).items():
-        default = getattr(defaults, name)
+        default = more.get(name, getattr(defaults, name))
         value = given.get(name, list(default) if isinstance(default, tuple) else default)
         if spec.kind == "number":  # "-p duration:=1" means 1.0
             value = float(value) if type(value) is int else value
@@ -63,9 +79,12 @@ def declare(node: Node, cls: type[P], changed: Callable[[P], None] | None = None
         except (InvalidParameterTypeException, InvalidParameterValueException):
             problems.append(Problem(name, value, spec.allowed()))
         values[name] = value
-    for name in given.keys() - values.keys() - node._parameters.keys():
-        known = ", ".join(values)
-        node.get_logger().warning(f"parameter {name} is unknown and not used; known are {known}")
+    ours = arguments.known_anywhere()
+    for name in sorted(given.keys() - values.keys()):
+        if name in ours:  # nodes may share a parameter file
+            node.get_logger().info(f"parameter {name} is one of another node: not used")
+        elif not arguments.is_foreign(name):
+            problems.append(arguments.unknown_parameter(name, [*values]))
     if problems:
         raise InputError(node.get_fully_qualified_name(), problems)
     try:
@@ -77,10 +96,10 @@ def declare(node: Node, cls: type[P], changed: Callable[[P], None] | None = None
 
 
 def _watch(node: Node, start: P, changed: Callable[[P], None] | None) -> None:
-    """Check what is set at run time, and pass it on."""
+    """Check values that are set at run time, and pass them on."""
     held = [start]
 
-    def check(given: list[Parameter]) -> SetParametersResult:
+    def check(given: list[Parameter[Any]]) -> SetParametersResult:
         known = specs(type(start))
         values = {parameter.name: parameter.value for parameter in given}
         if "use_sim_time" in values:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process, one node: start, spin until told to stop, leave without a trace."""
+"""One process, one node: start, spin until it is done or stopped, close in order."""
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import rclpy
@@ -16,58 +15,74 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from sst_ros.child_process import orphaned
-from sst_ros.errors import SstError
-from sst_ros.nodes import middleware, raw_handles
+from sst_ros.errors import InputError, SstError
+from sst_ros.nodes import arguments, entry, middleware
 
 _SPIN_PERIOD_S = 0.1
-"""So late may a signal be heard; to spin once takes half a millisecond, asked for or not."""
+"""Longest delay of a signal; to spin once takes half a millisecond, asked for or not."""
 
 
 class Worker(Protocol):
-    """What a process runs: a node that is `done` when its work is, and closes in order."""
+    """What a process runs: a node, `done` when its work is."""
 
     node: Node
     done: threading.Event
 
     def close(self) -> None:
-        """Finish: still connected, the last thing to publish or write goes out here."""
+        """Finish while still connected; raise an SstError where the work has failed."""
 
 
-def run(name: str, build: Callable[[], Worker], args: list[str] | None = None) -> int:
-    """Run until SIGINT, SIGTERM, or the worker is done, or its parent; return the exit status.
+def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT, SIGTERM, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker close.
+
+    Args:
+        command: name of the node on the command line.
+        build: makes the worker when rclpy is ready.
+        words: arguments behind the program's name, which is the first; those of the process where
+            None.
+
+    Returns:
+        The exit status: 0, 1 for a failure, 2 for arguments that are refused.
+
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    entry.handle_signals()
+    given = list(sys.argv if words is None else words)[1:]
+    if arguments.wants_help(given):
+        print(arguments.help_text(command))
+        return 0
     middleware.configure()
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except (RuntimeError, ValueError) as error:  # what rcl makes of bad --ros-args
-        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+        ros = arguments.ros_arguments(command, given)
+        for line in arguments.params_file_warnings(command, ros):
+            print(f"{command}: {line}", file=sys.stderr)
+        rclpy.init(args=[command, *ros], signal_handler_options=SignalHandlerOptions.NO)
+    except (InputError, RuntimeError, ValueError) as error:  # the latter from rcl
+        text = str(error) if isinstance(error, InputError) else str(error).splitlines()[0]
+        print(text if text.startswith(command) else f"{command}: {text}", file=sys.stderr)
         return 2
     try:
-        return _spin(build, stop)
+        if not entry.stop.is_set():
+            _spin(build)
     except (SstError, ParameterException) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{command}: {error}", file=sys.stderr)
         return 1
     finally:
         rclpy.try_shutdown()
+    return 0
 
 
-def _spin(build: Callable[[], Worker], stop: threading.Event) -> int:
+def _spin(build: Callable[[], Worker]) -> None:
     worker = build()
     executor = SingleThreadedExecutor()
     executor.add_node(worker.node)
     try:
-        while not (stop.is_set() or worker.done.is_set() or orphaned()):
+        while not (entry.stop.is_set() or worker.done.is_set() or orphaned()):
             executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
     finally:
         try:
             worker.close()
         finally:
             executor.shutdown()
-            raw_handles.release()
             worker.node.destroy_node()
-    return 0

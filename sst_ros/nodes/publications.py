@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the simulator publishes: the run loop's audience.
+"""Topics of the simulator, as the output of the run loop.
 
-Publishing happens in the run's thread, after the step, in the slack before the next deadline; a
-topic that nobody reads is left out.
+Publishing happens in the thread of the run, after the step, in the slack before the next deadline;
+a topic without subscribers is left out.
 rclpy holds the interpreter's lock while it publishes (measured: 200 publications beside a busy
 thread are never interrupted), so a thread of its own could not work beside the next step; it would
 only add switches between threads.
@@ -11,15 +11,20 @@ only add switches between threads.
 from __future__ import annotations
 
 import contextlib
+from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
+from sst_ros.description.frame_ids import IDLE_FRAME_ID
+from sst_ros.description.urdf import urdf
+from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import middleware, topics
-from sst_ros.nodes.clocks import OwnClock
+from sst_ros.nodes.clocks import PublishedClock
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
-from sst_ros.nodes.raw_messages import Outlet, Send, Template
-from sst_ros.runtime.torque_input import Moving, Settings
+from sst_ros.runtime.run_types import HasState
+from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation import State, Triple
@@ -29,72 +34,96 @@ _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 
 
-class Publications:
-    """Publishers of the simulator."""
+class SimulatorTopics:
+    """Publishers of the simulator.
 
-    def __init__(self, node: Node, scene: Scene, settings: Settings) -> None:
-        given = settings.parameters
+    Raises:
+        InputError: /clock has another publisher, or wait_for_subscribers names no topic of the node.
+
+    """
+
+    def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
         self._node = node
-        self._clock = OwnClock(node) if given.publish_clock else None
+        self._clock = PublishedClock(node) if given.publish_clock else None
         samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
-        states = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ)
-        state = [Outlet(topic.publisher(node, depth)) for topic in states]
-        self._torques = Outlet(topics.APPLIED_TORQUES.publisher(node, depth))
+        self._joints, self._orientation, self._euler, self._torques = (
+            topic.publisher(node, depth)
+            for topic in (
+                topics.JOINT_STATES,
+                topics.ORIENTATION,
+                topics.EULER_ZYZ,
+                topics.APPLIED_TORQUES,
+            )
+        )
         self._phase = topics.PHASE.publisher(node)
         self._scene = topics.SCENE.publisher(node)
         self._scene.publish(String(data=dump(scene)))
-        self._messages = StateMessages()
-        self._state = tuple(zip(state, self._messages.templates, strict=True))
+        if given.publish_description:
+            self._description = topics.ROBOT_DESCRIPTION.publisher(node)
+            self._description.publish(String(data=urdf(scene)))
+        self.diagnostics = topics.DIAGNOSTICS.publisher(node)
+        self._awaited = self._named(given.wait_for_subscribers)
+        self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         moments = scene.moment is not None and scene.moment.topic
         self._log = TorqueLog(given.ticks_per_sample, given.period_ns, moments=moments)
         self._period_ns = given.period_ns
 
-    def begin_ns(self, earliest_ns: int) -> int:
-        """Give the stamp of a new start; 0 as long as the clock that is followed has no time."""
-        self._log.clear()
+    def now_ns(self) -> int:
+        """Return the ROS time [ns]; 0 as long as a followed clock has none."""
         if self._clock is not None:
-            return max(self._clock.now_ns, earliest_ns)
-        now = self._node.get_clock().now().nanoseconds
-        return max(now, earliest_ns) if now else 0
+            return self._clock.now_ns
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def missing_subscribers(self) -> list[str]:
+        """Return the topics of wait_for_subscribers that have no subscriber."""
+        return [one.topic_name for one in self._awaited if not one.get_subscription_count()]
+
+    def start(self) -> None:
+        """Forget the torques of the run before."""
+        self._log.clear()
 
     def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
-        """Note what acted over some ticks."""
+        """Log the torque [N m] and external moment [N m] of some ticks."""
         self._log.append(torque, moment, count)
 
-    def sample(self, moving: Moving, stamp_ns: int) -> None:
+    def sample(self, simulation: HasState, stamp_ns: int) -> None:
         """Publish a sample of the run and the torques that led to it.
 
         Raises:
             NotFinite: nothing has been published.
 
         """
-        read = self._read()
+        read = self._subscribed(self._samples)
         if read:
-            self._messages.fill(moving.state)
+            self._samples.fill(simulation.state)
         if self._clock is not None:
-            self._clock.tell(stamp_ns)
-        if self._log and self._torques.readers():
-            self._torques.send(self._log.take(stamp_ns - len(self._log) * self._period_ns))
+            self._clock.publish(stamp_ns)
+        if self._log and self._torques.get_subscription_count():
+            began_ns = stamp_ns - len(self._log) * self._period_ns
+            self._torques.publish(self._log.take(began_ns))
         self._log.clear()
-        for send, template in read:
-            send(template.stamped(stamp_ns))
+        for publisher, message in read:
+            publisher.publish(message.stamped(stamp_ns))
 
-    def idle(self, state: State, *, still: bool) -> None:
-        """Show a state that is no sample: stamped zero, `still` with zero rates."""
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+        """Publish a state that is no sample; `at_rest` with zero rates and efforts.
+
+        joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero.
+        """
         if self._clock is not None:
             self._clock.repeat()
         self._log.clear()
-        self._torques.send(self._log.take(0))
-        with contextlib.suppress(NotFinite):  # then the last one that was is shown
-            self._messages.fill(state)
-        if still:
-            self._messages.still()
-        for send, template in self._read():
-            send(template.stamped(0))
+        self._torques.publish(self._log.take(0))
+        with contextlib.suppress(NotFinite):  # then the last valid one is shown
+            self._idles.fill(state)
+        if at_rest:
+            self._idles.set_at_rest()
+        for publisher, message in self._subscribed(self._idles):
+            publisher.publish(message.stamped(stamp_ns if publisher is self._joints else 0))
 
-    def changed(self, phase: str) -> None:
-        """Tell a change of the phase."""
+    def phase_changed(self, phase: str) -> None:
+        """Publish and log the phase, with the reason of a fault."""
         self._phase.publish(String(data=phase))
         log = self._node.get_logger()
         if phase.startswith("fault"):
@@ -106,10 +135,24 @@ class Publications:
         """Names of other nodes that publish /clock while this one does."""
         return [] if self._clock is None else self._clock.rivals()
 
-    def finish(self) -> None:
-        """Wait until readers have it all."""
-        middleware.finish(self._node.publishers)
+    def finish(self, timeout_s: float = middleware.ACKNOWLEDGE_S) -> None:
+        """Wait until the subscribers have received all messages."""
+        middleware.finish(self._node.publishers, timeout_s)
 
-    def _read(self) -> list[tuple[Send, Template]]:
-        """Messages of the state that somebody reads."""
-        return [(outlet.send, template) for outlet, template in self._state if outlet.readers()]
+    def _subscribed(self, messages: StateMessages) -> list[tuple[Publisher[Any], Any]]:
+        """Messages of the state whose topics have subscribers."""
+        pairs = (
+            (self._joints, messages.joints),
+            (self._orientation, messages.orientation),
+            (self._euler, messages.euler),
+        )
+        return [(topic, message) for topic, message in pairs if topic.get_subscription_count()]
+
+    def _named(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
+        own = {publisher.topic_name: publisher for publisher in self._node.publishers}
+        found = [self._node.resolve_topic_name(name) for name in names if name]
+        if unknown := [name for name in found if name not in own]:
+            allowed = f"must be topics that the node publishes: {', '.join(sorted(own))}"
+            problem = Problem("wait_for_subscribers", unknown, allowed)
+            raise InputError(self._node.get_fully_qualified_name(), [problem])
+        return [own[name] for name in found]

@@ -33,7 +33,7 @@ from rosbags.interfaces import (
 from sst_ros.errors import SstError
 from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.raw_readers import NeverSpun, take
+from sst_ros.nodes.polling import NeverSpun, take
 from sst_ros.nodes.topics import Endpoint
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control of the run from outside: pause, step, reset, set_state. Thin: the run loop decides."""
+"""Services of the run: pause, step, reset; and the topic set_state. The run loop decides."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.nodes import topics
 from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.torque_input import ZERO, Refused, named
+from sst_ros.runtime.torque_input import ZERO, MessageRefused, by_name
 
 
 class Services:
@@ -42,18 +42,18 @@ class Services:
         return response
 
     def _set_state(self, message: JointState) -> None:
-        """Take the angles and rates of the actuators; a topic has no reply, the log has."""
+        """Take the angles and rates of the actuators; the log has the reply."""
         try:
-            gamma = named(message.name, message.position, "angles [rad] in position")
+            gamma = by_name(message.name, message.position, "angles [rad] in position")
             gamma_dot = ZERO
             if len(message.velocity):
-                gamma_dot = named(message.name, message.velocity, "rates [rad/s] in velocity")
-        except Refused as refused:
+                gamma_dot = by_name(message.name, message.velocity, "rates [rad/s] in velocity")
+        except MessageRefused as refused:
             self._node.get_logger().warning(f"set_state refused: {refused}")
             return
         reply = self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot))
-        said = f"set_state: {reply.message}"
+        text = f"set_state: {reply.message}"
         if reply.success:  # rclpy refuses two severities from one line
-            self._node.get_logger().info(said)
+            self._node.get_logger().info(text)
         else:
-            self._node.get_logger().warning(said)
+            self._node.get_logger().warning(text)

@@ -60,9 +60,9 @@ class SimulationInterfaces:
             done = self._loop.ask(self._loop.reset)
             if not paused.success:  # out of a fault a reset comes first
                 self._loop.ask(partial(self._loop.pause, True))
-            self._tell(response, done)
+            self._fill(response, done)
         elif wanted in (PLAYING, PAUSED):
-            self._tell(response, self._loop.ask(partial(self._loop.pause, wanted == PAUSED)))
+            self._fill(response, self._loop.ask(partial(self._loop.pause, wanted == PAUSED)))
         else:
             response.result.result = UNSUPPORTED
             response.result.error_message = "end the process by SIGINT or SIGTERM"
@@ -71,7 +71,7 @@ class SimulationInterfaces:
     def reset(self, request: Any, response: Any) -> Any:
         """ResetSimulation; there is nothing spawned, and ROS time is never reset."""
         if request.scope in (0, SCOPE_ALL) or request.scope & SCOPE_STATE:
-            self._tell(response, self._loop.ask(self._loop.reset))
+            self._fill(response, self._loop.ask(self._loop.reset))
         elif request.scope & SCOPE_SPAWNED:
             response.result.result = DONE
         else:
@@ -81,7 +81,7 @@ class SimulationInterfaces:
 
     def step(self, request: Any, response: Any) -> Any:
         """StepSimulation."""
-        self._tell(response, self._loop.ask(partial(self._loop.step, int(request.steps))))
+        self._fill(response, self._loop.ask(partial(self._loop.step, int(request.steps))))
         return response
 
     def _state(self) -> int:
@@ -89,13 +89,13 @@ class SimulationInterfaces:
             return STOPPED
         return PLAYING if self._loop.phase in (Phase.WAITING, Phase.RUNNING) else PAUSED
 
-    def _tell(self, response: Any, reply: Reply) -> None:
+    def _fill(self, response: Any, reply: Reply) -> None:
         response.result.result = DONE if reply.success else FAILED
         response.result.error_message = "" if reply.success else reply.message
 
 
 def offer(node: Node, loop: RunLoop) -> bool:
-    """Open the services if the package is there; tell whether it is."""
+    """Create the services if the package is installed; return whether it is."""
     if srv is None:
         return False
     answers = SimulationInterfaces(loop)

@@ -3,111 +3,117 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from sst_ros import scene
-from sst_ros.errors import RunStopped
-from sst_ros.nodes import (
-    compiled_code,
-    parameters,
-    process,
-    robot_description,
-    simulation_interfaces,
-    topics,
-)
-from sst_ros.nodes.clocks import HEARD_GRAIN_NS, STEADY, HeardTime, follows_clock
+from sst_ros.errors import InputError, SstError
+from sst_ros.nodes import graph, parameters, process, simulation_interfaces, topics
+from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
+from sst_ros.nodes.compiled_code import CodeCompiler
 from sst_ros.nodes.messages import diagnostics
-from sst_ros.nodes.publications import Publications
-from sst_ros.nodes.raw_readers import reader
+from sst_ros.nodes.polling import reader
+from sst_ros.nodes.publications import SimulatorTopics
 from sst_ros.nodes.services import Services
-from sst_ros.nodes.topics import Endpoint
-from sst_ros.runtime import gauges, realtime
-from sst_ros.runtime.diagnostics import Health
+from sst_ros.runtime import realtime
+from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, CommandBoard
+from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation import NANOSECONDS, Simulation
 
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+_WATCH_S = 0.1
+_END_S = 0.5
+"""Wait for the thread of the run, and then for subscribers, where a step does not end."""
 
 
 class Simulator:
-    """Worker of the process `simulator`: wires the parts, reports once a second."""
+    """Worker of the process `simulator`: connects the parts, reports once a second."""
 
     def __init__(self) -> None:
         self.node = Node("sst_simulator")
         self.done = threading.Event()
-        self.parameters = parameters.declare(self.node, SimulatorParameters, self._change)
-        given = self.parameters
-        simulated = scene.load(given.scene)
-        self._publications = Publications(self.node, simulated, self)
-        self._board = CommandBoard(self, simulated.actuators, *self._readers(simulated))
-        self._pacer = self._paced()
-        self._compiled = given.compiled and compiled_code.use(self.node, simulated, given)
-        self._loop = RunLoop(
-            simulated, self._build, self, self._board, self._pacer, self._publications
+        given = self.parameters = parameters.declare(
+            self.node, SimulatorParameters, self._change, _scene_duration
         )
-        self._health = Health(self._loop, self._board, self._pacer, given.period_ns / NANOSECONDS)
-        self._diagnostics = topics.DIAGNOSTICS.publisher(self.node)
+        simulated = scene.load(given.scene)
+        self._topics = SimulatorTopics(self.node, simulated, given)
+        self._input = TorqueInput(self, simulated.actuators, *self._readers(simulated))
+        self._pacer = self._create_pacer()
+        self._code = CodeCompiler(self.node, simulated, given) if given.compiled else None
+        self._loop = RunLoop(simulated, self._build, self, self._input, self._pacer, self._topics)
+        period_s = given.period_ns / NANOSECONDS
+        self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         Services(self.node, self._loop)
         simulation_interfaces.offer(self.node, self._loop)
-        robot_description.offer(self.node, simulated, given)
         self.node.create_timer(1.0, self._report, clock=STEADY)
+        self.node.create_timer(_WATCH_S, self._watch, clock=STEADY)
         self._read_gauges()
         realtime.quiet()
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the run, tell the last diagnostics, wait until readers have it all."""
+        """End the run, publish the last diagnostics, wait until subscribers have received all.
+
+        Raises:
+            SstError: the run has failed.
+
+        """
         self._loop.stop()
-        self._thread.join()
-        self._read_gauges()
+        self._thread.join(_END_S)
+        stuck = self._thread.is_alive()
+        if not stuck:
+            self._read_gauges()
         self._report()
-        self._publications.finish()
-        print("\n".join(self._health.table()), flush=True)
+        self._topics.finish(*((_END_S,) if stuck else ()))
+        if self._code is not None:
+            self._code.start()
+        print("\n".join(self._diagnostics.table()), flush=True)
+        if self._loop.failed:
+            raise SstError(self._loop.fault)
 
     def _live(self) -> None:
-        """Thread of the run."""
+        """Run in a thread of its own."""
         self._schedule()
         try:
             self._loop.run()
         finally:
             self.done.set()
 
-    def _build(self, simulated: Scene) -> Simulation:
-        """Make a simulation whose first step takes no longer than the others."""
-        given = self.parameters
-        simulation = Simulation(
-            simulated, given.integrator, tolerance=given.tolerance, compiled=self._compiled
-        )
-        with contextlib.suppress(RunStopped):
-            simulation.step(ZERO, given.period_ns)
-        simulation.reset()
-        return simulation
+    def _watch(self) -> None:
+        self._loop.watch()
+        if self._loop.failed:
+            self.done.set()
 
-    def _paced(self) -> Pacer:
+    def _build(self, simulated: Scene) -> Simulation:
+        given = self.parameters
+        compiled = self._code is not None and self._code.available
+        return Simulation(
+            simulated, given.integrator, tolerance=given.tolerance, compiled=compiled
+        )
+
+    def _create_pacer(self) -> Pacer:
         given = self.parameters
         if follows_clock(self.node):
-            heard = HeardTime(self.node)
-            return Pacer(given.period_ns, given.real_time_factor, heard, HEARD_GRAIN_NS)
+            clock = FollowedClock(self.node)
+            return Pacer(given.period_ns, given.real_time_factor, clock, FOLLOWED_STEP_NS)
         return Pacer(given.period_ns, given.real_time_factor, SteadyTime())
 
     def _readers(self, simulated: Scene) -> list[Callable[[], Any]]:
-        listened: list[Endpoint] = [topics.COMMANDS, topics.COMMANDS_STAMPED]
+        inputs = [topics.COMMANDS, topics.COMMANDS_STAMPED]
         if simulated.moment is not None and simulated.moment.topic:
-            listened.append(topics.EXTERNAL_MOMENT)
-        return [reader(self.node, topic) for topic in listened]
+            inputs.append(topics.EXTERNAL_MOMENT)
+        return [reader(self.node, topic) for topic in inputs]
 
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
@@ -123,35 +129,55 @@ class Simulator:
     def _schedule(self) -> None:
         """Real-time scheduling for a run that sleeps; without deadlines it would starve others."""
         given = self.parameters
-        said = realtime.schedule(given.realtime_priority if given.real_time_factor else 0)
-        if said != self._health.scheduling:
-            self._health.scheduling = said
-            self.node.get_logger().info(f"scheduling of the run: {said}")
+        granted = realtime.schedule(given.realtime_priority if given.real_time_factor else 0)
+        if granted != self._diagnostics.scheduling:
+            self._diagnostics.scheduling = granted
+            self.node.get_logger().info(f"scheduling of the run: {granted}")
 
     def _read_gauges(self) -> Reply:
-        self._health.gauges = gauges.read(self._loop.simulation)
+        self._diagnostics.gauges = read_gauges(self._loop.simulation)
         return Reply(True, "")
 
     def _report(self) -> None:
-        """Publish the diagnostics, log what is new, ask for gauges for the next time."""
-        publishers = sum(
-            self.node.count_publishers(topic.at(self.node.get_fully_qualified_name()))
-            for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)
-        )
-        level, said, news = self._health.judge(publishers, self._publications.rivals())
+        """Publish the diagnostics, log what is new, request gauges for the next time."""
+        own = self.node.get_fully_qualified_name()
+        commands = [topic.at(own) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)]
+        publishers = sum(self.node.count_publishers(topic) for topic in commands)
+        level, text, news = self._diagnostics.status(publishers, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
-        name = f"{self.node.get_fully_qualified_name()}: run"
         stamp_ns = self.node.get_clock().now().nanoseconds
-        values = self._health.values(publishers)
-        self._diagnostics.publish(diagnostics(name, stamp_ns, _LEVELS[level], said, values))
+        values = self._diagnostics.values(publishers)
+        message = diagnostics(f"{own}: run", stamp_ns, _LEVELS[level], text, values)
+        self._topics.diagnostics.publish(message)
         realtime.tidy()
         if self._loop.phase is not Phase.FINISHED:
             self._loop.post(self._read_gauges)
 
+    def _warnings(self, commands: Sequence[str]) -> Iterator[str]:
+        """Conditions of the graph that keep a run from what its user expects."""
+        if rivals := self._topics.rivals():
+            yield f"/clock is also published by {', '.join(rivals)}"
+        if follows_clock(self.node) and self._topics.now_ns() == 0:
+            yield "use_sim_time is set and there is no /clock: the run waits for it"
+        for topic in commands:
+            for name in graph.publishers(self.node, topic, best_effort=True):
+                yield f"{topic} of {name} is best effort and not received: publish it reliably"
+        if graph.namesakes(self.node) > 0:
+            yield f"another node is named {self.node.get_fully_qualified_name()}, too"
+
+
+def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
+    """The scene's duration as the default of the parameter; faults of the scene are found later."""
+    try:
+        simulated = scene.load(given.get("scene", SimulatorParameters().scene))
+    except (InputError, TypeError):
+        return {}
+    return {"duration": simulated.duration or 0.0}
+
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point of `simulator`."""
+    """Run the node; `args` begin with the name of the program."""
     return process.run("simulator", Simulator, args)
 
 

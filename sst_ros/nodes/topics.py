@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every topic and service of every node, declared once: nodes open them, docs and tests list them.
 
-Names are as in the node: ~ stands for the node's own name.
+In names ~ stands for the name of the node.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class Endpoint:
         return f"{package}/{form}/{self.kind.__name__}"
 
     def at(self, node: str) -> str:
-        """Give its full name at the node of this full name."""
+        """Return its full name at the node of this full name."""
         name = self.name.replace("~", node)
         return name if name.startswith("/") else f"{node.rpartition('/')[0]}/{name}"
 
-    def publisher(self, node: Node, depth: int = 0) -> Publisher:
-        """Open it for publishing."""
+    def publisher(self, node: Node, depth: int = 0) -> Publisher[Any]:
+        """Create its publisher."""
         durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(depth=self.depth or depth, durability=durability)
         return node.create_publisher(self.kind, self.name, qos)
@@ -69,11 +69,11 @@ JOINT_STATES = Endpoint(
     "joint_states",
     JointState,
     "gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the "
-    "step that ended [N m]",
+    "step that ended [N m]; frame_id `idle` where it is no sample of a run",
     depth=0,
 )
 ORIENTATION = Endpoint(
-    PUBLISHES, "~/orientation", QuaternionStamped, "orientation of {E} in {B}", depth=0
+    PUBLISHES, "~/orientation", QuaternionStamped, "orientation of {E} in {B}, frame_id `base_link`", depth=0
 )
 EULER_ZYZ = Endpoint(
     PUBLISHES, "~/euler_zyz", Vector3Stamped, "the same as ZYZ angles theta, phi, psi [rad]", 0
@@ -82,8 +82,8 @@ APPLIED_TORQUES = Endpoint(
     PUBLISHES,
     "~/applied_torques",
     JointTrajectory,
-    "what acted over every step since the last message [N m]; where the scene takes a moment from "
-    "a topic also moment_x, moment_y, moment_z in {B}",
+    "torques of every step since the last message [N m]; where the scene takes a moment from a "
+    "topic also moment_x, moment_y, moment_z in {B}",
     depth=0,
 )
 SCENE = Endpoint(PUBLISHES, "~/scene", String, "the scene, as YAML", 1, latched=True)
@@ -91,11 +91,11 @@ PHASE = Endpoint(
     PUBLISHES,
     "~/phase",
     String,
-    "waiting, running, paused, finished, or `fault: ` and the reason",
+    "waiting, running, paused, finished, or `fault: ` with the reason",
     depth=1,
     latched=True,
 )
-DIAGNOSTICS = Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of the run, at 1 Hz")
+DIAGNOSTICS = Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the run, at 1 Hz")
 CLOCK = Endpoint(
     PUBLISHES, "/clock", Clock, "simulated time", depth=1, when="publish_clock is true"
 )
@@ -106,7 +106,7 @@ ROBOT_DESCRIPTION = Endpoint(
     "the scene as URDF",
     depth=1,
     latched=True,
-    when="publish_description is true",
+    when="publish_description is true, the default",
 )
 COMMANDS = Endpoint(
     SUBSCRIBES, "~/commands", Float64MultiArray, "torques of gamma_1..3 [N m], held until the next"
@@ -131,7 +131,7 @@ SET_STATE = Endpoint(
     "state to go on from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3; "
     "refused while running, in fault, and where it is not admissible",
 )
-PAUSE = Endpoint(SERVES, "~/pause", SetBool, "hold the run, or let it go on; idempotent")
+PAUSE = Endpoint(SERVES, "~/pause", SetBool, "pause the run, or resume it; idempotent")
 STEP = Endpoint(
     SERVES, "~/step", Trigger, "advance a paused run by one sample; refused while running"
 )
@@ -160,7 +160,7 @@ SIMULATOR = (
 
 
 def _torques(doc: str) -> tuple[Endpoint, Endpoint]:
-    """Give the commands of a node whose parameter `stamped` says which of them there are."""
+    """Return the commands of a node whose parameter `stamped` selects one of them."""
     plain, stamped = "{simulator}/commands", "{simulator}/commands_stamped"
     same = "the same, by name and stamp"
     return (
@@ -173,7 +173,7 @@ PLAYED = Endpoint(
     SUBSCRIBES,
     "joint_states",
     JointState,
-    "what is answered, sample by sample from the first",
+    "samples that are answered, from the first on",
     depth=1000,
 )
 PLAYER = (
@@ -183,10 +183,10 @@ PLAYER = (
 )
 
 VIEWER = (
-    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is shown", depth=64),
-    Endpoint(SUBSCRIBES, "{simulator}/scene", String, "which manipulator is drawn", 1, True),
-    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "what the run does", 1, True),
-    Endpoint(SUBSCRIBES, "/diagnostics", DiagnosticArray, "health of the run"),
+    Endpoint(SUBSCRIBES, "joint_states", JointState, "states that are shown", depth=64),
+    Endpoint(SUBSCRIBES, "{simulator}/scene", String, "manipulator that is drawn", 1, True),
+    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "phase of the run", 1, True),
+    Endpoint(SUBSCRIBES, "/diagnostics", DiagnosticArray, "diagnostics of the run"),
     Endpoint(
         PUBLISHES,
         "{simulator}/commands",
@@ -222,12 +222,12 @@ JOINT_TRAJECTORY = Endpoint(
     "cannot be followed, and where motion is not topic",
 )
 
-COMPANION = (
+INVERSE_DYNAMICS = (
     *_torques("torques [N m] that answer each joint_states"),
     REFERENCE,
     TRACKING_ERROR,
-    Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "health of the control, at 1 Hz"),
-    Endpoint(SUBSCRIBES, "joint_states", JointState, "what is answered; the newest counts", 1),
+    Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the control, at 1 Hz"),
+    Endpoint(SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1),
     Endpoint(
         SUBSCRIBES,
         "{simulator}/phase",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a node that answers joint states commands torques: plain, or by name and stamp."""
+"""Torque commands of a node that answers joint states: plain, or by name and stamp."""
 
 from __future__ import annotations
 
@@ -11,57 +11,59 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from sst_ros.description.frame_ids import is_idle
 from sst_ros.errors import SstError
 from sst_ros.mechanism.vec3 import ZERO
 from sst_ros.nodes.messages import nanoseconds
-from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation import Triple
 
 
 class TorqueCommands:
-    """The topic that the parameters name, and the watch over what is answered on it.
+    """Publisher of the commands, and the time-out of the joint states that they answer.
 
     Attributes:
         publisher: of the commands.
 
     """
 
-    def __init__(self, node: Node, given: PlayerParameters | CompanionParameters) -> None:
+    def __init__(self, node: Node, given: PlayerParameters | ControllerNodeParameters) -> None:
         self._given = given
         if given.stamped:
             topic = f"{given.simulator}/commands_stamped"
-            self._message: Any = JointState(name=ACTUATORS, effort=array("d", ZERO))
+            self._message: Any = JointState(name=list(ACTUATORS), effort=array("d", ZERO))
             self._torques = self._message.effort
         else:
             topic = f"{given.simulator}/commands"
             self._message = Float64MultiArray(data=array("d", ZERO))
             self._torques = self._message.data
         self.publisher = node.create_publisher(type(self._message), topic, 10)
-        self.heard()
+        self.received()
 
-    def are_read(self) -> bool:
-        """Tell whether as many read them as the parameters say to wait for."""
+    def subscribed(self) -> bool:
+        """Whether they have as many subscribers as the parameters ask for."""
         return self.publisher.get_subscription_count() >= self._given.wait_for_subscribers
 
     def answering(self, state: JointState) -> int:
-        """Put the stamp of a sample on what is sent from now on; return it [ns]."""
+        """Give the next commands the stamp of a state; return it [ns], 0 where it is no sample."""
         if self._given.stamped:
             self._message.header.stamp = state.header.stamp
-        return nanoseconds(state.header.stamp)
+        stamp_ns = nanoseconds(state.header.stamp)
+        return 0 if is_idle(stamp_ns, state.header.frame_id) else stamp_ns
 
     def send(self, torque: Triple) -> None:
         """Publish torques [N m]."""
         self._torques[0], self._torques[1], self._torques[2] = torque
         self.publisher.publish(self._message)
 
-    def heard(self) -> None:
-        """Begin to wait for the next joint_states."""
-        self._heard = time.monotonic()
+    def received(self) -> None:
+        """Count the time-out of joint_states from now on."""
+        self._received = time.monotonic()
 
     def watch(self) -> None:
-        """Raise an SstError if joint_states have been silent for longer than allowed."""
-        silent = time.monotonic() - self._heard
+        """Raise an SstError if no joint_states came for longer than the parameter `timeout`."""
+        silent = time.monotonic() - self._received
         if silent > self._given.timeout:
             raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")

@@ -50,7 +50,7 @@ class TorquePlayer:
             return torque_profiles.table(Path(self._parameters.csv))
         played = scene.load(self._parameters.scene)
         if played.torque is None or played.duration is None:
-            allowed = "must have torque and duration, or csv must name a file"
+            allowed = "must have torque and duration to be played, or csv must name a file"
             raise InputError("torque_player", [Problem("scene", played.name, allowed)])
         return torque_profiles.sine(played.torque), played.duration
 
@@ -59,10 +59,10 @@ class TorquePlayer:
             raise SstError(f"the simulator stopped: {phase.data}")
 
     def _answer(self, state: JointState) -> None:
-        """Play the torque of the state's instant; stamp zero means that it is of no run."""
-        self._commands.heard()
-        # Once begun, the simulator may have its duration and leave before its last sample is heard.
-        if self._start_ns is None and not self._commands.are_read():
+        """Play the torque of the sample's instant; before the run, that of its start."""
+        self._commands.received()
+        # Once begun, the simulator may end before its last sample has arrived.
+        if self._start_ns is None and not self._commands.subscribed():
             return
         stamp_ns = self._commands.answering(state)
         if stamp_ns == 0:
@@ -81,7 +81,7 @@ class TorquePlayer:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point of `torque_player`."""
+    """Run the node; `args` begin with the name of the program."""
     return process.run("torque_player", TorquePlayer, args)
 
 

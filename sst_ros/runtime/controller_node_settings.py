@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the companion node: what a controller takes, and what a node adds."""
+"""Parameters of the inverse-dynamics controller: those of the control law and those of the node."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sst_ros.simulation import NANOSECONDS
 
 
 @dataclass(frozen=True)
-class CompanionParameters(ControllerSettings):
+class ControllerNodeParameters(ControllerSettings):
     """Parameters of sst_inverse_dynamics."""
 
     scene: str = text(
-        "scene that the node takes the manipulator for, by name or by path", default="reach"
+        "scene of the controller's model, by name or by path", default="reach"
     )
     motion: str = choice(
-        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until told "
-        "to stop",
+        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until it is "
+        "stopped",
         ("scene", "topic"),
         default="scene",
     )
@@ -40,7 +40,7 @@ class CompanionParameters(ControllerSettings):
         most=100000,
     )
     start_tolerance: float = number(
-        "how far gamma may be from where the motion begins",
+        "largest distance of gamma from the start of the motion",
         "rad",
         default=0.05,
         above=0.0,
@@ -51,10 +51,10 @@ class CompanionParameters(ControllerSettings):
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
     wait_for_subscribers: int = integer(
-        "readers of the commands to wait for", "1", default=1, least=1, most=100
+        "subscribers of the commands to wait for", "1", default=1, least=1, most=100
     )
     wait_for_recorder: bool = flag(
-        "begin when ~/reference and ~/tracking_error are read, too: so a recording is whole",
+        "start when ~/reference and ~/tracking_error have subscribers, too, so that a recording is complete",
         default=False,
     )
     timeout: float = number(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counters of a run: written by its thread, read by the diagnostics. No ROS in here."""
+"""Counters of a run: written by its thread, read by the diagnostics."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import time
 
 
 class Counters:
-    """What the run has done so far.
+    """Counters of a run.
 
     Attributes:
         ticks, published: steps done and samples published.
-        resets, states_set: how often the run began anew.
-        step_total_s, step_max_s: time that steps took.
+        resets, states_set: number of resets and of states set.
+        step_total_s, step_max_s: total time of the steps and longest mean time of one [s].
 
     """
 
@@ -25,18 +25,18 @@ class Counters:
         self._resumed: float | None = None
 
     def resume(self) -> None:
-        """Count time from here on."""
+        """Count running time from now on."""
         self.hold()
         self._resumed = time.monotonic()
 
     def hold(self) -> None:
-        """Count time no longer."""
+        """Stop to count running time."""
         if self._resumed is not None:
             self._wall_s += time.monotonic() - self._resumed
             self._resumed = None
 
     def stepped(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
-        """Note steps that were done at once: what they took, and how late they began."""
+        """Count steps of one call: their time [s] and the lateness of their start [ns]."""
         self.ticks += ticks
         self.step_total_s += took_s
         if took_s > self.step_max_s * ticks:

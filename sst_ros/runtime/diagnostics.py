@@ -1,26 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run's health: one status a second, and at the end a table of error against run time."""
+"""Diagnostics of a run: one status a second, and at the end a table of errors over run time."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from sst_ros.runtime.gauges import GAUGES
+from sst_ros.dynamics.limits import limits_of
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase
-from sst_ros.runtime.torque_input import CommandBoard
+from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
 _ROWS = 16
 
+GAUGES = {
+    "error_estimate": "estimated error of the orientation so far [rad]",
+    "rate_error_estimate": "estimated error of the body rate so far [rad/s]",
+    "energy_residual_J": "energy less that of the start and the work done since [J]",
+    "closure_residual": "largest abs(r_k . t_k), 0 where the loops are closed",
+    "singularity_serial": "least sin(mu_k), 0 at a serial singularity",
+    "singularity_parallel": "det J2, 0 at a parallel singularity",
+    "stroke_margin_rad": "least distance of gamma to an end of the stroke [rad]",
+    "workspace_margin_rad": "least distance of beta to the edge of the workspace [rad]",
+    "integrator": "method in use",
+    "integrator_changes": "number of changes of the method",
+}
+"""Keys of the values that the simulation itself reports."""
+
 KEYS = {
-    "phase": "what the run does",
+    "phase": "phase of the run",
     "ticks": "steps done",
     "ticks_missed": "steps dropped because the machine was late",
-    "overruns": "how often some were",
-    "clock_jumps": "how often the followed clock went back",
+    "overruns": "number of such overruns",
+    "clock_jumps": "times that the followed clock went back",
     "samples_published": "samples of the run published",
     "step_mean_us": "mean time of a step [us]",
     "step_max_us": "longest step [us]",
@@ -31,24 +47,24 @@ KEYS = {
     "real_time_factor_now": "the same over the last second",
     "wall_time_s": "time spent running [s]",
     "simulated_time_s": "simulated time of all steps [s]",
-    "commands_received": "good commands",
+    "commands_received": "valid commands",
     "commands_dropped": "messages that were not used",
-    "commands_dropped_because": "why, with counts",
+    "commands_dropped_because": "reasons, with counts",
     "commands_clamped": "commands beyond the scene's torque limit",
-    "command_timeouts": "how often the command became too old",
-    "command_age_s": "age of the last good command [s]; none before the first",
+    "command_timeouts": "times that the command became too old",
+    "command_age_s": "age of the last valid command [s]; none before the first",
     "command_publishers": "publishers of commands",
     "resets": "times that the run began anew",
     "states_set": "times that a state was set",
-    "scheduling": "how the run's thread is scheduled",
+    "scheduling": "scheduling of the thread of the run",
     **GAUGES,
-    "fault": "why the run stopped",
+    "fault": "reason why the run stopped",
 }
 """Keys of /diagnostics, in order."""
 
 
-class Row(NamedTuple):
-    """The run's state at one time, for the table at the end."""
+class TableRow(NamedTuple):
+    """State of the run at one time, for the table at the end."""
 
     simulated_s: float
     factor: float
@@ -58,29 +74,32 @@ class Row(NamedTuple):
     closure: object
 
 
-class Health:
-    """Puts together what the parts of the node count."""
+class RunDiagnostics:
+    """Collects the counters of the parts of the node."""
 
-    def __init__(self, loop: RunLoop, board: CommandBoard, pacer: Pacer, period_s: float) -> None:
-        self._loop, self._board, self._pacer, self._period_s = loop, board, pacer, period_s
+    def __init__(
+        self, loop: RunLoop, torque_input: TorqueInput, pacer: Pacer, period_s: float
+    ) -> None:
+        self._loop, self._input, self._pacer, self._period_s = loop, torque_input, pacer, period_s
         self.gauges: dict[str, object] = {}
         self.scheduling = ""
         self._before = (0, 0.0)
         self._noted = (0, 0, 0, 0)
-        self._rows: list[Row] = []
-        self._last: Row | None = None
+        self._warned: list[str] = []
+        self._rows: list[TableRow] = []
+        self._last: TableRow | None = None
         self._count, self._stride = 0, 1
 
     def values(self, publishers: int) -> dict[str, object]:
-        """Give the value of each key that has one."""
-        count, board = self._loop.counters, self._board
+        """Return the value of each key that has one."""
+        count, commands = self._loop.counters, self._input
         ticks, wall, factor = count.ticks, count.wall_s, 0.0
         mean, deviation, largest = count.lateness_us
         passed = wall - self._before[1]
         if passed > 0:
             factor = (ticks - self._before[0]) * self._period_s / passed
         self._before = (ticks, wall)
-        age = board.age
+        age = commands.age
         values = {
             "phase": self._loop.phase.value,
             "ticks": ticks,
@@ -97,13 +116,13 @@ class Health:
             "real_time_factor_now": factor,
             "wall_time_s": wall,
             "simulated_time_s": ticks * self._period_s,
-            "commands_received": board.received,
-            "commands_dropped": board.dropped,
+            "commands_received": commands.received,
+            "commands_dropped": commands.dropped,
             "commands_dropped_because": ", ".join(
-                f"{reason} {times}" for reason, times in dict(board.reasons).items()
+                f"{reason} {times}" for reason, times in dict(commands.reasons).items()
             ),
-            "commands_clamped": board.clamped,
-            "command_timeouts": board.timeouts,
+            "commands_clamped": commands.clamped,
+            "command_timeouts": commands.timeouts,
             "command_age_s": "none" if age is None else age,
             "command_publishers": publishers,
             "resets": count.resets,
@@ -112,39 +131,40 @@ class Health:
             **self.gauges,
             "fault": self._loop.fault,
         }
-        self._keep(values)
+        if ticks:
+            self._keep_row(ticks * self._period_s, ticks * self._period_s / wall if wall else 0.0)
         return values
 
-    def judge(self, publishers: int, rivals: list[str]) -> tuple[int, str, list[str]]:
-        """Tell the level, the status in a few words, and what has to be warned of since last."""
-        board, loop = self._board, self._loop
-        now = (board.dropped, board.clamped, board.timeouts, self._pacer.missed)
+    def status(self, publishers: int, warnings: list[str]) -> tuple[int, str, list[str]]:
+        """Return the level, the status in a few words, and what is new to warn of."""
+        commands, loop = self._input, self._loop
+        now = (commands.dropped, commands.clamped, commands.timeouts, self._pacer.missed)
         dropped, clamped, timeouts, missed = (
             after - before for after, before in zip(now, self._noted, strict=True)
         )
         self._noted = now
         news = []
         if dropped:
-            news.append(f"command dropped: {board.last_refusal} ({board.dropped} so far)")
+            news.append(f"command dropped: {commands.last_refusal} ({commands.dropped} so far)")
         if clamped:
-            news.append(f"commands clamped to the scene's torque limit ({board.clamped} so far)")
+            news.append(f"commands clamped to the scene's torque limit ({commands.clamped} so far)")
         if timeouts:
-            news.append(f"no command within command_timeout: not held ({board.timeouts} so far)")
+            news.append(f"no command within command_timeout: not held ({commands.timeouts} so far)")
         if publishers > 1:
             news.append(f"{publishers} publishers of commands: the last message wins")
-        if rivals:
-            news.append(f"/clock is also published by {', '.join(rivals)}")
-        doubts = list(news)
+        news += [warning for warning in warnings if warning not in self._warned]
+        self._warned = warnings
+        doubts = [*news, *(warning for warning in warnings if warning not in news)]
         if missed:
             doubts.append(f"{missed} ticks missed")
-        if board.stale and loop.phase is Phase.RUNNING:
+        if commands.stale and loop.phase is Phase.RUNNING:
             doubts.append("the command is too old")
         if loop.fault:
             return ERROR, loop.fault, news
-        said = loop.phase.value
-        if loop.phase is Phase.RUNNING and not board.begun:
-            said += ", no command yet: zero torque"
-        return (WARN, f"{said}; {'; '.join(doubts)}", news) if doubts else (OK, said, news)
+        text = loop.phase.value
+        if loop.phase is Phase.RUNNING and not commands.begun:
+            text += ", no command yet: zero torque"
+        return (WARN, f"{text}; {'; '.join(doubts)}", news) if doubts else (OK, text, news)
 
     def table(self) -> Iterator[str]:
         """Yield the lines of the table of error against run time."""
@@ -160,17 +180,11 @@ class Health:
             )
             yield f"{row.simulated_s:12.3f} {numbers} {row.factor:10.3f} {row.missed:8d}"
 
-    def _keep(self, values: dict[str, object]) -> None:
-        """Keep the newest row and some before it: never more than 16, evenly over the run."""
-        row = Row(
-            float(values["simulated_time_s"]),
-            float(values["real_time_factor"]),
-            int(values["ticks_missed"]),
-            *(values.get(key) for key in ("error_estimate", "energy_residual_J")),
-            values.get("closure_residual"),
-        )
-        if not values["ticks"]:
-            return
+    def _keep_row(self, simulated_s: float, factor: float) -> None:
+        """Keep the newest row and at most 16 before it, evenly over the run."""
+        keys = ("error_estimate", "energy_residual_J", "closure_residual")
+        error, energy, closure = (self.gauges.get(key) for key in keys)
+        row = TableRow(simulated_s, factor, self._pacer.missed, error, energy, closure)
         if self._last is not None and self._last.simulated_s != row.simulated_s:
             self._count += 1
             if self._count % self._stride == 0:
@@ -179,3 +193,31 @@ class Health:
                 self._rows = self._rows[1::2]
                 self._stride *= 2
         self._last = row
+
+
+def read_gauges(simulation: Simulation) -> dict[str, object]:
+    """Read the gauges in the thread of the run; those without a finite value are left out."""
+    state = simulation.state
+    conditioning = simulation.conditioning
+    angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
+    margins: dict[bool, list[float]] = {True: [], False: []}
+    for limit in limits_of(simulation.scene, simulation.geometry):
+        if limit.joint < 3 or limit.joint >= 6:
+            margins[limit.joint < 3].append(limit.margin(angles))
+    values: dict[str, object] = {
+        "error_estimate": simulation.error_estimate,
+        "rate_error_estimate": simulation.rate_error_estimate,
+        "energy_residual_J": simulation.energy_residual,
+        "closure_residual": simulation.closure_residual,
+        "singularity_serial": conditioning["sin_mu"],
+        "singularity_parallel": conditioning["det_j2"],
+        "stroke_margin_rad": min(margins[True], default=None),
+        "workspace_margin_rad": min(margins[False], default=None),
+        "integrator": simulation.method,
+        "integrator_changes": len(simulation.changes),
+    }
+    return {key: value for key, value in values.items() if _is_known(value)}
+
+
+def _is_known(value: object) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))

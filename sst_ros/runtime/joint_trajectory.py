@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A JointTrajectory as a desired motion, or every reason why it is none. No ROS types."""
+"""A JointTrajectory as a desired motion, or every reason why it is refused."""
 
 from __future__ import annotations
 

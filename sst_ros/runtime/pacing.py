@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks at absolute deadlines; late ones are counted, never made up for. No ROS in here."""
+"""Ticks at absolute deadlines; late ones are counted, never made up for."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ _LONGEST_SLEEP_NS = 50_000_000
 
 
 class TimeSource(Protocol):
-    """What deadlines are measured by."""
+    """Clock that deadlines are measured by."""
 
     def now_ns(self) -> int:
-        """Tell the time [ns]."""
+        """Return the time [ns]."""
 
     def sleep(self, ns: int) -> None:
-        """Wait about so long [ns]; may return early."""
+        """Wait for about this time [ns]; may return early."""
 
 
 class SteadyTime:
     """The monotonic clock of the machine."""
 
     def now_ns(self) -> int:
-        """Tell the time [ns]."""
+        """Return the time [ns]."""
         return time.monotonic_ns()
 
     def sleep(self, ns: int) -> None:
-        """Wait so long [ns]."""
+        """Wait for this time [ns]."""
         time.sleep(ns / 1e9)
 
 
@@ -38,16 +38,16 @@ class Pacer:
     Attributes:
         speed: real-time factor; 0 for deadlines that have always come.
         missed: ticks dropped.
-        overruns: how often some were.
-        jumps: how often the clock went back.
-        late_ns: how late the last tick began [ns].
+        overruns: times that ticks were dropped.
+        jumps: times that the clock went back.
+        late_ns: lateness of the start of the last tick [ns].
 
     """
 
     def __init__(
         self, period_ns: int, speed: float, source: TimeSource, tolerance_ns: int = 0
     ) -> None:
-        """Lateness up to `tolerance_ns` is made up for: the grain of a clock that is heard."""
+        """Lateness up to `tolerance_ns` is made up for: the step of a followed clock."""
         self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
         self._anchor = self._count = self._seen = 0
         self.speed = speed
@@ -64,12 +64,12 @@ class Pacer:
         self.start()
 
     def excuse(self, ticks: int) -> None:
-        """Put the deadlines off if the last of the next ticks is past: that was nobody's fault."""
+        """Put the deadlines off if the last of the next ticks is past: that is no overrun."""
         if self.speed > 0.0:
             self._anchor += max(0, self._late(self._source.now_ns(), ticks))
 
     def _late(self, now: int, ticks: int) -> int:
-        """Give the time from the last of the next ticks to now [ns]; negative if it is to come."""
+        """Return the time from the last of the next ticks to now [ns]; negative if it is to come."""
         interval = self._period_ns / self.speed
         return now - self._anchor - round((self._count + ticks - 1) * interval)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a thread can ask of the machine to be on time, and what it got. No ROS in here."""
+"""Real-time scheduling of the threads of the node, and quiet garbage collection."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _SWITCH_INTERVAL_S = 1e-4
 
 
 def schedule(priority: int) -> str:
-    """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); say what was had.
+    """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); return what was granted.
 
     The calling thread gets the priority, the others half of it: they hold locks that it waits for,
-    the interpreter's and those of DDS, and must not be put aside meanwhile for the work of others.
-    What these threads start is scheduled as usual.
+    the interpreter's and those of DDS, and must not be preempted meanwhile.
+    Children of these threads are scheduled as usual.
     """
     if not hasattr(os, "sched_setscheduler"):
         return "usual: this system has no SCHED_FIFO"
@@ -43,9 +43,9 @@ def _schedule_all(policy: int, own: int, others: int) -> None:
 
 
 def quiet() -> None:
-    """Keep the interpreter out of the way: no garbage collection but `tidy`, short turns.
+    """Collect garbage in `tidy` only, and switch threads often.
 
-    A thread that wakes up waits for another's turn to end, 5 ms by default: five ticks.
+    A thread that wakes up waits up to the switch interval, 5 ms by default: five ticks.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     gc.collect()
@@ -54,5 +54,5 @@ def quiet() -> None:
 
 
 def tidy() -> None:
-    """Collect the little that has become garbage since `quiet`."""
+    """Collect the garbage since `quiet`."""
     gc.collect()

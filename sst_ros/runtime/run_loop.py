@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run: waiting, running, paused, fault, finished. One thread owns it; no ROS types in here.
+"""State machine of a run: waiting, running, paused, fault, finished. One thread owns it.
 
-Others ask for changes by `ask`. They happen between two samples, in the run's own thread.
+Other threads send requests by `ask`. They are served between two samples, in the thread of the run.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+import threading
 import time
 import traceback
 from collections import deque
@@ -16,23 +18,30 @@ from collections.abc import Callable
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.counters import Counters
 from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.run_types import Answer, Audience, Phase, Reply
-from sst_ros.runtime.tick_loop import Course, NoAnswer
-from sst_ros.runtime.torque_input import CommandBoard, Settings
+from sst_ros.runtime.run_types import PendingReply, Phase, Reply, RunOutput
+from sst_ros.runtime.tick_loop import NoAnswer, TickLoop
+from sst_ros.runtime.torque_input import HasParameters, TorqueInput
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation import Simulation, Triple
 
 IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001
-_ANSWER_S = 30.0
+_REPLY_S = 30.0
+_STUCK_S = 0.4
+"""Processor time after which a step in progress is a fault; a step's budget ends it before."""
+
+
+class NoSubscribers(SstError):
+    """A topic of wait_for_subscribers has no subscriber."""
 
 
 class RunLoop:
     """State machine of one node's run.
 
     Attributes:
-        phase: what it does now.
-        fault: why it does nothing any more, until a reset.
+        phase: present phase.
+        fault: reason why the run stopped, until a reset.
+        failed: the fault ends the node, because nothing is left to wait for.
 
     """
 
@@ -40,82 +49,115 @@ class RunLoop:
         self,
         scene: Scene,
         build: Callable[[Scene], Simulation],
-        settings: Settings,
-        board: CommandBoard,
+        owner: HasParameters,
+        torque_input: TorqueInput,
         pacer: Pacer,
-        audience: Audience,
+        output: RunOutput,
     ) -> None:
-        self.phase, self.fault = Phase.WAITING, ""
-        self._build, self._settings = build, settings
-        self._board, self._audience = board, audience
+        self.phase, self.fault, self.failed = Phase.WAITING, "", False
+        self._build, self._owner = build, owner
+        self._input, self._output = torque_input, output
         self._original = build(scene)
-        self._course = Course(self._original, settings, board, pacer, audience)
-        self._requests: deque[tuple[Callable[[], Reply], Answer]] = deque()
+        self._ticks = TickLoop(self._original, owner, torque_input, pacer, output)
+        self._requests: deque[tuple[Callable[[], Reply], PendingReply]] = deque()
+        self._changing = threading.RLock()
+        self._thread: threading.Thread | None = None
+        self._watched = (0.0, 0.0)
+        self._awaited_since: float | None = time.monotonic()
 
     @property
     def simulation(self) -> Simulation:
-        """The present one; its `state` may be read by any thread."""
-        return self._course.simulation
+        """Present simulation; its `state` may be read by any thread."""
+        return self._ticks.simulation
 
     @property
     def counters(self) -> Counters:
-        """What has been done."""
-        return self._course.counters
+        """Counters of the run."""
+        return self._ticks.counters
 
     @property
     def begun(self) -> bool:
         """Whether the first sample has been published since the start or the last reset."""
-        return self._course.begun
+        return self._ticks.begun
 
-    def ask(self, request: Callable[[], Reply], timeout: float = _ANSWER_S) -> Reply:
-        """Have a request (`pause`, `reset`, ...) served by the run's thread; wait for the reply."""
-        answer = self.post(request)
-        if self._course.stop.is_set() or not answer.done.wait(timeout):
-            return Reply(False, "the run did not answer: the node is shutting down or too slow")
-        return answer.reply
+    def ask(self, request: Callable[[], Reply], timeout: float = _REPLY_S) -> Reply:
+        """Have a request (`pause`, `reset`, ...) served by the thread of the run; wait for it.
 
-    def post(self, request: Callable[[], Reply]) -> Answer:
+        The wait ends early where the run has stopped or a step does not end.
+        """
+        pending = self.post(request)
+        deadline = time.monotonic() + timeout
+        while not pending.done.wait(_POLL_S):
+            since = self._ticks.step_since
+            stuck = since and time.perf_counter() - since > _STUCK_S
+            if stuck or self._ticks.stopped.is_set() or time.monotonic() > deadline:
+                with self._changing, contextlib.suppress(ValueError):  # it is being served
+                    self._requests.remove((request, pending))
+                reason = self.fault or ("a step does not end" if stuck else "the node is ending")
+                return Reply(False, f"not done: {reason}")
+        return pending.reply
+
+    def post(self, request: Callable[[], Reply]) -> PendingReply:
         """Have a request served; do not wait."""
-        answer = Answer()
-        self._requests.append((request, answer))
-        self._course.asked.set()
-        return answer
+        pending = PendingReply()
+        self._requests.append((request, pending))
+        self._ticks.requested.set()
+        return pending
 
     def stop(self) -> None:
-        """Have `run` return soon."""
-        self._course.stop.set()
-        self._course.asked.set()
+        """Make `run` return soon."""
+        self._ticks.stopped.set()
+        self._ticks.requested.set()
+
+    def watch(self) -> None:
+        """Latch a fault, from another thread, where the step in progress does not end."""
+        since, used = self._ticks.step_since, self._processor_s()
+        if since == 0.0 or since != self._watched[0]:
+            self._watched = since, used
+        elif used - self._watched[1] > _STUCK_S and self.phase is not Phase.FAULT:
+            took = time.perf_counter() - since
+            with self._changing:
+                self.fault = self.fault or f"a step has not ended after {took:.1f} s"
+                self._to(Phase.FAULT)
 
     def run(self) -> None:
-        """Live until `stop` or the end of the run."""
-        self._tell()
+        """Run until `stop`, the end of the run, or a fault of a run with a duration."""
+        self._thread, self._awaited_since = threading.current_thread(), time.monotonic()
+        self._publish_phase()
         act = {
             Phase.WAITING: self._wait_for_start,
-            Phase.RUNNING: self._to_the_next_sample,
+            Phase.RUNNING: self._to_next_sample,
             Phase.PAUSED: self._idle,
             Phase.FAULT: self._idle,
         }
-        while not self._course.stop.is_set() and self.phase is not Phase.FINISHED:
+        warm = False
+        while not (self._ticks.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
             try:
+                if not warm:
+                    warm = True
+                    self._ticks.warm_up()
                 self._serve()
                 act[self.phase]()
+            except NoSubscribers as missing:
+                self._fail(str(missing))
+                self.failed = True
             except (RunStopped, NoAnswer) as stopped:
                 self._fail(str(stopped))
             except Exception as error:
                 at = traceback.extract_tb(error.__traceback__)[-1]
                 where = f"{at.filename.rpartition('/')[2]}:{at.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
-                self._course.stop.wait(IDLE_PERIOD_S)
+                self._ticks.stopped.wait(IDLE_PERIOD_S)
         self._end_of_run()
 
     def pause(self, paused: bool) -> Reply:
-        """Hold the run, or let it go on; idempotent."""
+        """Pause the run, or resume it; idempotent."""
         if self.phase is Phase.FAULT:
             return Reply(False, f"fault, reset first: {self.fault}")
         if paused:
-            said = "already paused" if self.phase is Phase.PAUSED else "paused"
+            reply = "already paused" if self.phase is Phase.PAUSED else "paused"
             self._to(Phase.PAUSED)
-            return Reply(True, said)
+            return Reply(True, reply)
         if self.phase is not Phase.PAUSED:
             return Reply(True, f"not paused: {self.phase.value}")
         if self.begun:
@@ -125,67 +167,76 @@ class RunLoop:
         return Reply(True, self.phase.value)
 
     def step(self, samples: int = 1) -> Reply:
-        """Advance a paused run by one sample or more, by the torques of the last command."""
+        """Advance a paused run by some samples, with the torques of the last command."""
         if self.phase is not Phase.PAUSED:
-            return Reply(False, f"refused: only a paused run can be stepped, it is {self._said()}")
-        if not self.begun and not self._course.begin():
+            return Reply(False, f"refused: only a paused run can be stepped, it is {self._status}")
+        if not self.begun and not self._ticks.begin():
             return Reply(False, "refused: there is no time yet on /clock")
         for _ in range(samples):
-            self._course.refresh()
+            self._ticks.refresh()
             try:
-                if not self._course.to_the_next_sample(paced=False):
+                if not self._ticks.to_next_sample(paced=False):
                     return Reply(False, "not done: the node is shutting down")
             except NoAnswer as none:
                 return Reply(False, f"not done: {none}")
             except RunStopped as stopped:
                 self._fail(str(stopped))
-                return Reply(False, self._said())
+            if self.fault:
+                return Reply(False, self._status)
+            if self._ticks.complete:
+                self._to(Phase.FINISHED)
+                break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
     def reset(self) -> Reply:
         """Go back to the scene's initial state; stamps go on, the command is forgotten."""
         self._original.reset()
-        self._start_anew(self._original)
         self.fault = ""
+        self._restart(self._original)
         self.counters.resets += 1
         if self.phase is not Phase.PAUSED:
             self._to(Phase.WAITING)
         return Reply(True, f"at the initial state, {self.phase.value}")
 
     def set_state(self, gamma: Triple, gamma_dot: Triple) -> Reply:
-        """Put a run that waits or is paused at another state [rad], [rad/s]."""
+        """Put a run that waits or is paused into another state [rad], [rad/s]."""
         if self.phase not in (Phase.WAITING, Phase.PAUSED):
-            return Reply(False, f"refused: pause or reset first, the run is {self._said()}")
+            return Reply(False, f"refused: pause or reset first, the run is {self._status}")
         try:
             initial = Initial(gamma=gamma, gamma_dot=gamma_dot)
             scene = dataclasses.replace(self._original.scene, initial=initial)
-            self._start_anew(self._build(scene))
+            self._restart(self._build(scene))
         except SstError as error:
             return Reply(False, f"refused: {error}")
+        self._ticks.warm_up()
         self.counters.states_set += 1
         return Reply(True, f"the state is set, {self.phase.value}")
 
-    def _start_anew(self, simulation: Simulation) -> None:
-        self._course.start_anew(simulation)
+    def _restart(self, simulation: Simulation) -> None:
+        self._ticks.restart(simulation)
         self._show()
 
     def _serve(self) -> None:
-        if not self._course.asked.is_set():
+        if not self._ticks.requested.is_set():
             return
-        self._course.asked.clear()
+        self._ticks.requested.clear()
         while self._requests:
-            request, answer = self._requests.popleft()
+            with self._changing:
+                if not self._requests:
+                    return
+                request, pending = self._requests.popleft()
             try:
-                answer.reply = request()
+                pending.reply = request()
             finally:
-                answer.done.set()
+                pending.done.set()
 
     def _wait_for_start(self) -> None:
-        """Show the state until a command begins the run, where one has to."""
-        shown = -math.inf
-        while not self._course.asked.is_set():
-            called = not self._settings.parameters.waits or self._board.look()
-            if called and self._course.begin():
+        """Show the state until the run starts: by itself, or by a command."""
+        shown, by_itself = -math.inf, not self._owner.parameters.waits
+        while not self._ticks.requested.is_set():
+            if not self._recorded():
+                pass
+            elif (by_itself or self._input.starts_run()) and self._ticks.begin():
                 self._resume()
                 return
             if time.monotonic() - shown > IDLE_PERIOD_S:
@@ -193,45 +244,74 @@ class RunLoop:
                 self._show()
             time.sleep(_POLL_S)
 
+    def _recorded(self) -> bool:
+        """Whether the topics of wait_for_subscribers have had subscribers."""
+        if self._awaited_since is None:
+            return True
+        missing = self._output.missing_subscribers()
+        timeout = self._owner.parameters.subscriber_timeout
+        if not missing:
+            self._awaited_since = None
+        elif time.monotonic() - self._awaited_since > timeout:
+            reason = f"no subscriber of {', '.join(missing)} within {timeout:g} s"
+            raise NoSubscribers(f"{reason} (wait_for_subscribers)")
+        return not missing
+
     def _resume(self) -> None:
         self._to(Phase.RUNNING)
-        self._course.resume()
+        self._ticks.resume()
 
-    def _to_the_next_sample(self) -> None:
-        if self._course.to_the_next_sample(paced=True) and self._course.is_over:
+    def _to_next_sample(self) -> None:
+        done = self._ticks.to_next_sample(paced=True)
+        if self.fault:  # latched by `watch`: the step has ended after all
+            self._ticks.publish_rest()
+        elif done and self._ticks.complete:
             self._to(Phase.FINISHED)
 
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
         self.fault = self.fault or reason
         if self.phase is not Phase.FAULT:
-            self._course.publish_rest()
+            self._ticks.publish_rest()
         self._to(Phase.FAULT)
 
     def _idle(self) -> None:
         self._show()
-        self._course.asked.wait(IDLE_PERIOD_S)
+        self._ticks.requested.wait(IDLE_PERIOD_S)
 
     def _show(self) -> None:
-        self._course.show(still=self.phase is Phase.FAULT)
+        self._ticks.show(fault=bool(self.fault))
 
     def _end_of_run(self) -> None:
         if self.phase is Phase.RUNNING:
-            self._course.publish_rest()
+            self._ticks.publish_rest()
         self.counters.hold()
-        self._course.stop.set()
+        self._ticks.stopped.set()
         while self._requests:
             self._requests.popleft()[1].done.set()
 
     def _to(self, phase: Phase) -> None:
-        if phase is not Phase.RUNNING:
-            self.counters.hold()
-        if phase is not self.phase:
-            self.phase = phase
-            self._tell()
+        with self._changing:
+            if phase is not Phase.RUNNING:
+                self.counters.hold()
+            if self.fault:
+                phase = Phase.FAULT
+                self.failed = self.failed or self._owner.parameters.duration > 0.0
+            if phase is not self.phase:
+                self.phase = phase
+                self._publish_phase()
 
-    def _tell(self) -> None:
-        self._audience.changed(self._said())
+    def _publish_phase(self) -> None:
+        self._output.phase_changed(self._status)
 
-    def _said(self) -> str:
+    def _processor_s(self) -> float:
+        """Processor time of the thread of the run [s], where the system has it."""
+        if self._thread is None or self._thread.ident is None or not self._thread.is_alive():
+            return 0.0
+        if not hasattr(time, "pthread_getcpuclockid"):
+            return time.monotonic()
+        return time.clock_gettime(time.pthread_getcpuclockid(self._thread.ident))
+
+    @property
+    def _status(self) -> str:
         return f"{self.phase.value}: {self.fault}" if self.fault else self.phase.value

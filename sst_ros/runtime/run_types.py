@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run loop is in, is asked, and tells; no ROS types in here."""
+"""Types that the run loop shares with the node: phases, replies, and where its output goes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import threading
 from enum import Enum
 from typing import NamedTuple, Protocol
 
-from sst_ros.runtime.torque_input import Moving
 from sst_ros.simulation import State, Triple
 
 
 class Phase(str, Enum):
-    """What the run does."""
+    """Phase of a run."""
 
     WAITING = "waiting"
     RUNNING = "running"
@@ -22,34 +21,48 @@ class Phase(str, Enum):
 
 
 class Reply(NamedTuple):
-    """What came of a request."""
+    """Answer to a request."""
 
     success: bool
     message: str
 
 
-class Audience(Protocol):
-    """Who is told: the topics."""
-
-    def begin_ns(self, earliest_ns: int) -> int:
-        """Give the stamp of a new start, not before `earliest_ns`; 0 where there is no time yet."""
-
-    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
-        """Note what acted over some ticks."""
-
-    def sample(self, moving: Moving, stamp_ns: int) -> None:
-        """Publish a sample of the run and the torques that led to it."""
-
-    def idle(self, state: State, *, still: bool) -> None:
-        """Show a state that is no sample: stamped zero, `still` with zero rates."""
-
-    def changed(self, phase: str) -> None:
-        """Tell a change of the phase, and why."""
-
-
-class Answer:
-    """Where the reply to a request will be."""
+class PendingReply:
+    """Reply that the thread of the run will give; `done` is set when `reply` is valid."""
 
     def __init__(self) -> None:
         self.done = threading.Event()
         self.reply = Reply(False, "not done: the run has ended or failed")
+
+
+class HasState(Protocol):
+    """A simulation, as far as its state is read."""
+
+    @property
+    def state(self) -> State:
+        """Present state; built when it is read."""
+
+
+class RunOutput(Protocol):
+    """Where a run publishes: the topics of the node."""
+
+    def now_ns(self) -> int:
+        """Return the ROS time [ns]; 0 as long as a followed clock has none."""
+
+    def missing_subscribers(self) -> list[str]:
+        """Return the topics whose subscribers the run has to wait for."""
+
+    def start(self) -> None:
+        """Forget the torques of the run before."""
+
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        """Log the torque [N m] and external moment [N m] of some ticks."""
+
+    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+        """Publish a sample of the run and the torques that led to it."""
+
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+        """Publish a state that is no sample; `at_rest` with zero rates and efforts."""
+
+    def phase_changed(self, phase: str) -> None:
+        """Publish the phase, with the reason of a fault."""

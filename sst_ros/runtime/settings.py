@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes, as sections: descriptors, checks and the docs' tables come from here."""
+"""Parameters of the nodes: descriptors, checks, --help and the tables of the docs come from here."""
 
 from __future__ import annotations
 
@@ -38,16 +38,17 @@ class SimulatorParameters(Section):
         least=1,
         most=100000,
     )
-    wait_for_command: bool = flag("begin the run at the first command, not at once", default=False)
+    wait_for_command: bool = flag("start the run at the first command, not at once", default=False)
     duration: float = number(
-        "length of the run, after which the node ends; 0 for no end",
+        "length of the run, after which the node ends, by default the duration of the scene; 0 for "
+        "no end",
         "s",
         default=0.0,
         least=0.0,
         most=1e9,
     )
     real_time_factor: float = number(
-        "simulated time per time of the clock; 0 for as fast as possible",
+        "simulated time per time of the clock, 0.001 to 1000; 0 for as fast as possible",
         "1",
         default=1.0,
         least=0.0,
@@ -57,7 +58,19 @@ class SimulatorParameters(Section):
         "publish the simulated time on /clock; refused where there is a clock", default=False
     )
     publish_description: bool = flag(
-        "publish the scene as URDF on robot_description", default=False
+        "publish the scene as URDF on robot_description", default=True
+    )
+    wait_for_subscribers: tuple[str, ...] = texts(
+        "topics of the node, such as joint_states or ~/orientation, that must have a subscriber "
+        "before the run starts",
+        default=(),
+    )
+    subscriber_timeout: float = number(
+        "longest wait for them, after which the node ends with an error",
+        "s",
+        default=10.0,
+        least=0.0,
+        most=1e6,
     )
     sync: str = choice(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
@@ -65,7 +78,7 @@ class SimulatorParameters(Section):
         default="free",
     )
     lockstep_timeout: float = number(
-        "longest wait for an answer, then fault; 0 for no end",
+        "longest wait for the answer to a sample, then fault; 0 for no end",
         "s",
         default=10.0,
         least=0.0,
@@ -87,8 +100,8 @@ class SimulatorParameters(Section):
         most=1.0,
     )
     compiled: bool = flag(
-        "run machine code where numba is installed: the first run of a scene is plain Python, to "
-        "the same bits, while a process beside makes the code for the next",
+        "run machine code where numba is installed; the first run of a scene is plain Python, with "
+        "the same bits, and a process of low priority compiles the scene for the next",
         default=True,
     )
     realtime_priority: int = integer(
@@ -101,11 +114,14 @@ class SimulatorParameters(Section):
     )
 
     def check(self) -> Iterator[Problem]:
-        """Refuse rates that have no whole period."""
+        """Refuse rates that have no whole period, and bounds too small to be meant."""
         if NANOSECONDS % self.rate:
             yield Problem("rate", self.rate, "must divide 1e9, so that a step is whole nanoseconds")
         if self.rate % self.publish_rate:
             yield Problem("publish_rate", self.publish_rate, f"must divide rate = {self.rate}")
+        for name in self.CHANGEABLE:
+            if 0.0 < getattr(self, name) < 1e-3:
+                yield Problem(name, getattr(self, name), "must be 0 or >= 0.001")
 
     @property
     def period_ns(self) -> int:
@@ -119,7 +135,7 @@ class SimulatorParameters(Section):
 
     @property
     def waits(self) -> bool:
-        """Whether a run begins by a command."""
+        """Whether a command starts the run."""
         return self.wait_for_command or self.sync == "lockstep"
 
 
@@ -134,7 +150,7 @@ class PlayerParameters(Section):
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
     wait_for_subscribers: int = integer(
-        "readers of the commands to wait for", "1", default=1, least=1, most=100
+        "subscribers of the commands to wait for", "1", default=1, least=1, most=100
     )
     timeout: float = number(
         "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6

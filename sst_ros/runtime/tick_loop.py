@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The course of a run: the ticks from one published sample to the next. No ROS types in here."""
+"""Ticks from one published sample to the next. Owned by the thread of the run."""
 
 from __future__ import annotations
 
@@ -8,65 +8,74 @@ import math
 import threading
 import time
 
-from sst_ros.errors import SstError
+from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.counters import Counters
 from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.run_types import Audience
-from sst_ros.runtime.torque_input import CommandBoard, Settings
+from sst_ros.runtime.run_types import RunOutput
+from sst_ros.runtime.torque_input import ZERO, HasParameters, TorqueInput
 from sst_ros.simulation import Simulation, Triple
 
 _POLL_S = 0.001
-_TICKS_AT_ONCE = 64
-"""So many ticks may pass before somebody who asks to stop is heard."""
+_TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
+"""Bounds of one call of `Simulation.steps`, after which requests are served."""
 
 
 class NoAnswer(SstError):
-    """Nobody has answered a sample in lockstep."""
+    """No command answered a sample in lockstep."""
 
 
-class Course:
-    """Ticks and samples; owned by the run's thread.
+class TickLoop:
+    """Ticks and samples of one simulation.
 
     Attributes:
         simulation: what is run; its `state` may be read by any thread.
         begun: the first sample has been published.
-        counters: what has been done.
-        asked, stop: set by others to have the thread look up, or end.
+        counters: counters of the run.
+        step_since: time.perf_counter at which the step in progress began; 0 between steps.
+        requested, stopped: set by others to interrupt a wait, or to end.
 
     """
 
     def __init__(
         self,
         simulation: Simulation,
-        settings: Settings,
-        board: CommandBoard,
+        owner: HasParameters,
+        torque_input: TorqueInput,
         pacer: Pacer,
-        audience: Audience,
+        output: RunOutput,
     ) -> None:
+        given = owner.parameters
         self.simulation, self.begun, self.counters = simulation, False, Counters()
-        self.asked, self.stop = threading.Event(), threading.Event()
-        self._settings, self._board = settings, board
-        self._pacer, self._audience = pacer, audience
-        self._lockstep = settings.parameters.sync == "lockstep"
-        self._period_ns = settings.parameters.period_ns
-        self._ticks_per_sample = settings.parameters.ticks_per_sample
-        duration = settings.parameters.duration * settings.parameters.rate
-        self._last_tick = math.ceil(duration - 1e-6) or math.inf
-        self._tick = self._start_ns = self._stamp_ns = 0
+        self.requested, self.stopped = threading.Event(), threading.Event()
+        self.step_since = 0.0
+        self._owner, self._input, self._pacer, self._output = owner, torque_input, pacer, output
+        self._lockstep = given.sync == "lockstep"
+        self._period_ns, self._ticks_per_sample = given.period_ns, given.ticks_per_sample
+        self._last_tick = math.ceil(given.duration * given.rate - 1e-6) or math.inf
+        self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
         self._awaited_since = time.monotonic()
 
-    def start_anew(self, simulation: Simulation) -> None:
+    def warm_up(self) -> None:
+        """Take the first step, which loads code, and go back: later steps take no longer."""
+        self.step_since = time.perf_counter()
+        with contextlib.suppress(RunStopped):
+            self.simulation.step(ZERO, self._period_ns)
+        self.step_since = 0.0
+        self.simulation.reset()
+
+    def restart(self, simulation: Simulation) -> None:
         """Take another simulation, or the same at its start; stamps go on."""
         self.simulation, self.begun, self._tick = simulation, False, 0
-        self._board.clear()
+        self._input.clear()
 
     def begin(self) -> bool:
-        """Publish the first sample; False as long as the clock has not begun."""
-        self._start_ns = self._audience.begin_ns(
-            self._stamp_ns + self._period_ns * self._ticks_per_sample
-        )
-        if self._start_ns == 0:
+        """Publish the first sample; False as long as a followed clock has no time."""
+        now = self._output.now_ns()
+        if now == 0:
             return False
+        sample = self._stamp_ns + self._period_ns * self._ticks_per_sample
+        self._start_ns = max(now, sample, self._idle_ns + 1)
+        self._output.start()
         self.begun = True
         self._publish()
         return True
@@ -74,7 +83,7 @@ class Course:
     def refresh(self) -> None:
         """Count the age of the command and the wait for an answer from now on."""
         self._awaited_since = time.monotonic()
-        self._board.refresh()
+        self._input.refresh()
 
     def resume(self) -> None:
         """Count time and deadlines from now on."""
@@ -83,32 +92,32 @@ class Course:
         self._pacer.start()
 
     @property
-    def is_over(self) -> bool:
-        """Whether the run has its duration."""
+    def complete(self) -> bool:
+        """Whether the run has reached its duration."""
         return self._tick >= self._last_tick
 
-    def to_the_next_sample(self, *, paced: bool) -> bool:
-        """Tick to the next sample and publish it; False if something else comes first.
+    def to_next_sample(self, *, paced: bool) -> bool:
+        """Tick to the next sample and publish it; False if it was interrupted before.
 
-        Ticks between which nothing can change are done at once: in lockstep, without deadlines,
-        and when a paused run is stepped.
+        Ticks between which nothing can change are one call: in lockstep, without deadlines, and
+        when a paused run is stepped.
 
         Raises:
-            RunStopped: the run ends before; the ticks before it are done and told.
-            NoAnswer: in lockstep nobody has answered in time.
+            RunStopped: the run ends before; the ticks before it are done and logged.
+            NoAnswer: in lockstep no answer came within lockstep_timeout.
 
         """
-        answer = self._answered(paced) if self._lockstep else None
+        answer = self._answer(paced) if self._lockstep else None
         if self._lockstep and answer is None:
             return False
         at_once = answer is not None or not paced or self._pacer.speed == 0.0
         while True:
             ticks = self._ticks_left() if at_once else 1
-            if paced and not self._pacer.wait(self.stop.is_set, ticks):
+            if paced and not self._pacer.wait(self.stopped.is_set, ticks):
                 return False
-            torque = self._board.torque(self.simulation) if answer is None else answer
-            self._advance(torque, 1 if self._board.brakes else ticks)
-            if self._tick % self._ticks_per_sample == 0 or self.is_over:
+            torque = self._input.torque(self.simulation) if answer is None else answer
+            self._advance(torque, 1 if self._input.depends_on_state else ticks)
+            if self._tick % self._ticks_per_sample == 0 or self.complete:
                 self._publish()
                 return True
 
@@ -118,34 +127,47 @@ class Course:
             with contextlib.suppress(Exception):  # publishing may be what failed
                 self._publish()
 
-    def show(self, *, still: bool) -> None:
-        """Show the state of a run that does not move."""
-        self._audience.idle(self.simulation.state, still=still)
+    def show(self, *, fault: bool) -> None:
+        """Publish the state of a run that does not advance, marked as idle.
+
+        Its stamp is the ROS time at which the state holds: that of the last sample where samples
+        will follow it, else the present time. Stamps never go back.
+        """
+        stamp_ns = self._stamp_ns
+        if fault or not self.begun:
+            now = self._output.now_ns()
+            stamp_ns = max(now, stamp_ns + 1, self._idle_ns) if now else self._idle_ns
+        self._output.idle(self.simulation.state, stamp_ns, at_rest=fault)
+        self._idle_ns = stamp_ns
+        self._input.idle_shown(stamp_ns)
 
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
-        return int(min(left, self._last_tick - self._tick, _TICKS_AT_ONCE))
+        most = max(1.0, _AT_ONCE_S / (self.counters.step_max_s or _AT_ONCE_S))
+        return int(min(left, self._last_tick - self._tick, _TICKS_AT_ONCE, most))
 
     def _advance(self, torque: Triple, ticks: int) -> None:
-        simulation, moment = self.simulation, self._board.moment
-        before, began = simulation.time_ns, time.perf_counter()
+        simulation, moment = self.simulation, self._input.moment
+        before = simulation.time_ns
+        self.step_since = began = time.perf_counter()
         try:
             simulation.steps(torque, self._period_ns, ticks, moment)
         finally:
             took = time.perf_counter() - began
+            self.step_since = 0.0
             done = (simulation.time_ns - before) // self._period_ns
             if done:
                 self.counters.stepped(took, self._pacer.late_ns, done)
-                self._audience.ticks(torque, moment, done)
+                self._output.ticks(torque, moment, done)
                 self._tick += done
 
-    def _answered(self, paced: bool) -> Triple | None:
-        """Torques that answer the last sample; None if something else comes first."""
-        timeout = self._settings.parameters.lockstep_timeout or math.inf
-        while (answer := self._board.answer(self._stamp_ns)) is None:
-            if self.stop.is_set() or (paced and self.asked.is_set()):
+    def _answer(self, paced: bool) -> Triple | None:
+        """Torques that answer the last sample; None if interrupted before."""
+        while (answer := self._input.answer(self._stamp_ns)) is None:
+            if self.stopped.is_set() or (paced and self.requested.is_set()):
                 return None
             waited = time.monotonic() - self._awaited_since
+            timeout = self._owner.parameters.lockstep_timeout or math.inf
             if waited > timeout:
                 raise NoAnswer(
                     f"no command answered the sample of {self._stamp_ns} ns within {timeout:g} s"
@@ -156,6 +178,6 @@ class Course:
 
     def _publish(self) -> None:
         self._stamp_ns = self._start_ns + self._tick * self._period_ns
-        self._audience.sample(self.simulation, self._stamp_ns)
+        self._output.sample(self.simulation, self._stamp_ns)
         self._awaited_since = time.monotonic()
         self.counters.published += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The companion's work: which motion it follows, since when, and how well. No ROS types."""
+"""Trajectory following: the motion, when it began, its commands and its tracking error."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, axpy, dot
 from sst_ros.runtime import joint_trajectory
-from sst_ros.runtime.controller_node_settings import CompanionParameters
+from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.scene.scene import Actuators, Scene
 from sst_ros.simulation import NANOSECONDS
 
@@ -32,7 +32,7 @@ _COLUMNS = 22
 
 
 class Stage(Enum):
-    """What it does now."""
+    """Stage of a motion."""
 
     WAITING = "waiting for a trajectory"
     READY = "ready"
@@ -41,23 +41,22 @@ class Stage(Enum):
     ENDED = "ended"
 
 
-class Pursuit:
+class TrajectoryFollower:
     """Follows the scene's motion once, or one trajectory after the other.
 
     Attributes:
-        stage: what it does now.
-        samples, irregular: samples answered, and those that came at another time than the period
-            says.
+        stage: present stage.
+        samples, irregular: samples answered, and those that came at another period.
         limited: samples of the motion in which a torque was limited.
         largest: largest error of the motion so far [rad].
-        refused, last_refusal: trajectories that were refused, and why the last one was.
+        refused, last_refusal: trajectories that were refused, and the reason of the last one.
 
     Raises:
         InputError, AssemblyError, SingularConfiguration: the scene's motion is refused.
 
     """
 
-    def __init__(self, model: Scene, settings: CompanionParameters) -> None:
+    def __init__(self, model: Scene, settings: ControllerNodeParameters) -> None:
         self._model, self._settings = _limited(model, settings.torque_limit), settings
         self._geometry = Geometry.of(model)
         self._period_ns = NANOSECONDS // settings.rate
@@ -67,9 +66,10 @@ class Pursuit:
             check(self._planned, self._model)
         self.samples = self.irregular = self.limited = self.refused = 0
         self.last_refusal = ""
-        self.anew()
+        self._start_ns: int | None = None
+        self.restart()
 
-    def anew(self) -> None:
+    def restart(self) -> None:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
         self.stage, self._last_ns, self._rows = Stage.WAITING, 0, array("d")
         self._square = self.largest = 0.0
@@ -140,21 +140,21 @@ class Pursuit:
         passed_ns = stamp_ns - self._start_ns
         time = passed_ns / NANOSECONDS
         command = self._controller.command(time, measured)
-        judged_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
+        end_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
         if time >= self._motion.duration:
             self.stage = Stage.HOLDING
-        if passed_ns >= judged_ns and self._planned is not None:
+        if passed_ns >= end_ns and self._planned is not None:
             self.stage = Stage.ENDED
             command = dataclasses.replace(command, torque=ZERO)
-        if passed_ns <= judged_ns:
-            self._note(time, measured, command)
+        if passed_ns <= end_ns:
+            self._log(time, measured, command)
         self.samples += 1
         self.limited += command.saturated
         self._last, self._last_ns = command, stamp_ns
         return command
 
-    def judged(self) -> TrackingMetrics | None:
-        """Tell how well the motion has been followed; None before two samples of it."""
+    def tracking(self) -> TrackingMetrics | None:
+        """Return the tracking errors of the motion; None before two samples of it."""
         if len(self._rows) < 2 * _COLUMNS:
             return None
         rows = np.array(self._rows).reshape(-1, _COLUMNS)
@@ -180,7 +180,7 @@ class Pursuit:
         self._square = self.largest = 0.0
         self.limited = 0
 
-    def _note(self, time: float, measured: Measurement, command: Command) -> None:
+    def _log(self, time: float, measured: Measurement, command: Command) -> None:
         desired = command.desired
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
         self._square += dot(error, error)
@@ -199,9 +199,9 @@ class Pursuit:
         )
 
     def _standing(self, seen: Measurement | None) -> Reference:
-        """Be at rest at what was measured."""
+        """Return the reference at rest at the measured angles."""
         if seen is None:
-            allowed = "must come first: they say where a trajectory begins"
+            allowed = "must come first: a trajectory begins there"
             raise InputError("joint_trajectory", [Problem("joint_states", None, allowed)])
         named = self._model.initial.orientation
         meant = None if named is None else rotation_matrix(named)
@@ -224,14 +224,14 @@ class Pursuit:
 
 
 def _samples(bag: str) -> MotionSamples:
-    """Read a recorded motion; only who has one needs what reads bags."""
+    """Read a recorded motion; the import is needed for these only."""
     from sst_ros.recording.recorded_motion import samples
 
     return samples(bag)
 
 
 def _limited(model: Scene, limit: float) -> Scene:
-    """Give a model's actuators a torque limit, unless theirs is smaller."""
+    """Return the model with a torque limit, unless its own is smaller."""
     if not limit:
         return model
     own = model.actuators or Actuators(torque_limit=limit)

@@ -18,7 +18,12 @@ _END_S = 10.0
 @contextmanager
 def simulator(scene: str, speed: float = 1.0) -> Iterator[None]:
     """Run a simulator of a scene; `speed` is simulated time per time."""
-    given = {"scene": scene, "publish_rate": PUBLISH_RATE, "real_time_factor": speed}
+    given: dict[str, object] = {
+        "scene": scene,
+        "publish_rate": PUBLISH_RATE,
+        "real_time_factor": speed,
+        "duration": 0.0,
+    }
     process = child_process.start("simulator", given, stdout=subprocess.DEVNULL)
     try:
         yield

@@ -24,6 +24,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
 from sst_ros import child_process  # noqa: E402
+from sst_ros.description.frame_ids import IDLE_FRAME_ID  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
 
 DOMAINS = itertools.cycle(range(1, 101))
@@ -81,6 +82,8 @@ class Nodes:
         return process
 
     def run(self, command, **given):
+        if command == "simulator":  # by default it would end with the scene's duration
+            given.setdefault("duration", 0.0)
         return self.start(command, "--ros-args", *child_process.words(given))
 
     def line(self, process, timeout=20):
@@ -163,6 +166,9 @@ class Observer:
 
     @staticmethod
     def stamp(message):
+        """Of a sample [ns]; 0 for a state that is shown before the run, in a pause or in a fault."""
+        if message.header.frame_id == IDLE_FRAME_ID:
+            return 0
         return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
     def close(self):

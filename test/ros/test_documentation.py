@@ -15,7 +15,6 @@ ROOT = Path(__file__).parents[2]
 IDS = [node.command for node in NODES]
 WITHOUT_REASON = {
     "/clock",
-    "/robot_description",
     "/sst_simulator/external_moment",
     "/sst_simulator/commands_stamped",
 }

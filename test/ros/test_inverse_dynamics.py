@@ -233,7 +233,7 @@ def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_p
     ids=["too weak", "nan gain"],
 )
 def test_what_cannot_be_followed_is_refused_at_the_start(nodes, tmp_path, given, reason):
-    """See test_companion_pursuit.py for more reasons."""
+    """See test_companion_follower.py for more reasons."""
     companion = nodes.run("inverse_dynamics", scene=written(tmp_path), **given)
     _, err = companion.communicate(timeout=30)
     assert companion.returncode == 1

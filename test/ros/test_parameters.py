@@ -79,9 +79,11 @@ def test_refused_at_start(nodes, given, said):
 def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     path = ROOT / "config" / "simulator.yaml"
     document = yaml.safe_load(path.read_text())
-    given = document["sst_simulator"]["ros__parameters"]
+    given = document["/**"]["ros__parameters"]
     defaults = SimulatorParameters()
-    assert given == {name: getattr(defaults, name) for name in specs(SimulatorParameters)}
-    process = nodes.start("simulator", "--ros-args", "--params-file", str(path))
+    names = specs(SimulatorParameters).keys() - {"duration", "wait_for_subscribers"}
+    assert given == {name: getattr(defaults, name) for name in names}
+    told = ["-p", "duration:=0.0", "-r", "__ns:=/left", "-r", "__node:=other"]
+    process = nodes.start("simulator", "--ros-args", "--params-file", str(path), *told)
     observer.told("phase", "running")
     assert nodes.stop(process)[0] == 0

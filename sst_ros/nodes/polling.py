@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers that no executor spins: their owner takes the messages, when and where it wants."""
+"""Subscriptions that no executor spins: their owner takes the messages when and where it wants.
+
+An executor wakes a thread for each message, which costs far more than taking it. rclpy has no
+public call that takes a message; this is what its executors do.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,11 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
-from sst_ros.nodes import raw_handles
 from sst_ros.nodes.topics import Endpoint
 
 
 class NeverSpun(CallbackGroup):
-    """Keeps readers out of the executor: one wake-up a message costs far more than taking it."""
+    """Keeps subscriptions out of the executor."""
 
     def can_execute(self, entity: object) -> bool:
         """Refuse."""
@@ -29,22 +32,22 @@ class NeverSpun(CallbackGroup):
         """Do nothing."""
 
 
-def take(reader: Subscription, *, raw: bool) -> tuple[Any, dict[str, Any]] | None:
-    """Take the next message and what is known about it, or None."""
-    with reader.handle:
-        result: tuple[Any, dict[str, Any]] | None = reader.handle.take_message(reader.msg_type, raw)
-    return result
+def take(subscription: Subscription[Any], *, raw: bool) -> tuple[Any, dict[str, Any]] | None:
+    """Take the next message and its information, or None."""
+    handle: Any = subscription.handle
+    with handle:
+        taken: tuple[Any, dict[str, Any]] | None = handle.take_message(subscription.msg_type, raw)
+    return taken
 
 
 def reader(node: Node, topic: Endpoint) -> Callable[[], Any]:
-    """Open a topic; the function gives its next message, or None."""
+    """Subscribe to a topic; the function returns its next message, or None."""
     subscription = node.create_subscription(
         topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
     )
-    look, kind = raw_handles.keep(subscription.handle).take_message, topic.kind
 
     def next_message() -> Any:
-        result = look(kind, False)
-        return None if result is None else result[0]
+        taken = take(subscription, raw=False)
+        return None if taken is None else taken[0]
 
     return next_message

@@ -17,42 +17,48 @@ from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, CommandBoard
+from sst_ros.runtime.torque_input import ZERO, TorqueInput
 from sst_ros.simulation import Simulation
 
 
-class Audience:
-    """Keeps what it is told; gives time from 1 s on."""
+class Output:
+    """Keeps what the run publishes; gives time from 1 s on."""
 
     def __init__(self):
         self.samples, self.acted, self.idles, self.phases = [], [], [], []
-        self.now_ns = 1_000_000_000
+        self.now, self.missing = 1_000_000_000, []
 
-    def begin_ns(self, earliest_ns):
-        return max(self.now_ns, earliest_ns) if self.now_ns else 0
+    def now_ns(self):
+        return self.now
+
+    def missing_subscribers(self):
+        return self.missing
+
+    def start(self):
+        pass
 
     def ticks(self, torque, moment, count):
         self.acted.extend([torque] * count)
 
-    def sample(self, moving, stamp_ns):
-        self.samples.append((stamp_ns, moving.state))
+    def sample(self, simulation, stamp_ns):
+        self.samples.append((stamp_ns, simulation.state))
 
-    def idle(self, state, *, still):
-        self.idles.append((state, still))
+    def idle(self, state, stamp_ns, *, at_rest):
+        self.idles.append((state, at_rest, stamp_ns))
 
-    def changed(self, phase):
+    def phase_changed(self, phase):
         self.phases.append(phase)
 
 
 class Bench:
     def __init__(self, scene="example1", build=Simulation, **given):
         self.parameters = SimulatorParameters(scene=scene, **{"real_time_factor": 0.0, **given})
-        self.queue, self.stamped, self.audience = [], [], Audience()
+        self.queue, self.stamped, self.output = [], [], Output()
         takes = [lambda q=q: q.pop(0) if q else None for q in (self.queue, self.stamped)]
-        self.board = CommandBoard(self, None, *takes)
+        self.input = TorqueInput(self, None, *takes)
         pacer = Pacer(self.parameters.period_ns, self.parameters.real_time_factor, SteadyTime())
-        self.loop = RunLoop(load_scene(scene), build, self, self.board, pacer, self.audience)
-        self.thread = threading.Thread(target=self.loop.run)
+        self.loop = RunLoop(load_scene(scene), build, self, self.input, pacer, self.output)
+        self.thread = threading.Thread(target=self.loop.run, daemon=True)
 
     @contextlib.contextmanager
     def running(self):
@@ -78,7 +84,7 @@ def answer(stamp_ns):
 
 
 def stamps(bench):
-    return [stamp for stamp, _ in bench.audience.samples]
+    return [stamp for stamp, _ in bench.output.samples]
 
 
 def test_a_run_ends_after_its_duration_with_every_sample():
@@ -87,14 +93,14 @@ def test_a_run_ends_after_its_duration_with_every_sample():
     assert bench.loop.phase is Phase.FINISHED
     first = stamps(bench)[0]
     assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
-    assert len(bench.audience.acted) == bench.loop.counters.ticks == 11
-    assert bench.audience.phases == ["waiting", "running", "finished"]
+    assert len(bench.output.acted) == bench.loop.counters.ticks == 11
+    assert bench.output.phases == ["waiting", "running", "finished"]
 
 
 def test_pause_is_idempotent_and_a_step_is_one_sample():
     bench = Bench()
     with bench.running() as loop:
-        bench.until(lambda: len(bench.audience.samples) > 3)
+        bench.until(lambda: len(bench.output.samples) > 3)
         assert loop.ask(loop.step) == (
             False,
             "refused: only a paused run can be stepped, it is running",
@@ -108,7 +114,7 @@ def test_pause_is_idempotent_and_a_step_is_one_sample():
         assert len(stamps(bench)) == len(before) + 6
         assert loop.ask(partial(loop.pause, False)) == (True, "running")
         assert loop.ask(partial(loop.pause, False)) == (True, "not paused: running")
-        bench.until(lambda: len(bench.audience.samples) > len(before) + 8)
+        bench.until(lambda: len(bench.output.samples) > len(before) + 8)
     whole = stamps(bench)[:-1]  # the last one is where it was stopped
     spacing = set(np.diff(whole).tolist())
     assert spacing == {2_000_000}
@@ -117,30 +123,30 @@ def test_pause_is_idempotent_and_a_step_is_one_sample():
 def test_resume_makes_no_burst():
     bench = Bench(real_time_factor=1.0)
     with bench.running() as loop:
-        bench.until(lambda: len(bench.audience.samples) > 3)
+        bench.until(lambda: len(bench.output.samples) > 3)
         loop.ask(partial(loop.pause, True))
         time.sleep(0.2)
         before = loop.counters.ticks
         loop.ask(partial(loop.pause, False))
         assert loop.counters.ticks - before < 50
-    assert bench.audience.idles  # the state is shown meanwhile
+    assert bench.output.idles  # the state is shown meanwhile
 
 
 def test_reset_goes_back_and_stamps_go_on():
     bench = Bench()
     start = bench.loop.simulation.state
     with bench.running() as loop:
-        bench.until(lambda: len(bench.audience.samples) > 5)
+        bench.until(lambda: len(bench.output.samples) > 5)
         loop.ask(partial(loop.pause, True))
         last = stamps(bench)[-1]
         assert loop.ask(loop.reset) == (True, "at the initial state, paused")
         assert loop.simulation.state == start
-        bench.audience.now_ns = 0  # no time: cannot begin
+        bench.output.now = 0  # no time: cannot begin
         assert "no time yet" in loop.ask(loop.step).message
-        bench.audience.now_ns = 1_000_000_000
+        bench.output.now = 1_000_000_000
         assert loop.ask(loop.step).success
         assert stamps(bench)[-2:] == [last + 2_000_000, last + 4_000_000]
-        assert bench.audience.samples[-2][1] == start
+        assert bench.output.samples[-2][1] == start
 
 
 def test_a_fault_is_latched_until_a_reset():
@@ -151,10 +157,10 @@ def test_a_fault_is_latched_until_a_reset():
         loop.ask(partial(loop.pause, False))
         bench.until(lambda: loop.phase is Phase.FAULT)
         assert "gamma_1 > 1.570796 rad" in loop.fault
-        assert bench.audience.phases[-1].startswith("fault: stopped at t = ")
-        bench.until(lambda: bench.audience.idles and bench.audience.idles[-1][1])
-        held, _ = bench.audience.idles[-1]
-        assert held == bench.audience.samples[-1][1]
+        assert bench.output.phases[-1].startswith("fault: stopped at t = ")
+        bench.until(lambda: bench.output.idles and bench.output.idles[-1][1])
+        held, _, _ = bench.output.idles[-1]
+        assert held == bench.output.samples[-1][1]
         assert not loop.ask(partial(loop.pause, True)).success
         assert not loop.ask(loop.step).success
         assert not loop.ask(partial(loop.set_state, (0.7,) * 3, ZERO)).success
@@ -162,7 +168,7 @@ def test_a_fault_is_latched_until_a_reset():
         assert loop.ask(loop.reset).success
         bench.until(lambda: loop.phase is Phase.RUNNING)
         assert loop.fault == ""
-        bench.until(lambda: bench.audience.acted[-1] == ZERO)  # the command is forgotten
+        bench.until(lambda: bench.output.acted[-1] == ZERO)  # the command is forgotten
 
 
 def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick():
@@ -172,10 +178,10 @@ def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick():
         bench.until(lambda: loop.phase is Phase.FAULT)
         ticks, last = loop.simulation.time_ns // 1_000_000, loop.simulation.state
     assert ticks % 100 and "gamma_1 > 1.570796 rad" in loop.fault
-    assert bench.audience.acted == [(50.0, 0.0, 0.0)] * ticks
+    assert bench.output.acted == [(50.0, 0.0, 0.0)] * ticks
     assert loop.counters.ticks == ticks
     assert stamps(bench)[-1] == stamps(bench)[0] + ticks * 1_000_000
-    assert bench.audience.samples[-1][1] == last
+    assert bench.output.samples[-1][1] == last
 
 
 def test_set_state_is_checked():
@@ -203,7 +209,7 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
 
     bench = Bench(build=Broken)
     with bench.running() as loop:
-        bench.until(lambda: len(bench.audience.samples) > 2)
+        bench.until(lambda: len(bench.output.samples) > 2)
         loop.simulation.broken = True
         bench.until(lambda: loop.phase is Phase.FAULT)
         assert "boom" in loop.fault
@@ -216,11 +222,12 @@ def test_lockstep_times_out_into_a_fault():
     bench = Bench(sync="lockstep", lockstep_timeout=0.05)
     with bench.running() as loop:
         bench.stamped.append(answer(0))
-        bench.until(lambda: bench.audience.samples)
+        bench.until(lambda: bench.output.samples)
         bench.stamped.append(answer(stamps(bench)[0]))
         bench.until(lambda: loop.phase is Phase.FAULT)
-        assert "no command answered the sample of 1002000000 ns within 0.05 s" in loop.fault
-        assert len(bench.audience.acted) == 2
+        last = stamps(bench)[-1]
+        assert f"no command answered the sample of {last} ns within 0.05 s" in loop.fault
+        assert len(bench.output.acted) == 2
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.0])
@@ -228,7 +235,7 @@ def test_requests_do_not_put_off_the_timeout_in_lockstep(factor):
     bench = Bench(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
     with bench.running() as loop:
         bench.stamped.append(answer(0))
-        bench.until(lambda: bench.audience.samples)
+        bench.until(lambda: bench.output.samples)
         began = time.monotonic()
 
         def asked():
@@ -244,12 +251,105 @@ def test_a_pause_does_not_count_as_waiting_for_an_answer():
     bench = Bench(sync="lockstep", lockstep_timeout=0.3)
     with bench.running() as loop:
         bench.stamped.append(answer(0))
-        bench.until(lambda: bench.audience.samples)
+        bench.until(lambda: bench.output.samples)
         loop.ask(partial(loop.pause, True))
         time.sleep(0.4)
         loop.ask(partial(loop.pause, False))
         bench.stamped.append(answer(stamps(bench)[0]))
-        bench.until(lambda: len(bench.audience.samples) > 1)
+        bench.until(lambda: len(bench.output.samples) > 1)
+
+
+def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
+    class Stuck(Simulation):
+        stuck = threading.Event()
+        released = threading.Event()
+
+        def steps(self, *args):
+            while self.stuck.is_set() and not self.released.is_set():
+                pass
+            super().steps(*args)
+
+    bench = Bench(build=Stuck)
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.output.samples) > 2)
+        bench.loop.simulation.stuck.set()
+        began = time.monotonic()
+
+        def watched():
+            loop.watch()
+            time.sleep(0.02)
+            return loop.phase is Phase.FAULT
+
+        bench.until(watched)
+        assert bench.output.phases[-1].startswith("fault: a step has not ended after")
+        asked = time.monotonic()
+        assert loop.ask(loop.reset) == (False, f"not done: {loop.fault}")
+        assert time.monotonic() - asked < 0.5
+        assert asked - began < 5.0  # 0.4 s of its processor time, on a busy machine
+        loop.simulation.released.set()
+        bench.until(lambda: bench.output.idles and bench.output.idles[-1][1])
+        assert loop.ask(loop.reset).success  # what could not be done has been forgotten
+        bench.until(lambda: loop.phase is Phase.RUNNING)
+
+
+def test_a_fault_ends_a_run_with_a_duration():
+    bench = Bench(scene="example2", duration=10.0, wait_for_command=True)
+    bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
+    bench.loop.run()
+    assert bench.loop.phase is Phase.FAULT and bench.loop.failed
+    assert "gamma_1 > 1.570796 rad" in bench.loop.fault
+
+
+def test_it_waits_for_subscribers_and_no_longer_than_allowed():
+    bench = Bench(duration=0.01, wait_for_subscribers=("joint_states",))
+    bench.output.missing = ["/joint_states"]
+    with bench.running() as loop:
+        bench.until(lambda: len(bench.output.idles) > 2)
+        assert loop.phase is Phase.WAITING
+        bench.output.missing = []
+        bench.until(lambda: loop.phase is Phase.FINISHED)
+    bench = Bench(wait_for_subscribers=("joint_states",), subscriber_timeout=0.2)
+    bench.output.missing = ["/joint_states"]
+    bench.loop.run()
+    assert bench.loop.failed
+    assert "no subscriber of /joint_states within 0.2 s" in bench.loop.fault
+
+
+def test_states_that_are_no_samples_have_the_time_at_which_they_hold():
+    bench = Bench(wait_for_command=True, real_time_factor=1.0)
+
+    def idle_stamps():
+        return [stamp for _, _, stamp in bench.output.idles]
+
+    with bench.running() as loop:
+        bench.until(lambda: len(idle_stamps()) > 1)
+        bench.output.now += 5
+        bench.until(lambda: idle_stamps()[-1] == bench.output.now)
+        bench.queue.append(Box(data=(0.0, 0.0, 0.0)))
+        bench.until(lambda: len(bench.output.samples) > 3)
+        assert stamps(bench)[0] > max(idle_stamps())
+        loop.ask(partial(loop.pause, True))
+        shown = len(idle_stamps())
+        bench.until(lambda: len(idle_stamps()) > shown)
+        assert idle_stamps()[-1] == stamps(bench)[-1]  # samples will follow it
+        loop.ask(loop.reset)
+        bench.output.now += 10**9
+        bench.until(lambda: idle_stamps()[-1] == bench.output.now)
+    assert idle_stamps() == sorted(idle_stamps())
+
+
+@pytest.mark.parametrize(("of_the_run_before", "starts"), [(True, False), (False, True)])
+def test_after_a_reset_a_late_answer_does_not_start_the_run(of_the_run_before, starts):
+    bench = Bench(sync="lockstep")
+    with bench.running() as loop:
+        bench.stamped.append(answer(0))
+        bench.until(lambda: bench.output.samples)
+        loop.ask(loop.reset)
+        shown = bench.output.idles[-1][2]
+        bench.stamped.append(answer(stamps(bench)[-1] if of_the_run_before else shown))
+        bench.until(lambda: not bench.stamped)
+        time.sleep(0.05)
+        assert (len(stamps(bench)) > 1) == starts
 
 
 def test_requests_after_the_end_are_refused():
@@ -272,9 +372,9 @@ def test_simulation_interfaces_are_the_same_machine():
         assert answers.step(Box(steps=1), response()).result.result == 4
         assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 1
         assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 101
-        before = len(bench.audience.samples)
+        before = len(bench.output.samples)
         assert answers.step(Box(steps=3), response()).result.result == 1
-        assert len(bench.audience.samples) == before + 3
+        assert len(bench.output.samples) == before + 3
         assert answers.reset(Box(scope=1), response()).result.result == 0
         assert answers.reset(Box(scope=255), response()).result.result == 1
         assert answers.get_state(None, response()).state.state == 0

@@ -10,8 +10,8 @@ from sst_ros import scene
 from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
-from sst_ros.runtime.controller_node_settings import CompanionParameters
-from sst_ros.runtime.trajectory_following import Pursuit, Stage
+from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
+from sst_ros.runtime.trajectory_following import TrajectoryFollower, Stage
 from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Initial
 from sst_ros.simulation import Simulation
@@ -27,42 +27,42 @@ def seen(state):
 
 
 def test_it_follows_holds_and_ends_with_zero_torque():
-    pursuit = Pursuit(MODEL, CompanionParameters(hold=0.01, feedforward_at="middle"))
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(hold=0.01, feedforward_at="middle"))
     simulation = Simulation(MODEL)
-    assert pursuit.stage is Stage.READY and pursuit.judged() is None
-    first = pursuit.preview(seen(simulation.state))
+    assert follower.stage is Stage.READY and follower.tracking() is None
+    first = follower.preview(seen(simulation.state))
     stages, commands = [], []
     for k in range(40):
-        command = pursuit.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
+        command = follower.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
         if command is None:
             break
-        stages.append(pursuit.stage)
+        stages.append(follower.stage)
         commands.append(command)
         simulation.step(command.torque, PERIOD_NS)
     assert commands[0].torque == first.torque
     assert stages == [Stage.FOLLOWING] * 25 + [Stage.HOLDING] * 5 + [Stage.ENDED]
-    assert commands[-1].torque == (0.0, 0.0, 0.0) and pursuit.samples == 31
-    judged = pursuit.judged()
+    assert commands[-1].torque == (0.0, 0.0, 0.0) and follower.samples == 31
+    judged = follower.tracking()
     assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / BAND
-    assert pursuit.largest == judged.largest.max()
-    assert pursuit.rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
+    assert follower.largest == judged.largest.max()
+    assert follower.rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
 
 
 def test_samples_that_come_twice_or_late_are_told_apart():
-    pursuit = Pursuit(MODEL, CompanionParameters())
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
     here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
-        assert (pursuit.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
-    assert (pursuit.samples, pursuit.irregular) == (3, 1)
+        assert (follower.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
+    assert (follower.samples, follower.irregular) == (3, 1)
 
 
 def test_a_reset_of_the_simulator_begins_the_motion_anew():
-    pursuit = Pursuit(MODEL, CompanionParameters(mode="pd", integral_rate=1.0))
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(mode="pd", integral_rate=1.0))
     here = Measurement(tuple(np.add(MODEL.initial.gamma, 0.01)), (0.0, 0.0, 0.0))
-    told = [pursuit.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
-    pursuit.anew()
-    assert pursuit.stage is Stage.READY and pursuit.judged() is None
-    again = [pursuit.answer(START_NS + (100 + k) * PERIOD_NS, here) for k in range(5)]
+    told = [follower.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
+    follower.restart()
+    assert follower.stage is Stage.READY and follower.tracking() is None
+    again = [follower.answer(START_NS + (100 + k) * PERIOD_NS, here) for k in range(5)]
     assert [one.torque for one in again] == [one.torque for one in told]
 
 
@@ -83,7 +83,7 @@ def test_a_reset_of_the_simulator_begins_the_motion_anew():
 )  # fmt: skip
 def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason):
     with pytest.raises(SstError, match=reason):
-        Pursuit(dataclasses.replace(MODEL, **model), CompanionParameters(**settings))
+        TrajectoryFollower(dataclasses.replace(MODEL, **model), ControllerNodeParameters(**settings))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason
 )
 def test_bad_parameters_are_refused(given):
     with pytest.raises(InputError):
-        CompanionParameters(**given)
+        ControllerNodeParameters(**given)
 
 
 def test_it_begins_only_near_the_start_of_the_motion():
@@ -108,18 +108,18 @@ def test_it_begins_only_near_the_start_of_the_motion():
         MODEL, initial=Initial(gamma=tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0))))
     )
     state = Simulation(off).state
-    near = CompanionParameters(start_tolerance=0.07)
-    assert Pursuit(MODEL, near).answer(START_NS, seen(state)) is not None
+    near = ControllerNodeParameters(start_tolerance=0.07)
+    assert TrajectoryFollower(MODEL, near).answer(START_NS, seen(state)) is not None
     for ask in (lambda p: p.preview(seen(state)), lambda p: p.answer(START_NS, seen(state))):
         with pytest.raises(InputError, match="where the motion begins"):
-            ask(Pursuit(MODEL, CompanionParameters()))
+            ask(TrajectoryFollower(MODEL, ControllerNodeParameters()))
 
 
 def test_what_is_not_finite_is_nowhere_near():
-    pursuit = Pursuit(MODEL, CompanionParameters())
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
     here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="where the motion begins"):
-        pursuit.preview(dataclasses.replace(here, gamma=(np.nan,) * 3))
-    pursuit.answer(START_NS, here)
+        follower.preview(dataclasses.replace(here, gamma=(np.nan,) * 3))
+    follower.answer(START_NS, here)
     with pytest.raises(ControlStopped, match="must be finite"):
-        pursuit.answer(START_NS + PERIOD_NS, dataclasses.replace(here, gamma_dot=(np.nan,) * 3))
+        follower.answer(START_NS + PERIOD_NS, dataclasses.replace(here, gamma_dot=(np.nan,) * 3))

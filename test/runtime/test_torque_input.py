@@ -9,7 +9,7 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, CommandBoard, Refused, named
+from sst_ros.runtime.torque_input import ZERO, MessageRefused, TorqueInput, by_name
 from sst_ros.scene.scene import Actuators
 from sst_ros.simulation import Simulation
 
@@ -32,7 +32,7 @@ class Bench:
             lambda queue=queue: queue.pop(0) if queue else None
             for queue in (self.commands, self.stamped, self.moments)
         ]
-        self.board = CommandBoard(self, actuators, *takes)
+        self.board = TorqueInput(self, actuators, *takes)
         self.moving = Simulation(load_scene("example1"))
 
     def torque(self):
@@ -41,7 +41,7 @@ class Bench:
 
 def test_what_comes_while_the_node_starts_is_not_lost():
     bench = Bench(commands=[array(1.0, 2.0, 3.0), array(1.0)])
-    assert bench.board.look()
+    assert bench.board.starts_run()
     assert (bench.board.received, bench.board.dropped) == (1, 1)
     assert bench.torque() == (1.0, 2.0, 3.0)
 
@@ -74,8 +74,8 @@ def test_names_may_come_in_any_order():
     ],
 )
 def test_wrong_names_sizes_and_values_are_refused(names, effort, kind):
-    with pytest.raises(Refused) as caught:
-        named(names, effort, "torques [N m] in effort")
+    with pytest.raises(MessageRefused) as caught:
+        by_name(names, effort, "torques [N m] in effort")
     assert caught.value.kind == kind
 
 
@@ -106,12 +106,12 @@ def test_damping_takes_over_within_the_limit():
     bench = Bench(Actuators(torque_limit=0.5, idle_damping=2.0), command_timeout=0.5)
     bench.commands.append(array(0.1, 0.1, 0.1))
     bench.torque()
-    assert not bench.board.brakes
+    assert not bench.board.depends_on_state
     bench.board._since -= 1.0
     rates = bench.moving.state.joints.gamma_dot
     expected = tuple(min(max(-2.0 * rate, -0.5), 0.5) for rate in rates)
     assert any(rates) and bench.torque() == expected
-    assert bench.board.brakes  # by the rates of this tick, so for no more than this tick
+    assert bench.board.depends_on_state  # by the rates of this tick, so for no more than this tick
 
 
 def test_limits_clamp_and_count():
@@ -141,9 +141,9 @@ def test_lockstep_wants_the_stamp():
 
 def test_lockstep_begins_at_the_answer_to_a_preview():
     bench = Bench(sync="lockstep")
-    assert not bench.board.look()
+    assert not bench.board.starts_run()
     bench.stamped.append(stamped(0, [0, 0, 0]))
-    assert bench.board.look()
+    assert bench.board.starts_run()
 
 
 def test_clear_forgets_what_has_arrived():
