@@ -58,7 +58,12 @@ class Described(NamedTuple):
 NODES = (
     Described("simulator", SIMULATOR, SimulatorParameters, topics.SIMULATOR),
     Described("torque_player", "sst_torque_player", PlayerParameters, topics.PLAYER),
-    Described("inverse_dynamics", "sst_inverse_dynamics", ControllerNodeParameters, topics.INVERSE_DYNAMICS),
+    Described(
+        "inverse_dynamics",
+        "sst_inverse_dynamics",
+        ControllerNodeParameters,
+        topics.INVERSE_DYNAMICS,
+    ),
     Described("recorder", "sst_recorder", RecorderParameters, topics.RECORDER),
     Described("viewer", "sst_viewer", ViewerParameters, topics.VIEWER),
 )
@@ -90,7 +95,9 @@ def filled(text: str) -> str:
     for name, part in tables().items():
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
         pattern = re.escape(begin) + ".*?" + re.escape(end)
-        text, count = re.subn(pattern, f"{begin}\n{part}{end}".replace("\\", r"\\"), text, flags=re.S)
+        text, count = re.subn(
+            pattern, f"{begin}\n{part}{end}".replace("\\", r"\\"), text, flags=re.S
+        )
         if count != 1:
             raise ValueError(f"the text has {count} parts {name}")
     return text

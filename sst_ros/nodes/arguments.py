@@ -12,6 +12,7 @@ import json
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -212,7 +213,7 @@ def _faults(line: CommandLine, ros: Sequence[str], known: dict[str, Spec]) -> It
 
 
 def _values(ros: Sequence[str], names: Sequence[str]) -> list[str]:
-    return [value for word, value in zip(ros, ros[1:], strict=False) if word in names]
+    return [value for word, value in pairwise(ros) if word in names]
 
 
 def _document(path: str) -> Any:

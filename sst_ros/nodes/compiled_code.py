@@ -18,7 +18,7 @@ from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene
 
 _DELAY_S = 5.0
-"""Time from the start of the node to that of the compiler: the first seconds of a run are its own."""
+"""Delay of the compiler: the first seconds of a real-time run have the processor alone."""
 
 
 class CodeCompiler:

@@ -22,7 +22,7 @@ def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str
 
 
 def namesakes(node: Node) -> int:
-    """Number of other nodes with the same full name."""
+    """Count other nodes with the same full name."""
     own = node.get_fully_qualified_name()
     found = node.get_node_names_and_namespaces()
     return sum(full_name(namespace, name) == own for name, namespace in found) - 1

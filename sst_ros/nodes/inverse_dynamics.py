@@ -42,7 +42,7 @@ KEYS = {
 
 
 class InverseDynamicsController:
-    """Worker of the process `inverse_dynamics`: messages and time; `TrajectoryFollower` does the work."""
+    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`."""
 
     def __init__(self) -> None:
         self.node = Node("sst_inverse_dynamics")

@@ -38,7 +38,7 @@ class SimulatorTopics:
     """Publishers of the simulator.
 
     Raises:
-        InputError: /clock has another publisher, or wait_for_subscribers names no topic of the node.
+        InputError: /clock has another publisher, or wait_for_subscribers names another node's topic.
 
     """
 

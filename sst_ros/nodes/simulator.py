@@ -98,9 +98,7 @@ class Simulator:
     def _build(self, simulated: Scene) -> Simulation:
         given = self.parameters
         compiled = self._code is not None and self._code.available
-        return Simulation(
-            simulated, given.integrator, tolerance=given.tolerance, compiled=compiled
-        )
+        return Simulation(simulated, given.integrator, tolerance=given.tolerance, compiled=compiled)
 
     def _create_pacer(self) -> Pacer:
         given = self.parameters
@@ -168,7 +166,7 @@ class Simulator:
 
 
 def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
-    """The scene's duration as the default of the parameter; faults of the scene are found later."""
+    """Return the scene's duration as a default; faults of the scene are reported later."""
     try:
         simulated = scene.load(given.get("scene", SimulatorParameters().scene))
     except (InputError, TypeError):

@@ -73,7 +73,11 @@ JOINT_STATES = Endpoint(
     depth=0,
 )
 ORIENTATION = Endpoint(
-    PUBLISHES, "~/orientation", QuaternionStamped, "orientation of {E} in {B}, frame_id `base_link`", depth=0
+    PUBLISHES,
+    "~/orientation",
+    QuaternionStamped,
+    "orientation of {E} in {B}, frame_id `base_link`",
+    depth=0,
 )
 EULER_ZYZ = Endpoint(
     PUBLISHES, "~/euler_zyz", Vector3Stamped, "the same as ZYZ angles theta, phi, psi [rad]", 0
@@ -95,7 +99,9 @@ PHASE = Endpoint(
     depth=1,
     latched=True,
 )
-DIAGNOSTICS = Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the run, at 1 Hz")
+DIAGNOSTICS = Endpoint(
+    PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the run, at 1 Hz"
+)
 CLOCK = Endpoint(
     PUBLISHES, "/clock", Clock, "simulated time", depth=1, when="publish_clock is true"
 )
@@ -227,7 +233,9 @@ INVERSE_DYNAMICS = (
     REFERENCE,
     TRACKING_ERROR,
     Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the control, at 1 Hz"),
-    Endpoint(SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1),
+    Endpoint(
+        SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1
+    ),
     Endpoint(
         SUBSCRIBES,
         "{simulator}/phase",

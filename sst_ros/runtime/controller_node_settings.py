@@ -16,9 +16,7 @@ from sst_ros.simulation import NANOSECONDS
 class ControllerNodeParameters(ControllerSettings):
     """Parameters of sst_inverse_dynamics."""
 
-    scene: str = text(
-        "scene of the controller's model, by name or by path", default="reach"
-    )
+    scene: str = text("scene of the controller's model, by name or by path", default="reach")
     motion: str = choice(
         "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until it is "
         "stopped",
@@ -54,7 +52,7 @@ class ControllerNodeParameters(ControllerSettings):
         "subscribers of the commands to wait for", "1", default=1, least=1, most=100
     )
     wait_for_recorder: bool = flag(
-        "start when ~/reference and ~/tracking_error have subscribers, too, so that a recording is complete",
+        "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",
         default=False,
     )
     timeout: float = number(

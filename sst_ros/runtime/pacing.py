@@ -69,7 +69,7 @@ class Pacer:
             self._anchor += max(0, self._late(self._source.now_ns(), ticks))
 
     def _late(self, now: int, ticks: int) -> int:
-        """Return the time from the last of the next ticks to now [ns]; negative if it is to come."""
+        """Return the time from the last of the next ticks to now [ns]; negative before it."""
         interval = self._period_ns / self.speed
         return now - self._anchor - round((self._count + ticks - 1) * interval)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes: descriptors, checks, --help and the tables of the docs come from here."""
+"""Parameters of the nodes: source of descriptors, checks, --help and the tables of the docs."""
 
 from __future__ import annotations
 
@@ -57,9 +57,7 @@ class SimulatorParameters(Section):
     publish_clock: bool = flag(
         "publish the simulated time on /clock; refused where there is a clock", default=False
     )
-    publish_description: bool = flag(
-        "publish the scene as URDF on robot_description", default=True
-    )
+    publish_description: bool = flag("publish the scene as URDF on robot_description", default=True)
     wait_for_subscribers: tuple[str, ...] = texts(
         "topics of the node, such as joint_states or ~/orientation, that must have a subscriber "
         "before the run starts",

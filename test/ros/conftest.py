@@ -166,7 +166,7 @@ class Observer:
 
     @staticmethod
     def stamp(message):
-        """Of a sample [ns]; 0 for a state that is shown before the run, in a pause or in a fault."""
+        """Of a sample [ns]; 0 for a state before the run, in a pause or in a fault."""
         if message.header.frame_id == IDLE_FRAME_ID:
             return 0
         return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec

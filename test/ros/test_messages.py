@@ -21,6 +21,8 @@ from sst_ros.nodes.messages import (
     StateMessages,
     TorqueLog,
     clock_message,
+)
+from sst_ros.nodes.messages import (
     zyz_angles as angles_of,
 )
 from sst_ros.scene.loads import JOINTS
@@ -39,7 +41,8 @@ def state():
 def stamped(messages, stamp_ns):
     """joint_states, orientation, euler_zyz."""
     return [
-        message.stamped(stamp_ns) for message in (messages.joints, messages.orientation, messages.euler)
+        message.stamped(stamp_ns)
+        for message in (messages.joints, messages.orientation, messages.euler)
     ]
 
 

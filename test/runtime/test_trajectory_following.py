@@ -11,7 +11,7 @@ from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
-from sst_ros.runtime.trajectory_following import TrajectoryFollower, Stage
+from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Initial
 from sst_ros.simulation import Simulation
@@ -27,7 +27,9 @@ def seen(state):
 
 
 def test_it_follows_holds_and_ends_with_zero_torque():
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(hold=0.01, feedforward_at="middle"))
+    follower = TrajectoryFollower(
+        MODEL, ControllerNodeParameters(hold=0.01, feedforward_at="middle")
+    )
     simulation = Simulation(MODEL)
     assert follower.stage is Stage.READY and follower.tracking() is None
     first = follower.preview(seen(simulation.state))
@@ -83,7 +85,9 @@ def test_a_reset_of_the_simulator_begins_the_motion_anew():
 )  # fmt: skip
 def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason):
     with pytest.raises(SstError, match=reason):
-        TrajectoryFollower(dataclasses.replace(MODEL, **model), ControllerNodeParameters(**settings))
+        TrajectoryFollower(
+            dataclasses.replace(MODEL, **model), ControllerNodeParameters(**settings)
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command lines, warnings of the graph, signals, and ends of real nodes."""
+
+import json
+import signal
+import time
+
+import pytest
+import yaml
+from geometry_msgs.msg import QuaternionStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+
+from sst_ros import load_scene
+from sst_ros.scene.yaml_document import dump
+
+pytestmark = pytest.mark.ros
+NODE = "/sst_simulator"
+NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
+
+
+def ended(process, timeout=20):
+    out, err = process.communicate(timeout=timeout)
+    assert "Traceback" not in err
+    return process.returncode, out, err
+
+
+@pytest.mark.parametrize("command", NODES)
+def test_help_starts_nothing(nodes, tmp_path, command):
+    process = nodes.start(command, "--help")
+    status, out, _ = ended(process)
+    assert status == 0 and f"usage: {command}" in out and "default:" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--scen", "friction"], "did you mean --scene?"),
+        (["--scene", "nosuchscene"], "must be a readable .yaml file or one of"),
+        (["--bogus"], "is no option"),
+        (["--ros-args", "-p", "nonexist:=1"], "is no parameter of the node"),
+        (["--ros-args", "--params-file", __file__], "must be a parameter file"),
+    ],
+)
+def test_unknown_arguments_are_refused(nodes, words, said):
+    status, _, err = ended(nodes.start("simulator", *words))
+    assert status in (1, 2)
+    assert said in err
+
+
+def test_an_unknown_parameter_of_a_file_is_refused(nodes, tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_text("/**: {ros__parameters: {sceen: friction, csv: foreign}}\n")
+    status, _, err = ended(nodes.start("simulator", "--ros-args", "--params-file", str(path)))
+    assert status == 1
+    assert "did you mean scene?" in err and "csv = " not in err
+
+
+def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(nodes, observer):
+    scene = observer.listen(String, f"{NODE}/scene", latched=True)
+    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.2")
+    observer.until(lambda: scene, "the scene")
+    assert "name: fast_spin" in scene[0].data
+    assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
+    assert ended(process)[0] == 0
+
+
+def test_a_fault_ends_a_run_with_a_duration(nodes, observer):
+    process = nodes.run("simulator", duration=100.0, wait_for_command=True)
+    commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    commands.publish(Float64MultiArray(data=[50.0, 0.0, 0.0]))
+    status, _, err = ended(process)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("simulator: stopped at t = ")
+
+
+def test_a_run_waits_for_subscribers(nodes, observer):
+    phases = observer.listen(String, f"{NODE}/phase", latched=True)
+    nodes.run("simulator", wait_for_subscribers="[joint_states, '~/orientation']")
+    observer.until(lambda: phases, "a phase")
+    states = observer.listen(JointState, "/joint_states")
+    observer.until(lambda: len(states) > 5, "states")
+    assert {message.data for message in phases} == {"waiting"}
+    observer.listen(QuaternionStamped, f"{NODE}/orientation")
+    observer.until(lambda: phases[-1].data == "running", "the run")
+
+
+@pytest.mark.parametrize(
+    ("topics", "said"),
+    [
+        ("[joint_states]", "no subscriber of /joint_states within 0.5 s"),
+        ("[elsewhere]", "must be topics that the node publishes: "),
+    ],
+)
+def test_a_run_that_nobody_records_ends(nodes, topics, said):
+    given = {"wait_for_subscribers": topics, "subscriber_timeout": 0.5}
+    status, _, err = ended(nodes.run("simulator", **given))
+    assert status == 1
+    assert said in err.splitlines()[-1]
+
+
+def test_what_keeps_commands_and_clocks_away_is_named(nodes, observer):
+    process = nodes.run("simulator", use_sim_time=True)
+    qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    observer.node.create_publisher(Float64MultiArray, f"{NODE}/commands", qos)
+    other = nodes.run("simulator")
+    wanted = ("of /observer is best effort", "there is no /clock", "another node is named")
+    observer.told("phase", lambda phase: True)
+    heard = observer.heard["/diagnostics"]
+    for words in wanted:
+        observer.until(
+            lambda words=words: any(words in one.status[0].message for one in heard), words
+        )
+    assert nodes.stop(other)[0] == 0
+    status, _, err = nodes.stop(process)
+    assert status == 0
+    for words in wanted:
+        assert err.count(words) >= 1
+
+
+@pytest.mark.parametrize("delay", [0.2, 0.4, 0.6, 0.8, 1.0, 1.5])
+def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, delay):
+    process = nodes.start("simulator", "--duration", "0")
+    time.sleep(delay)  # a moment of the start, before or behind our first line
+    status, _, err = nodes.stop(process, signal.SIGINT)
+    if "KeyboardInterrupt" in err or status < 0:
+        assert "sst_ros" not in err  # the interpreter itself was starting
+    else:
+        assert (status, "Traceback" in err) == (0, False)
+
+
+def stiff_scene(tmp_path):
+    """One step of 1 ms takes a minute without a budget."""
+    scene = yaml.safe_load(dump(load_scene("example2")))
+    scene["star"]["inertia"] = {"xx": 1.0, "yy": 1.0, "zz": 1e-12}
+    for links in ("actuated_links", "intermediate_links"):
+        scene[links] = [{}]
+    for ends in ("stroke", "workspace"):
+        scene[ends] = {"at_end" if ends == "stroke" else "at_edge": "ignore"}
+    path = tmp_path / "stiff.yaml"
+    path.write_text(json.dumps(scene))  # without aliases
+    return path
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_step_that_does_not_end_is_a_fault_and_the_node_ends(nodes, observer, tmp_path, number):
+    process = nodes.run("simulator", scene=stiff_scene(tmp_path), wait_for_command=True)
+    commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    observer.told("phase", "waiting")
+    phases = observer.listen(String, f"{NODE}/phase", latched=True)
+    commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
+    began = time.monotonic()
+    observer.until(lambda: phases and phases[-1].data.startswith("fault"), "the fault")
+    faulted = time.monotonic() - began
+    asked = time.monotonic()
+    reply = observer.call(SetBool, f"{NODE}/pause", data=True)
+    assert not reply.success
+    observer.call(Trigger, f"{NODE}/reset")
+    answered = time.monotonic() - asked
+    stopped = time.monotonic()
+    status, _, err = nodes.stop(process, number)
+    assert status == 0 and "Traceback" not in err
+    # Twice what is promised on an idle machine.
+    assert (faulted < 4.0, answered < 4.0, time.monotonic() - stopped < 5.0) == (True,) * 3
