@@ -38,7 +38,7 @@ class SimulatorTopics:
     """Publishers of the simulator.
 
     Raises:
-        InputError: /clock has another publisher, or wait_for_subscribers names another node's topic.
+        InputError: /clock has another publisher; wait_for_subscribers names a foreign topic.
 
     """
 
