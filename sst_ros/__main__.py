@@ -6,10 +6,16 @@ from __future__ import annotations
 
 import sys
 
+from sst_ros.nodes import signals
+
+NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command or a node; return the exit status."""
     given = sys.argv[1:] if arguments is None else arguments
+    if given and given[0] in NODES:
+        signals.handle()
     try:
         from sst_ros.cli.main import run
     except KeyboardInterrupt:

@@ -16,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from sst_ros.child_process import orphaned
 from sst_ros.errors import InputError, SstError
-from sst_ros.nodes import arguments, entry, middleware
+from sst_ros.nodes import arguments, middleware, signals
 
 _SPIN_PERIOD_S = 0.1
 """Longest delay of a signal; to spin once takes half a millisecond, asked for or not."""
@@ -47,7 +47,7 @@ def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None =
         The exit status: 0, 1 for a failure, 2 for arguments that are refused.
 
     """
-    entry.handle_signals()
+    signals.handle()
     given = list(sys.argv if words is None else words)[1:]
     if arguments.wants_help(given):
         print(arguments.help_text(command))
@@ -63,7 +63,7 @@ def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None =
         print(text if text.startswith(command) else f"{command}: {text}", file=sys.stderr)
         return 2
     try:
-        if not entry.stop.is_set():
+        if not signals.stop.is_set():
             _spin(build)
     except (SstError, ParameterException) as error:
         print(f"{command}: {error}", file=sys.stderr)
@@ -78,7 +78,7 @@ def _spin(build: Callable[[], Worker]) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(worker.node)
     try:
-        while not (entry.stop.is_set() or worker.done.is_set() or orphaned()):
+        while not (signals.stop.is_set() or worker.done.is_set() or orphaned()):
             executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
     finally:
         try:

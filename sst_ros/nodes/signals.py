@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGINT and SIGTERM of a node, handled before what takes time to import."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+stop = threading.Event()
+"""Set by SIGINT or SIGTERM."""
+
+
+def handle() -> None:
+    """Have SIGINT and SIGTERM end the node in order, also while it starts."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
