@@ -86,11 +86,11 @@ class Nodes:
             given.setdefault("duration", 0.0)
         return self.start(command, "--ros-args", *child_process.words(given))
 
-    def line(self, process, timeout=20):
+    def line(self, process, timeout=40):
         assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"
         return process.stdout.readline()
 
-    def stop(self, process, number=signal.SIGINT, timeout=15):
+    def stop(self, process, number=signal.SIGINT, timeout=40):
         process.send_signal(number)
         out, err = process.communicate(timeout=timeout)
         return process.returncode, out, err
@@ -132,7 +132,7 @@ class Observer:
         self.until(lambda: publisher.get_subscription_count() >= readers, f"readers of {topic}")
         return publisher
 
-    def until(self, condition, what, timeout=20.0):
+    def until(self, condition, what, timeout=40.0):
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, f"no {what} within {timeout} s"
@@ -151,7 +151,7 @@ class Observer:
         reply = self.call(SetParameters, f"{node}/set_parameters", parameters=[parameter])
         return reply.results[0]
 
-    def told(self, key, value, timeout=20.0):
+    def told(self, key, value, timeout=40.0):
         """Wait until the diagnostics say so; return all that they say then."""
         heard = self.heard.get("/diagnostics")
         if heard is None:

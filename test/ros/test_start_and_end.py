@@ -21,7 +21,7 @@ NODE = "/sst_simulator"
 NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
 
 
-def ended(process, timeout=20):
+def ended(process, timeout=40):
     out, err = process.communicate(timeout=timeout)
     assert "Traceback" not in err
     return process.returncode, out, err
