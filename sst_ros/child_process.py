@@ -42,6 +42,6 @@ def words(given: dict[str, object]) -> list[str]:
 
 
 def orphaned() -> bool:
-    """Tell whether the process without which this one is to end has ended."""
+    """Return whether the process that started this one, and without which it ends, has ended."""
     parent = os.environ.get(PARENT)
     return parent is not None and os.getppid() != int(parent)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demos: runs through real nodes, recorded, and judged from the recording."""
+"""The demos: runs through real nodes, recorded, and evaluated from the recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _END_S = 30.0
 
 
 def demo(out: Path) -> int:
-    """Run both examples into `out`; return 0 if both were recorded and judged.
+    """Run both examples into `out`; return 0 if both were recorded and evaluated.
 
     Example 2 is the main job and lies in `out` itself, Example 1 in `out`/example1.
     """
@@ -45,13 +45,13 @@ def demo(out: Path) -> int:
 
 
 def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -> int:
-    """Follow a scene's motion in lockstep, a run for each mode, and judge how well.
+    """Follow a scene's motion in lockstep, a run for each mode, and evaluate the tracking.
 
     The first of the default modes is the paper's double check: nothing but the torques of the
     inverse dynamics. Each run lies in `out`/mode.
 
     Raises:
-        SstError: the scene's motion is refused, or a node failed; says which.
+        SstError: the scene's motion is refused, or a node failed; names it.
 
     """
     seconds = reference_motion(scene.load(name)).duration + HOLD_S
@@ -64,10 +64,10 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
 
 
 def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
-    """Have the companion follow a scene's motion for some time [s], and record the run.
+    """Have the controller node follow a scene's motion for some time [s], and record the run.
 
     Raises:
-        SstError: a node failed or did not end in time; says which.
+        SstError: a node failed or did not end in time; names it.
 
     """
     run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
@@ -75,8 +75,8 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
         followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
         followed |= {"stamped": True, "feedforward_at": "middle"}
         waits = {"wait_for_subscribers": 2, "wait_for_recorder": True}
-        with _node("inverse_dynamics", **followed, **waits) as companion:
-            _wait_for_end("inverse_dynamics", companion, 20.0 * seconds + _END_S)
+        with _node("inverse_dynamics", **followed, **waits) as controller:
+            _wait_for_end("inverse_dynamics", controller, 20.0 * seconds + _END_S)
 
 
 def record(name: str, bag: Path) -> None:
@@ -85,7 +85,7 @@ def record(name: str, bag: Path) -> None:
     It goes by the clock, and in lockstep: to the same bits however busy the machine is.
 
     Raises:
-        SstError: a node failed or did not end in time; says which.
+        SstError: a node failed or did not end in time; names it.
 
     """
     duration = scene.load(name).duration or 1.0
@@ -109,7 +109,7 @@ def _recorded(bag: Path, **run: object) -> Iterator[None]:
 
 
 def _room(folder: Path) -> Path:
-    """Make room for a bag; one of an earlier demo gives way."""
+    """Return the folder of a bag, without that of an earlier demo."""
     bag = folder / "bag"
     if bag.exists():
         shutil.rmtree(bag)
@@ -132,12 +132,12 @@ def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
 def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + _READY_S
     assert recorder.stdout is not None
-    told, printed = recorder.stdout.fileno(), b""
+    output, printed = recorder.stdout.fileno(), b""
     while b"ready" not in printed:
         left = max(0.0, deadline - time.monotonic())
-        more = os.read(told, 4096) if select.select([told], [], [], left)[0] else b""
+        more = os.read(output, 4096) if select.select([output], [], [], left)[0] else b""
         if not more:
-            raise SstError(f"the recorder heard no simulator within {_READY_S:g} s")
+            raise SstError(f"the recorder received nothing from a simulator within {_READY_S:g} s")
         printed += more
 
 

@@ -83,7 +83,7 @@ class AmbiguousAssembly(AssemblyError):
 
 
 class SingularConfiguration(SstError):
-    """A matrix that must be inverted is singular; `measure` is the number that says so."""
+    """A matrix that must be inverted is singular; `measure` is the number that shows it."""
 
     def __init__(self, message: str, measure: float) -> None:
         self.measure = measure
@@ -91,7 +91,7 @@ class SingularConfiguration(SstError):
 
 
 class RunStopped(SstError):
-    """The motion cannot go on; `state` is the last valid one, `time` [s] says when it ended."""
+    """The motion cannot go on; `state` is the last valid one, `time` [s] is when it ended."""
 
     def __init__(self, reason: str, time: float, state: State) -> None:
         self.reason = reason

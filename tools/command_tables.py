@@ -71,8 +71,8 @@ def _commands(of: argparse.ArgumentParser, path: str) -> Iterator[str]:
                 continue
             below = list(_commands(command, f"{path}{name} "))
             if not below:
-                said = helps[name][:1].upper() + helps[name][1:]
-                yield f"## {path}{name}\n\n{said}.\n\n{_arguments(command)}"
+                text = helps[name][:1].upper() + helps[name][1:]
+                yield f"## {path}{name}\n\n{text}.\n\n{_arguments(command)}"
             yield from below
 
 

@@ -14,8 +14,8 @@ def failure(error: BaseException) -> tuple[int, str]:
     message = _message(error)
     if message is not None:
         return (INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED), message
-    said = " ".join(f"{type(error).__name__}: {error}".split())
-    return BUG, f"internal error, please report it with the output of --debug: {said}"
+    bug = " ".join(f"{type(error).__name__}: {error}".split())
+    return BUG, f"internal error, please report it with the output of --debug: {bug}"
 
 
 def _message(error: BaseException) -> str | None:

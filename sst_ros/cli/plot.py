@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
     plot.add_argument("--list", action="store_true", help="list the pictures, and draw none")
     plot.add_argument(
         "--compare", nargs="+", type=Path, default=[], metavar="BAG",
-        help="lay runs on each other, and tell how far they are from the first",
+        help="draw runs over each other, and print their differences from the first",
     )  # fmt: skip
     plot.set_defaults(run=_plot, parser=plot)
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a file is a scene that can start: all that is wrong with it, key by key and line by line.
+"""Validate a scene file: its document, and the assembly at its initial state.
 
-`scene.load` judges the document; whether the manipulator can be assembled at its initial state,
-and where that is written, is judged here.
+`scene.load` checks the document only. Every fault is reported with its key and its line.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`study`: try what cannot be tried on a machine."""
+"""`study`: robustness of controllers to model errors, delay and noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sst_ros.output_folder import require_free
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    kinds = group(commands.add_parser("study", help="controllers against what they have wrong"))
+    kinds = group(commands.add_parser("study", help="robustness of controllers to model errors"))
     feedforward = kinds.add_parser(
         "feedforward",
         help="every mode of control against every error of its model",

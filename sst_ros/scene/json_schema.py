@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The JSON schema of a document, from the same declarations that check it.
 
-Editors complete and check YAML with it; what no schema can say (inertias, angles that must sum to
-360 deg) is left to `read`.
+Editors complete and check YAML with it; what no schema can express (inertias, angles that must sum
+to 360 deg) is left to `read`.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class Gravity(Section):
 
 @dataclass(frozen=True)
 class Moment(Section):
-    """An external moment on the star: constant, or what the topic ~/external_moment says."""
+    """An external moment on the star: constant, or received on the topic ~/external_moment."""
 
     value: Vector | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
     topic: bool = flag("take it from the topic ~/external_moment", default=False)
@@ -217,7 +217,7 @@ class Initial(Section):
         "actuator rates at t = 0", "rad/s", shape=(3,), default=(0.0, 0.0, 0.0)
     )
     orientation: tuple[float, float, float, float] | None = number(
-        "quaternion (x, y, z, w) of {E} in {B} that says which assembly is meant where gamma has "
+        "quaternion (x, y, z, w) of {E} in {B} that selects the assembly mode where gamma has "
         "several admissible ones; within 0.1 rad",
         "1",
         shape=(4,),

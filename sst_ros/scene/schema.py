@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Documents as frozen dataclasses: every field says its unit and bounds, and is held to them.
+"""Documents as frozen dataclasses: every field has a unit and bounds, which are checked.
 
 A class that derives from `Section` is checked whenever it is built, from YAML or from Python.
 Reading a document gives either the object or one `InputError` with every fault and its line.
@@ -41,11 +41,11 @@ class Spec:
     lengths: tuple[int, ...] = ()
 
     def refusal(self, value: object) -> str:
-        """Say what is allowed, and what replaces a choice of an older version."""
+        """Return what is allowed, and what replaces a choice of an older version."""
         return "; ".join([self.allowed(), *(new for old, new in self.replaced if old == value)])
 
     def allowed(self) -> str:
-        """Say in words what is allowed."""
+        """Describe the values that are allowed."""
         if self.kind == "number":
             what = "a finite number" if not self.shape else f"{_size(self.shape)} finite numbers"
             bounds = [
@@ -169,7 +169,7 @@ def accept(spec: Spec, value: Any) -> Any:
         return _numbers(spec, value, spec.shape)
     if spec.kind == "notes" and isinstance(value, (dict, tuple)):
         pairs = value.items() if isinstance(value, dict) else value
-        return tuple((frozen_text(name), frozen_text(said)) for name, said in pairs)
+        return tuple((frozen_text(name), frozen_text(note)) for name, note in pairs)
     if spec.kind == "text":
         return frozen_text(value)
     if spec.kind == "texts" and isinstance(value, (list, tuple)):

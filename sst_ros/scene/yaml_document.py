@@ -141,8 +141,8 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
         name = str(_plain(key_node))
         key = f"{path}.{name}" if path else name
         if name in cls.REMOVED:
-            said = f"line {_line(key_node)}: {key} is ignored: {cls.REMOVED[name]}"
-            warnings.warn(said, FutureWarning, stacklevel=2)
+            message = f"line {_line(key_node)}: {key} is ignored: {cls.REMOVED[name]}"
+            warnings.warn(message, FutureWarning, stacklevel=2)
         elif name not in known:
             allowed = "unknown key; allowed are " + ", ".join(known)
             problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
@@ -190,13 +190,13 @@ def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> 
 def _notes(node: yaml.MappingNode, path: str, problems: list[Problem]) -> dict[str, str]:
     result: dict[str, str] = {}
     for key_node, value_node in node.value:
-        name, said = str(_plain(key_node)), _plain(value_node)
+        name, note = str(_plain(key_node)), _plain(value_node)
         if name in result:
-            problems.append(Problem(f"{path}.{name}", said, "is given twice", _line(key_node)))
+            problems.append(Problem(f"{path}.{name}", note, "is given twice", _line(key_node)))
         try:
-            result[name] = frozen_text(said)
+            result[name] = frozen_text(note)
         except ValueError:
-            problems.append(Problem(f"{path}.{name}", said, "must be text", _line(key_node)))
+            problems.append(Problem(f"{path}.{name}", note, "must be text", _line(key_node)))
     return result
 
 
