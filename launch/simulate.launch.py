@@ -1,64 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulator, and with `play:=true` the torque player of the same scene."""
+"""Start the simulator, and as wanted the player of the scene's torques, a recorder and RViz.
+
+The launch ends with the simulator, that is after `duration`, by default the duration of the scene;
+with play:=true and duration:=0 it ends with the player.
+"""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PythonExpression
-from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch.action import Action
 
-ARGUMENTS = {
+from sst_ros import launch_parts
+from sst_ros.launch_parts import Given
+
+RUN = {
     "scene": ("example2", "scene, by name or by path of a .yaml file"),
-    "namespace": ("", "namespace of the nodes"),
-    "rate": ("1000", "steps per second of simulated time [Hz]"),
-    "publish_rate": ("500", "published samples per second [Hz]"),
-    "duration": ("0.0", "length of the run [s]; 0 for no end"),
-    "real_time_factor": ("1.0", "simulated time per time of the clock; 0 for as fast as possible"),
-    "publish_clock": ("false", "publish the simulated time on /clock"),
-    "sync": ("free", "free, or lockstep with the commands"),
-    "play": ("false", "also play the scene's torques, from the beginning of the run"),
+    "rate": ("", "steps per second of simulated time [Hz]"),
+    "publish_rate": ("", "published samples per second [Hz]"),
+    "duration": ("", "length of the run [s]; 0 for no end; by default that of the scene"),
+    "real_time_factor": ("", "simulated time per time of the clock; 0 for as fast as possible"),
+    "publish_clock": ("", "true: publish the simulated time on /clock"),
+    "sync": ("", "free, or lockstep with the commands; by default lockstep with play:=true"),
+}
+ARGUMENTS = {
+    **RUN,
+    "play": ("false", "also play the scene's torques, from the start of the run"),
+    "record": ("false", "also record the run, which starts when it is recorded"),
+    "rviz": ("false", "also start robot_state_publisher and RViz"),
+    **launch_parts.recording_arguments("sst_bag"),
 }
 
 
+def actions(given: Given) -> list[Action]:
+    """Describe the nodes."""
+    play, recorded = given["play"] == "true", given["record"] == "true"
+    run = {name: given[name] for name in RUN}
+    if play:
+        run["wait_for_command"] = "true"
+        run["sync"] = run["sync"] or "lockstep"  # the same run on a busy machine
+    nodes = launch_parts.rviz(given, given["scene"]) if given["rviz"] == "true" else []
+    if recorded:
+        nodes.append(launch_parts.recorder(given))
+    nodes.append(launch_parts.simulator(given, run, recorded=recorded))
+    if play:
+        played = {
+            "scene": given["scene"],
+            "stamped": "true" if run["sync"] == "lockstep" else "",
+            "wait_for_subscribers": "2" if recorded else "",  # the recorder reads them, too
+        }
+        endless = bool(given["duration"]) and float(given["duration"]) == 0.0
+        nodes.append(launch_parts.node(given, "torque_player", played, ends=endless))
+    return nodes
+
+
 def generate_launch_description() -> LaunchDescription:
-    """Describe the nodes and their arguments."""
-    value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
-    simulator = Node(
-        package="sst_ros",
-        executable="simulator",
-        namespace=value["namespace"],
-        output="screen",
-        parameters=[
-            {
-                "scene": ParameterValue(value["scene"], value_type=str),
-                "rate": ParameterValue(value["rate"], value_type=int),
-                "publish_rate": ParameterValue(value["publish_rate"], value_type=int),
-                "duration": ParameterValue(value["duration"], value_type=float),
-                "wait_for_command": ParameterValue(value["play"], value_type=bool),
-                "real_time_factor": ParameterValue(value["real_time_factor"], value_type=float),
-                "publish_clock": ParameterValue(value["publish_clock"], value_type=bool),
-                "sync": ParameterValue(value["sync"], value_type=str),
-            }
-        ],
-    )
-    player = Node(
-        package="sst_ros",
-        executable="torque_player",
-        namespace=value["namespace"],
-        output="screen",
-        parameters=[
-            {
-                "scene": ParameterValue(value["scene"], value_type=str),
-                "stamped": ParameterValue(
-                    PythonExpression(["'", value["sync"], "' == 'lockstep'"]), value_type=bool
-                ),
-            }
-        ],
-        condition=IfCondition(value["play"]),
-    )
-    declared = [
-        DeclareLaunchArgument(name, default_value=default, description=said)
-        for name, (default, said) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*declared, simulator, player])
+    """Describe the arguments and the nodes."""
+    return launch_parts.description(__file__, ARGUMENTS, actions)

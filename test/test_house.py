@@ -25,7 +25,7 @@ FLOORS = (
     {"studies"},
     {"runtime"},
     {"nodes"},
-    {"demo"},
+    {"demo", "launch_parts"},
     {"cli", "__main__"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -2,8 +2,10 @@
 import re
 import signal
 from functools import partial
+from pathlib import Path
 
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -12,6 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
+
+from sst_ros.nodes import topics
 
 pytestmark = pytest.mark.ros
 
@@ -147,3 +151,15 @@ def test_an_existing_folder_is_refused(nodes, tmp_path):
     assert process.returncode == 1
     assert f"output = '{tmp_path}': must be a new folder" in err.replace("PosixPath", "")
     assert "Traceback" not in err
+
+
+def test_rosbag2_is_given_the_declared_qos():
+    config = Path(__file__).parents[2] / "config"
+    profiles = yaml.safe_load((config / "rosbag2_qos.yaml").read_text(encoding="utf-8"))
+    assert set(profiles) == set((config / "topics.txt").read_text(encoding="utf-8").split())
+    declared = {one.name.rpartition("/")[2]: one for one in (*topics.PLAYER, *topics.SIMULATOR)}
+    for topic, profile in profiles.items():
+        own = declared.get(topic.rpartition("/")[2])
+        latched = own is not None and own.latched
+        assert profile["durability"] == ("transient_local" if latched else "volatile"), topic
+        assert profile["reliability"] == "reliable"

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the launch files share: arguments, nodes, recorders, RViz, and when a launch ends.
+
+Only launch files import this module: it needs `launch` and `launch_ros` of a ROS installation.
+"""
+
+from __future__ import annotations
+
+import atexit
+import difflib
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from pathlib import Path
+
+import yaml
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.events.process import ProcessExited
+from launch.launch_context import LaunchContext
+from launch.launch_description import LaunchDescription
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from sst_ros import child_process, scene
+from sst_ros.description.urdf import urdf
+from sst_ros.nodes import topics
+from sst_ros.runtime.settings import default_topics
+from sst_ros.scene.scene import share_directory
+
+Given = Mapping[str, str]
+"""Values of the launch arguments."""
+
+_FLAG = ["true", "false"]
+_CHOICES = {"sync": ["", "free", "lockstep"], "bag": ["ros2", "sst"]}
+_SHARED = {
+    "namespace": ("", "namespace of the nodes"),
+    "params_file": ("", "YAML file of parameters; arguments that are given here go before it"),
+    "log_level": ("info", "log level of the nodes: debug, info, warn, error or fatal"),
+}
+_CLOSING_S = "60"
+"""Time that a recorder has to write its index before it is terminated [s]."""
+
+_WAIT_S = "60"
+"""Time that a simulator waits for its recorder [s]; on a busy machine one starts in 20 s."""
+
+
+def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
+    """Return the launch arguments of `recorder`; the default of output is dated."""
+    dated = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
+    return {
+        "output": (dated, "folder of the recording, which must not exist yet"),
+        "bag": ("ros2", "recorder: ros2 for `ros2 bag record`, sst for the node of this package"),
+    }
+
+
+def description(
+    file: str, arguments: Mapping[str, tuple[str, str]], actions: Callable[[Given], list[Action]]
+) -> LaunchDescription:
+    """Describe a launch.
+
+    Args:
+        file: path of the launch file.
+        arguments: default and description by name; empty defaults are left to the nodes.
+        actions: makes the nodes from the values of the arguments.
+
+    """
+    every = {**arguments, **_SHARED}
+
+    def perform(context: LaunchContext) -> list[Action]:
+        if any(word.endswith(Path(file).name) for word in sys.argv):  # not one that is included
+            _refuse_unknown(context.argv, every)
+        return actions({name: context.launch_configurations[name] for name in every})
+
+    declared = [
+        DeclareLaunchArgument(
+            name,
+            default_value=default,
+            description=text,
+            choices=_FLAG if default in _FLAG else _CHOICES.get(name),
+        )
+        for name, (default, text) in every.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=perform)])
+
+
+def node(given: Given, executable: str, parameters: Given, *, ends: bool = True) -> Node:
+    """Describe a node of this package, which ends with the launch, however that ends.
+
+    Args:
+        given: the launch arguments.
+        executable: name of the node.
+        parameters: of the node; those that are empty are left to params_file or the default.
+        ends: whether its end is that of the launch; its failure always is.
+
+    """
+    return Node(
+        package="sst_ros",
+        executable=executable,
+        namespace=given["namespace"],
+        output="screen",
+        arguments=[
+            f"--{key.replace('_', '-')}={value}" for key, value in parameters.items() if value != ""
+        ],
+        parameters=[given["params_file"]] if given["params_file"] else [],
+        ros_arguments=["--log-level", given["log_level"]],
+        additional_env={child_process.PARENT: str(os.getpid())},
+        sigterm_timeout=_CLOSING_S,
+        on_exit=_exit_handler(executable, ends),
+    )
+
+
+def simulator(given: Given, parameters: Given, *, recorded: bool) -> Node:
+    """Describe a simulator, which does not start its run before it is recorded."""
+    if recorded:
+        always = (one for one in topics.SIMULATOR if one.use == topics.PUBLISHES and not one.when)
+        waits = {
+            "wait_for_subscribers": ",".join(topic.name for topic in always),
+            "subscriber_timeout": _WAIT_S,
+        }
+        parameters = {**parameters, **waits}
+    return node(given, "simulator", parameters)
+
+
+def recorder(given: Given) -> Action:
+    """Describe what records the topics of config/topics.txt into `output`."""
+    inside = ("/" + given["namespace"].strip("/")).rstrip("/")
+    names = {
+        topic: topic if topic == topics.DIAGNOSTICS.name else inside + topic
+        for topic in default_topics()
+    }
+    if given["bag"] == "sst":
+        recorded = {"output": given["output"], "topics": ",".join(names.values())}
+        return node(given, "recorder", recorded)
+    require("ros2bag", "rosbag2_storage_mcap")
+    profiles = yaml.safe_load((share_directory() / "config" / "rosbag2_qos.yaml").read_text())
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
+        yaml.safe_dump({names[topic]: profile for topic, profile in profiles.items()}, file)
+    atexit.register(Path(file.name).unlink, missing_ok=True)
+    return ExecuteProcess(
+        cmd=[
+            *("ros2", "bag", "record", "--storage", "mcap", "--output", given["output"]),
+            *("--disable-keyboard-controls", "--qos-profile-overrides-path", file.name),
+            *("--topics", *names.values()),
+        ],
+        output="screen",
+        sigterm_timeout=_CLOSING_S,
+        on_exit=_exit_handler("ros2 bag record", True),
+    )
+
+
+def rviz(given: Given, scene_name: str) -> list[Action]:
+    """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout."""
+    require("robot_state_publisher", "rviz2")
+    model = ParameterValue(urdf(scene.load(scene_name)), value_type=str)
+    return [
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            namespace=given["namespace"],
+            output="screen",
+            parameters=[{"robot_description": model}],
+            on_exit=_exit_handler("robot_state_publisher", True),
+        ),
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            namespace=given["namespace"],
+            output="screen",
+            arguments=["-d", str(share_directory() / "config" / "sst_ros.rviz")],
+            on_exit=_exit_handler("rviz2", True),
+        ),
+    ]
+
+
+def require(*packages: str) -> None:
+    """Refuse a launch for which a ROS package is missing, before anything is started.
+
+    Raises:
+        RuntimeError: names the missing packages.
+
+    """
+    missing = []
+    for package in packages:
+        try:
+            get_package_prefix(package)
+        except PackageNotFoundError:
+            missing.append(package)
+    if missing:
+        raise RuntimeError(f"this needs the ROS package(s) {', '.join(missing)}: not installed")
+
+
+def _exit_handler(
+    name: str, ends: bool
+) -> Callable[[ProcessExited, LaunchContext], list[Action] | None]:
+    """Return what is done when a process exits: an exception gives the launch the status 1."""
+
+    def handle(event: ProcessExited, context: LaunchContext) -> list[Action] | None:
+        interrupted = context.is_shutdown and event.returncode == -signal.SIGINT
+        if event.returncode and not interrupted:
+            raise RuntimeError(f"{name} failed with exit status {event.returncode}")
+        return [Shutdown(reason=f"{name} has ended")] if ends and not context.is_shutdown else None
+
+    return handle
+
+
+def _refuse_unknown(argv: list[str], known: Mapping[str, object]) -> None:
+    for word in argv:
+        name, assigned, _ = word.partition(":=")
+        if assigned and name not in known:
+            close = difflib.get_close_matches(name, known, 1) or sorted(known)
+            raise RuntimeError(f"{word}: no such argument; known: {', '.join(close)}")

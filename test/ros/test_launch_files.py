@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch files by `ros2 launch`: each ends when its work has, with the right status."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from sst_ros.recording import recording
+
+PREFIXES = [Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
+RUN_S = 110
+
+
+def installed(package):
+    index = Path("share", "ament_index", "resource_index", "packages", package)
+    return any((prefix / index).is_file() for prefix in PREFIXES)
+
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(
+        not (shutil.which("ros2") and installed("ros2launch") and installed("sst_ros")),
+        reason="needs `ros2 launch` of a ROS installation with this package built by colcon",
+    ),
+]
+needs_rosbag2 = pytest.mark.skipif(not installed("ros2bag"), reason="needs `ros2 bag`")
+
+
+class Launch:
+    """A `ros2 launch` with all that it prints."""
+
+    def __init__(self, folder, *words):
+        self._process = subprocess.Popen(
+            ["ros2", *words],
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")},
+        )
+        self.text, self._news = "", threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        for line in self._process.stdout:
+            with self._news:
+                self.text += line
+                self._news.notify()
+
+    def until(self, pattern, timeout=60):
+        with self._news:
+            found = self._news.wait_for(lambda: re.search(pattern, self.text), timeout)
+        assert found, f"no {pattern} in {self.text}"
+        return found
+
+    def interrupt(self):
+        self._process.send_signal(signal.SIGINT)
+
+    def ended(self, timeout=RUN_S):
+        """Wait for the end; return the status. No process that it has started is left."""
+        try:
+            status = self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"it does not end:\n{self.text}") from None
+        self._reader.join(10)
+        pids = map(int, re.findall(r"process started with pid \[(\d+)\]", self.text))
+        assert not [pid for pid in pids if Path("/proc", str(pid)).exists()]
+        return status
+
+    def close(self):
+        if self._process.poll() is None:
+            self.interrupt()
+            try:
+                self._process.wait(20)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+
+
+@pytest.fixture
+def launch(domain, tmp_path):
+    started = []
+
+    def start(name, *words):
+        started.append(Launch(tmp_path, "launch", "sst_ros", name, *words))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+def counts(bag):
+    with Reader(bag) as reader:
+        return {topic: info.msgcount for topic, info in reader.topics.items()}
+
+
+@pytest.mark.parametrize("bag", ["sst", pytest.param("ros2", marks=needs_rosbag2)])
+def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
+    words = ["play:=true", "duration:=0.5", "record:=true", f"bag:={bag}", "output:=bag"]
+    run = launch("simulate.launch.py", *words)
+    assert run.ended() == 0, run.text
+    read = recording.read(tmp_path / "bag")
+    assert (read.time_ns == [2_000_000 * k for k in range(251)]).all()
+    assert counts(tmp_path / "bag")["/sst_simulator/commands_stamped"] >= 250
+    again = launch("simulate.launch.py", *words)  # into the same folder
+    assert again.ended() == 1
+    assert str(tmp_path / "bag") in again.text or "'bag'" in again.text
+
+
+def test_the_run_of_the_readme_ends(launch):
+    run = launch("simulate.launch.py", "scene:=example2", "play:=true")
+    assert run.ended() == 0, run.text
+
+
+def test_without_an_end_the_launch_ends_with_the_profile(launch):
+    run = launch("simulate.launch.py", "play:=true", "duration:=0.0", "sync:=lockstep")
+    assert run.ended() == 0, run.text
+    assert "the profile of 1 s is played" in run.text
+
+
+def test_a_scene_without_a_profile_ends_the_launch_in_an_error(launch):
+    run = launch("simulate.launch.py", "scene:=swing", "play:=true")
+    assert run.ended() == 1
+    assert "must have torque and duration" in run.text
+    assert "torque_player failed with exit status 1" in run.text
+
+
+def test_a_part_that_dies_ends_the_launch_in_an_error(launch):
+    run = launch("simulate.launch.py", "scene:=swing", "duration:=0.0")
+    pid = int(run.until(r"\[simulator-1\]: process started with pid \[(\d+)\]")[1])
+    run.until("running")
+    os.kill(pid, signal.SIGKILL)
+    assert run.ended() == 1
+    assert "simulator failed with exit status -9" in run.text
+
+
+def test_feedforward_twice_and_beside_the_first_recording(launch, tmp_path):
+    words = ["mode:=computed_torque", "real_time_factor:=0.0", "hold:=0.0", "bag:=sst"]
+    for _ in range(2):
+        run = launch("feedforward.launch.py", *words)
+        assert run.ended() == 0, run.text
+    first, second = tmp_path.glob("feedforward_bag_*")
+    assert counts(first)["/sst_inverse_dynamics/reference"] > 100
+    run = launch("feedforward.launch.py", *words, f"output:={first}")
+    assert run.ended() == 1
+    assert "must be a new folder" in run.text
+    assert counts(second)["/joint_states"] > 100
+
+
+def test_namespace_params_file_and_log_level_reach_the_nodes(launch, tmp_path):
+    (tmp_path / "given.yaml").write_text("/**: {ros__parameters: {duration: 0.2}}")
+    words = ["namespace:=left", "params_file:=given.yaml", "log_level:=warn"]
+    run = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=bag")
+    assert run.ended() == 0, run.text
+    assert "[INFO] [" not in "".join(re.findall(r"\[simulator-\d\] .*", run.text))
+    found = counts(tmp_path / "bag")
+    assert found["/left/joint_states"] >= 101
+    assert found["/left/sst_simulator/scene"] == 1
+
+
+def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):
+    view = launch("view.launch.py", "browser:=false")
+    view.until("running")
+    recorder = launch("record.launch.py", "bag:=sst", "output:=bag")
+    recorder.until("ready: ")
+    recorder.interrupt()
+    assert recorder.ended() == 0, recorder.text
+    assert counts(tmp_path / "bag")["/joint_states"] > 0
+    view.interrupt()
+    assert view.ended() == 0, view.text
+
+
+@pytest.mark.skipif(installed("rviz2"), reason="RViz is installed")
+@pytest.mark.parametrize("name", ["view.launch.py", "simulate.launch.py"])
+def test_rviz_without_its_packages_starts_nothing(launch, name):
+    run = launch(name, "rviz:=true")
+    assert run.ended() == 1
+    assert re.search(r"needs the ROS package\(s\) .*rviz2", run.text)
+    assert "process started" not in run.text
+
+
+def test_an_unknown_argument_is_refused(launch):
+    run = launch("simulate.launch.py", "scen:=swing")
+    assert run.ended() == 1
+    assert "scen:=swing: no such argument; known: scene" in run.text
+    assert "process started" not in run.text
+
+
+@needs_rosbag2
+def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
+    words = ["scene:=friction", "play:=true", "sync:=free", "record:=true", "bag:=sst"]
+    first = launch("simulate.launch.py", *words, "output:=bag")
+    assert first.ended() == 0, first.text
+    (tmp_path / "wait.yaml").write_text(
+        "/**: {ros__parameters: {wait_for_command: true, command_timeout: 0.0}}"
+    )
+    words = ["scene:=friction", "params_file:=wait.yaml", "duration:=2.0"]
+    fresh = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=again")
+    fresh.until("waiting")
+    topic = "/sst_simulator/commands"
+    player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, "--delay", "10")
+    assert player.ended() == 0, player.text
+    assert fresh.ended() == 0, fresh.text
+    played = counts(tmp_path / "bag")[topic]
+    received = recording.read(tmp_path / "again").diagnostics["commands_received"]
+    assert int(received) == played
