@@ -92,7 +92,8 @@ def _value(spec, text):
 
 def _launch(words):
     name, *given = words
-    text = (ROOT / "launch" / name).read_text(encoding="utf-8")
+    shared = ROOT / "sst_ros" / "launch_parts.py"
+    text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "launch" / name, shared))
     for argument in (word.partition(":=")[0] for word in given if ":=" in word):
         assert f'"{argument}"' in text, f"{name} has no argument {argument}"
 
