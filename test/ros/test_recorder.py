@@ -29,7 +29,7 @@ def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path
     assert nodes.line(recorder) == "ready: 9 topics\n"
     commands = observer.publisher(Float64MultiArray, "/sst_simulator/commands", readers=2)
     commands.publish(Float64MultiArray(data=[0.0, 0.0, 0.0]))
-    assert simulator.wait(timeout=20) == 0
+    assert simulator.wait(timeout=60) == 0
     status, _, err = nodes.stop(recorder, number)
     assert status == 0
     assert "Traceback" not in err
@@ -106,7 +106,7 @@ def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, observer, tmp_pat
     timeout = 0.5 if ending == "timeout" else 0.0
     recorder = nodes.run("recorder", output=tmp_path / "bag", timeout=timeout)
     if ending == "timeout":
-        _, err = recorder.communicate(timeout=20)
+        _, err = recorder.communicate(timeout=60)
         assert "given up after 0.5 s" in err
     else:
         assert "recording to" in recorder.stderr.readline()
@@ -147,7 +147,7 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
 
 def test_an_existing_folder_is_refused(nodes, tmp_path):
     process = nodes.run("recorder", output=tmp_path)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 1
     assert f"output = '{tmp_path}': must be a new folder" in err.replace("PosixPath", "")
     assert "Traceback" not in err
