@@ -7,7 +7,16 @@ from bags import bags, example2, written
 from sst_ros.dynamics import kernel, traced_dynamics
 
 pytest_plugins = ["unexpected_skips"]
-__all__ = ["bags", "example2", "written", "wrong_kernel"]
+__all__ = ["bags", "browser", "example2", "written", "wrong_kernel"]
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """One Chromium for all tests, each of which opens its page in it."""
+    from tools.browser import browse
+
+    with browse() as started:
+        yield started
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium that looks at the page: for tests, and for the picture in the README."""
+"""A headless Chromium that opens the page: for tests, and for the pictures in docs/."""
 
 from __future__ import annotations
 
@@ -34,15 +34,29 @@ def chromium() -> tuple[str, str] | None:
 
 
 class Browser:
-    """One page in one window."""
+    """One window with one page."""
 
     def __init__(self, driver: Any) -> None:
         self._driver = driver
+
+    def open(self, url: str, size: tuple[int, int]) -> None:
+        """Open a page, of a size in pixels, in place of the last one, whose errors are dropped."""
+        self._driver.get("about:blank")
+        self._driver.set_window_size(*size)
+        # The window has borders; what counts is the page.
+        inner = self._driver.execute_script("return [window.innerWidth, window.innerHeight]")
+        self._driver.set_window_size(2 * size[0] - inner[0], 2 * size[1] - inner[1])
+        self.complaints()
+        self._driver.get(url)
 
     def text(self, selector: str) -> str:
         """Text of the element that a CSS selector finds; empty where there is none."""
         script = "const e = document.querySelector(arguments[0]); return e ? e.textContent : ''"
         return str(self._driver.execute_script(script, selector))
+
+    def title(self) -> str:
+        """Title of the browser's tab."""
+        return str(self._driver.title)
 
     def time(self) -> float | None:
         """Time of the run that the page shows [s]; None where it shows none."""
@@ -58,7 +72,7 @@ class Browser:
         self._driver.execute_script("arguments[0].click()", self._buttons(label)[0])
 
     def enabled(self, label: str) -> bool:
-        """Tell whether the button of this label is there and can be pressed."""
+        """Whether the button of this label is there and can be pressed."""
         found = self._buttons(label)
         return bool(found) and bool(found[0].is_enabled())
 
@@ -72,7 +86,7 @@ class Browser:
         return list(self._driver.find_elements("xpath", path))
 
     def hide(self, selector: str) -> None:
-        """Show nothing that a CSS selector finds, now and later."""
+        """Hide what a CSS selector finds, now and later."""
         script = "document.head.insertAdjacentHTML('beforeend', arguments[0])"
         rule = f"<style>{selector} {{ display: none !important }}</style>"
         self._driver.execute_script(script, rule)
@@ -81,7 +95,7 @@ class Browser:
         """Wait until all that has arrived is on the screen."""
         script = (
             "let n = 4; const done = arguments[0];"
-            "const beat = () => n-- ? requestAnimationFrame(beat) : done(); beat()"
+            "const next = () => n-- ? requestAnimationFrame(next) : done(); next()"
         )
         self._driver.execute_async_script(script)
 
@@ -104,27 +118,27 @@ class Browser:
 
         taken = b""
 
-        def seen() -> bool:
+        def succeeded() -> bool:
             nonlocal taken
             with suppress(TimeoutException):  # the driver waits 10 s, a busy machine may need more
                 taken = bytes(self._driver.get_screenshot_as_png())
             return bool(taken)
 
-        self.until(seen, "picture")
+        self.until(succeeded, "picture")
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(taken)
         return taken
 
     def complaints(self) -> list[str]:
-        """Give the errors on the browser's console since the last call."""
+        """Return the errors on the browser's console since the last call."""
         entries = self._driver.get_log("browser")
         return [entry["message"] for entry in entries if entry["level"] in ("SEVERE", "ERROR")]
 
 
 @contextmanager
-def browse(url: str, size: tuple[int, int] = (1280, 800)) -> Iterator[Browser]:
-    """Open a page in a Chromium with a fresh profile that is gone afterwards.
+def browse() -> Iterator[Browser]:
+    """Start a Chromium with a fresh profile; both are gone afterwards.
 
     Raises:
         SstError: there is no Chromium, or no driver of it.
@@ -139,15 +153,11 @@ def browse(url: str, size: tuple[int, int] = (1280, 800)) -> Iterator[Browser]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         options = webdriver.ChromeOptions()
         options.binary_location = found[0]
-        for flag in (*_FLAGS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={profile}"):
+        for flag in (*_FLAGS, f"--user-data-dir={profile}"):
             options.add_argument(flag)
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         driver = webdriver.Chrome(options=options, service=Service(found[1]))
         try:
-            # The window has borders; what counts is the page.
-            inner = driver.execute_script("return [window.innerWidth, window.innerHeight]")
-            driver.set_window_size(2 * size[0] - inner[0], 2 * size[1] - inner[1])
-            driver.get(url)
             yield Browser(driver)
         finally:
             driver.quit()

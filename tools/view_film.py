@@ -48,7 +48,8 @@ def film(path: Path) -> None:
             found = re.search(r"http://\S+", process.stdout.readline())
             if found is None:
                 raise SstError("`view` printed no address")
-            with browse(found.group(), WINDOW) as page:
+            with browse() as page:
+                page.open(found.group(), WINDOW)
                 taken = [Image.open(io.BytesIO(png)).convert("RGB") for png in _pictures(page)]
         finally:
             process.send_signal(signal.SIGINT)

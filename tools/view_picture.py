@@ -44,9 +44,9 @@ def picture(path: Path) -> None:
     server = PageServer(port=_PORT)
     try:
         _build(server, scene)
-        with browse(server.url, SIZE) as page:
+        with browse() as page:
+            page.open(server.url, SIZE)
             page.hide(".mantine-Notification-root, .mantine-Paper-root, .mantine-ActionIcon-root")
-            page.until(lambda: bool(page.text("canvas") is not None), "canvas")
             for _ in range(10):
                 page.drawn()
             taken = Image.open(io.BytesIO(page.picture())).convert("RGB")

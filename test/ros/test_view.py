@@ -16,7 +16,7 @@ pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
 from PIL import Image
 
-from tools.browser import browse, chromium
+from tools.browser import chromium
 
 pytestmark = [
     pytest.mark.ros,
@@ -30,15 +30,15 @@ PANEL = 400
 
 
 @pytest.fixture(scope="module")
-def viewed(domain_of_module):
+def viewed(domain_of_module, browser):
     """The process, the page in a browser, and an observer of the topics."""
     started, watching = Nodes(), Observer(domain_of_module)
     process = started.start("view", "--scene", "swing", "--port", "18080")
     url = re.search(r"http://127\.0\.0\.1:\S+", started.line(process, 60)).group()
-    with browse(url, SIZE) as page:
-        page.until(lambda: page.time() is not None, "time of a run")
-        watching.listen(String, "/sst_simulator/phase", latched=True)
-        yield started, process, page, watching
+    browser.open(url, SIZE)
+    browser.until(lambda: browser.time() is not None, "time of a run")
+    watching.listen(String, "/sst_simulator/phase", latched=True)
+    yield started, process, browser, watching
     watching.close()
     started.close()
 

@@ -42,7 +42,8 @@ def test_make_view(tmp_path, domain):
     try:
         lines = iter(process.stdout.readline, "")
         url = next(filter(None, (re.search(r"http://\S+", line) for line in lines))).group()
-        with browse(url, (820, 560)) as page:
+        with browse() as page:
+            page.open(url, (820, 560))
             page.until(lambda: page.time() is not None, "time of a run")
             first = page.time()
             page.until(lambda: page.time() > first, "motion")

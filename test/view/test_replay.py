@@ -17,7 +17,7 @@ pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
 from sst_ros.view import replay
-from tools.browser import browse, chromium
+from tools.browser import chromium
 
 PICTURES = Path(__file__).parents[2] / "view_out"
 RIGHT, HOME = "\ue014", "\ue011"
@@ -62,24 +62,26 @@ def test_hold_seek_and_speed(bag, monkeypatch):
 
 @pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
 @pytest.mark.timeout(300)
-def test_the_page_of_a_bag(bag):
+def test_the_page_of_a_bag(bag, browser):
     command = [sys.executable, "-m", "sst_ros", "view", str(bag), "--port", "18180"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as process:
         try:
             assert select.select([process.stdout], [], [], 60)[0]
             url = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline()).group()
-            with browse(url, (960, 640)) as page:
-                page.until(lambda: page.text("#sst-phase") == "recording, paused", "end of the bag")
-                assert page.time() == 0.3
-                page.slide("t [s]", HOME)
-                page.until(lambda: page.time() == 0.0, "beginning of the bag")
-                page.slide("t [s]", RIGHT * 20)
-                page.until(lambda: page.time() > 0.0, "later time")
-                page.press("Play")
-                page.until(lambda: page.time() == 0.3, "end of the bag")
-                page.picture(PICTURES / "recording.png")
-                assert page.complaints() == []
+            page = browser
+            page.open(url, (960, 640))
+            page.until(lambda: page.title() == "sst_ros", "title of the tab")
+            page.until(lambda: page.text("#sst-phase") == "recording, paused", "end of the bag")
+            assert page.time() == 0.3
+            page.slide("t [s]", HOME)
+            page.until(lambda: page.time() == 0.0, "beginning of the bag")
+            page.slide("t [s]", RIGHT * 20)
+            page.until(lambda: page.time() > 0.0, "later time")
+            page.press("Play")
+            page.until(lambda: page.time() == 0.3, "end of the bag")
+            page.picture(PICTURES / "recording.png")
+            assert page.complaints() == []
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=30)
             assert process.returncode == 0 and "Traceback" not in errors
