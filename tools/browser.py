@@ -24,7 +24,8 @@ _FLAGS = (
     "--no-first-run",
     "--hide-scrollbars",
 )
-_TIMEOUT_S = 60.0
+_TIMEOUT_S = 120.0
+"""Bound of every wait: without a graphics card a busy machine draws a frame in seconds."""
 
 
 def chromium() -> tuple[str, str] | None:
