@@ -13,7 +13,8 @@ import numpy as np
 
 from sst_ros.integration.methods import METHODS, RODAS4
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
-from sst_ros.studies.extreme_cases import CaseResult, results
+from sst_ros.studies.case_catalogue import results
+from sst_ros.studies.extreme_cases import CaseResult
 from sst_ros.studies.results import markdown, provenance, records, table, write
 from sst_ros.studies.stability_limits import (
     LONGEST_S,

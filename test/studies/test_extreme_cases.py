@@ -26,9 +26,9 @@ from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation import Simulation
-from sst_ros.studies import extreme_cases
+from sst_ros.studies import case_catalogue, extreme_cases
 
-CASES = list(extreme_cases.cases())
+CASES = list(case_catalogue.cases())
 EXAMPLE2 = load("example2")
 LONGEST = 60.0
 """Seconds for any case on a busy machine: what must not happen is an endless loop."""

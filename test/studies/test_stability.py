@@ -11,7 +11,7 @@ from matplotlib import image
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
 from sst_ros.plot.style import save_figure
-from sst_ros.studies import extreme_cases
+from sst_ros.studies import case_catalogue
 from sst_ros.studies.extreme_cases import evaluate_case
 from sst_ros.studies.results import table
 from sst_ros.studies.stability_limits import (
@@ -26,7 +26,7 @@ from sst_ros.studies.stability_limits import (
 )
 from sst_ros.studies.stability_report import limits_of_theory, lines, page
 
-CASES = list(extreme_cases.cases())
+CASES = list(case_catalogue.cases())
 
 
 def test_a_bound_is_found_to_one_per_cent():
