@@ -65,7 +65,7 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     number = NUMBERS.get(scene or "", {}).get(name)
     if number is None:
         return name, title
-    return f"fig{number:02d}_{name}", f"{title} (Fig. {number} of the paper; {ASSUMPTION})"
+    return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
 
 
 def rotations(quaternion: Array) -> Array:

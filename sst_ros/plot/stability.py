@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,7 +12,17 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.style import GREY, INK, free_figure, note, styled
+from sst_ros.plot.style import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    free_figure,
+    note,
+    styled,
+)
 from sst_ros.plot.work_precision import MARKERS
 
 if TYPE_CHECKING:
@@ -76,34 +86,47 @@ def draw_regions(
         footnote: small print.
 
     """
-    figure = free_figure(11.0, 8.6)
-    panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    figure.subplots_adjust(left=0.07, right=0.79, top=0.95, bottom=0.1, hspace=0.14, wspace=0.06)
-    markers = "osD^v<>phX*P"
-    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
-              for name, z in points.items()}  # fmt: skip
+    figure = free_figure(13.0, 8.6)
+    grid = figure.add_gridspec(2, 2, left=0.05, right=0.63, top=0.95, bottom=0.1, hspace=0.14,
+                               wspace=0.08)  # fmt: skip
+    panels: Any = grid.subplots(sharex=True, sharey=True)
+    near = figure.add_axes((0.69, 0.53, 0.3, 0.42))
     for axes, (method, modulus) in zip(panels.flat, growth.items(), strict=True):
         colour = MARKERS[method][0]
         axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
         axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
-        for k, (name, z) in enumerate(points.items()):
-            some = z[inside[name]]
-            axes.plot(some.real, some.imag, markers[k % len(markers)], markersize=5,
-                      color=INK if k < len(markers) else GREY, markerfacecolor="none")  # fmt: skip
+        axes.set_title(f"{method}: stable where coloured")
+    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
+              for name, z in points.items()}  # fmt: skip
+    shown = [z[inside[name]] for name, z in points.items()]
+    colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK)
+    looks: list[dict[str, Any]] = [
+        {"marker": "osD^v<>phX*P"[k % 12], "color": colours[(k + k // 12) % 6],
+         "linestyle": "none", "markersize": 6, "markerfacecolor": "none"}
+        for k in range(len(points))
+    ]  # fmt: skip
+    for axes in (*panels.flat, near):
+        for z, look in zip(shown, looks, strict=True):
+            axes.plot(z.real, z.imag, **look)
         axes.axhline(0.0, color=INK, linewidth=0.6)
         axes.axvline(0.0, color=INK, linewidth=0.6)
-        axes.set_title(f"{method}: stable where coloured")
+    reach = 1.1 * max((float(np.abs(z).max()) for z in shown if len(z)), default=1.0)
+    near.set_xlim(-reach, reach)
+    near.set_ylim(-reach, reach)
+    near.set_title("Near the origin")
+    near.set_xlabel("Re hλ")
     for axes in panels[1]:
         axes.set_xlabel("Re hλ")
     for axes in panels[:, 0]:
         axes.set_ylabel("Im hλ")
     handles = [
-        Line2D([], [], marker=markers[k % len(markers)], linestyle="none", markersize=5,
-               color=INK if k < len(markers) else GREY, markerfacecolor="none",
-               label=name if inside[name].all() else f"{name} (some lie outside)")
-        for k, name in enumerate(points)
-    ]  # fmt: skip
-    figure.legend(handles=handles, loc="center left", bbox_to_anchor=(0.795, 0.55), fontsize=8.5,
-                  frameon=False, title="hλ of the scenes,\nstep as advised")  # fmt: skip
+        Line2D(
+            [], [], **look, label=name if inside[name].all() else f"{name} (some beyond the axes)"
+        )
+        for name, look in zip(points, looks, strict=True)
+    ]
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.68, 0.46), fontsize=8.5,
+                  frameon=False, ncol=2, title="hλ of the scenes at their start, step h as advised",
+                  title_fontsize=9)  # fmt: skip
     note(figure, footnote, 170)
     return figure

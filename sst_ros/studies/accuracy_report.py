@@ -50,8 +50,8 @@ the largest over the run.
 
 A setting is named as the fastest for a target only if every finer setting of the same method that
 was tried, and at least one, reaches the target too. The advice is that of
-`python -m sst_ros scene show`; behind it stands the error of `Simulation` that follows it, measured
-against the same reference.
+`python -m sst_ros scene show`; where it was measured, the error of a `Simulation` that follows it
+stands behind it.
 """
 
 

@@ -51,8 +51,8 @@ def _friction() -> Iterator[Case]:
         def crept(simulation: Simulation, v: float = smoothing) -> float:
             """Compare with gamma + smoothing artanh(tau / static) t."""
             t = simulation.time_ns * 1e-9
-            way = [QUARTER + v * math.atanh(tau / breakaway) * t for tau in push]
-            return math.dist(simulation.state.joints.gamma, way) / (v * t)
+            path = [QUARTER + v * math.atanh(tau / breakaway) * t for tau in push]
+            return math.dist(simulation.state.joints.gamma, path) / (v * t)
 
         yield Case(
             f"Stribeck friction, smoothing {smoothing:g} rad/s",

@@ -100,7 +100,7 @@ def _violent() -> Iterator[Case]:
     for rate in (1e4, 1e6):
         yield Case(
             f"spin of {rate:g} rad/s",
-            "without torque the way does not depend on the rate",
+            "without torque the path does not depend on the rate",
             lambda v=rate: extremes.spun(v),  # type: ignore[misc]
             REST,
             10,
