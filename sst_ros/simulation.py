@@ -20,14 +20,15 @@ from sst_ros.integration.adaptive_stepper import (
     EvaluationBudget,
     MethodChange,
 )
+from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.integration.ode import ode_with_work
-from sst_ros.integration.propagator import Point, Propagator, Torque
+from sst_ros.integration.propagator import Point, Propagator
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import axpy, cross, dot, rotation_rows, turned_back
 from sst_ros.scene.given import scene_of
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.state import NANOSECONDS, Joints, State, Vector3
 
 __all__ = [
@@ -51,7 +52,7 @@ COMPILED_BUDGET = 120_000
 """Evaluations a compiled step may take: 0.12 s, for an accepted step of 36 takes 36 us in all."""
 
 WHOLE_MOTION_BUDGET = 10_000_000
-"""`step_budget` where a step may be a whole motion and nobody waits for it: minutes in Python."""
+"""`step_budget` where a step may be a whole motion, offline: minutes in plain Python."""
 
 Triple = Vector3
 
@@ -75,7 +76,8 @@ class Simulation:
             its length. RK4 has no error estimate; it takes one pair of steps a call.
         compiled: run under numba; the digits are the same, the first step of a new scene takes
             seconds. Without numba a RuntimeWarning is raised and plain Python runs. Torque
-            functions run in plain Python, with one RuntimeWarning.
+            functions, and sines that the actuators clamp, run in plain Python, with one
+            RuntimeWarning.
         step_budget: evaluations of the right-hand side that one `step` may take. The default keeps
             a step below about 0.2 s: `PLAIN_BUDGET` operations in plain Python (5,000 to 12,000
             evaluations), `COMPILED_BUDGET` evaluations under numba. Long steps of a stiff or fast
@@ -115,8 +117,8 @@ class Simulation:
         self.dynamics = Dynamics.of(scene)
         self.compiled = compiled and numba_version() is not None
         if compiled and not self.compiled:
-            said = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"
-            warnings.warn(said, RuntimeWarning, stacklevel=2)
+            text = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
         if step_budget is None:
             operations = len(ode_with_work(self.dynamics).program.steps)
             step_budget = (
@@ -210,8 +212,8 @@ class Simulation:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
         Args:
-            torque: commanded torques [N m], held constant, or a function of t [s], for which
-                explicit methods in plain Python are used.
+            torque: commanded torques [N m], held constant; a `SineTorque`; or a function of
+                t [s], for which explicit methods in plain Python are used.
             dt_ns: length [ns], > 0.
             moment: external moment on the star in {B} [N m], used where the scene takes it from
                 a topic.
@@ -239,6 +241,7 @@ class Simulation:
 
         """
         _refuse_bad_input(torque, dt_ns, moment)
+        torque = self._propagator.traced(torque)
         if callable(torque) and not self._warned:
             self._warned = True
             text = "a torque function runs in plain Python, slower than compiled=True; same digits"
@@ -300,8 +303,7 @@ class Simulation:
         if len(self.dynamics.state) > 7:
             torque = (y[7], y[8], y[9])
         else:
-            given = asked(at.time_ns / NANOSECONDS) if callable(asked) else asked
-            torque = self._propagator.limited(given)
+            torque = self._propagator.torque_at(asked, at.time_ns / NANOSECONDS)
         joints = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])  # type: ignore[arg-type]
         return State(at.time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), joints, torque)
 
@@ -325,8 +327,8 @@ class Simulation:
 
 def _refuse_bad_input(torque: Torque, dt_ns: int, moment: Sequence[float]) -> None:
     problems = []
-    if not callable(torque) and not _is_vector3(torque):
-        allowed = "must be three finite numbers [N m], or a function of t [s]"
+    if not (callable(torque) or isinstance(torque, SineTorque) or _is_vector3(torque)):
+        allowed = "must be three finite numbers [N m], a SineTorque or a function of t [s]"
         problems.append(Problem("torque", torque, allowed))
     if not _is_vector3(moment):
         problems.append(Problem("moment", moment, "must be three finite numbers [N m]"))

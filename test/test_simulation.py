@@ -26,7 +26,7 @@ from sst_ros.errors import (
 )
 from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.scene.scene import Initial, Stroke, Workspace, load
+from sst_ros.scene.scene import Actuators, Initial, Stroke, Workspace, load
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation import Simulation
 
@@ -308,3 +308,41 @@ def test_a_torque_function_in_a_compiled_simulation_warns_once():
         simulation.step(lambda t: (t, 0.0, 1.0), 1_000_000)
         plain.steps(lambda t: (t, 0.0, 1.0), 1_000_000, 2)
     assert simulation.state == plain.state
+
+
+def sine_runs(scene, compiled, torque, count=100):
+    simulation = Simulation(scene, compiled=compiled)
+    for _ in range(count):
+        simulation.step(torque, 10_000_000)
+    return simulation
+
+
+@pytest.mark.parametrize("name", ["example2", "friction"])
+def test_a_sine_torque_moves_as_its_function_does(name):
+    scene = load(name)
+    one = sine_runs(scene, False, scene.torque, 50)
+    other = sine_runs(scene, False, sine(scene.torque), 50)
+    assert one.state.torque == pytest.approx(other.state.torque, abs=1e-13)
+    assert one.state.quaternion == pytest.approx(other.state.quaternion, abs=3e-10)
+    assert one.error_estimate < 1e-8
+    middle = one.state.time_ns - 4_000_000
+    at = one.within(middle)
+    assert at.quaternion == pytest.approx(other.within(middle).quaternion, abs=3e-10)
+
+
+def test_a_sine_torque_that_the_actuators_clamp_moves_as_its_function_does():
+    scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=2.0))
+    one, other = (sine_runs(scene, False, t, 20) for t in (scene.torque, sine(scene.torque)))
+    assert one.state == other.state and max(map(abs, one.state.torque)) <= 2.0
+
+
+@pytest.mark.skipif(numba_version() is None, reason="needs numba")
+def test_a_sine_torque_is_compiled_to_the_bits_of_plain_python():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one, other = (sine_runs(EXAMPLE2, compiled, EXAMPLE2.torque) for compiled in (True, False))
+    assert one.state == other.state and one.error_estimate == other.error_estimate
+    one.reset()
+    assert one.state == Simulation(EXAMPLE2).state
+    again = one.step(EXAMPLE2.torque, 10_000_000)
+    assert again == Simulation(EXAMPLE2).step(EXAMPLE2.torque, 10_000_000)

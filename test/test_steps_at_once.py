@@ -25,7 +25,6 @@ INWARDS = {
 CASES = {
     "example2": (load("example2"), {}),
     "loaded": (loaded(), {}),
-    "impacts": (replace(load("impacts"), **INWARDS), {}),
     "elastic": (replace(load("elastic_stops"), **INWARDS), {}),
     "stiff": (viscous(300.0), {"tolerance": 1e-9}),
     "rodas4": (viscous(3.0), {"integrator": "rodas4", "tolerance": 1e-8}),
@@ -33,8 +32,7 @@ CASES = {
 }
 needs_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
 BY_NUMBA = [
-    pytest.param(name, marks=() if name in ("example2", "impacts") else pytest.mark.slow)
-    for name in CASES
+    pytest.param(name, marks=() if name == "example2" else pytest.mark.slow) for name in CASES
 ]
 
 
@@ -85,7 +83,7 @@ def held_against_single_ticks(name, ticks, glided, *, compiled):
         assert run(scene, at_once, ticks, compiled=compiled, **how) == one
     if name in ("example2", "loaded", "rk4"):
         assert (60, 60) in glided
-    if name in ("impacts", "elastic"):
+    if name == "elastic":
         assert any(0 < done < count for count, done in glided)
     return one
 

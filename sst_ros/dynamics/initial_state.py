@@ -19,9 +19,9 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     """Quaternion (x, y, z, w) and body rate [rad/s] at t = 0, seven numbers.
 
     Raises:
-        AssemblyError: the initial gamma has no admissible assembly, or several and the scene does
-            not say which.
-        SingularConfiguration: gamma_dot says nothing of the body rate there.
+        AssemblyError: the initial gamma has no admissible assembly, or several and the scene
+            selects none.
+        SingularConfiguration: gamma_dot does not determine the body rate there.
 
     """
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
@@ -35,7 +35,7 @@ def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Arra
     """Body rate [rad/s] of a posture; rest needs no Jacobian, which a singular one has not.
 
     Raises:
-        SingularConfiguration: gamma_dot says nothing of it.
+        SingularConfiguration: gamma_dot does not determine it.
 
     """
     if not gamma_dot.any():
@@ -43,6 +43,6 @@ def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Arra
     at = virtual_work.posture(geometry, gamma, rotation)
     determinant = float(np.linalg.det(at.j2))
     if abs(determinant) < SINGULAR:
-        said = "gamma_dot does not determine the body rate: parallel singularity, det J2"
-        raise SingularConfiguration(said, determinant)
+        message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
+        raise SingularConfiguration(message, determinant)
     return np.asarray(rotation.T @ at.j @ gamma_dot)

@@ -19,7 +19,7 @@ class Limit(NamedTuple):
     """One end: sign * (angle of a joint - end) >= 0.
 
     Attributes:
-        reason: what is said when the run stops here.
+        reason: text of the error when the run stops here.
         error: what is raised then; None for a contact event.
         joint: number of the joint in (gamma_1..3, mu_1..3, beta_1..3), from 0.
         sign: +1 for a lower end, -1 for an upper one.

@@ -41,7 +41,7 @@ class AcceptedStep(NamedTuple):
 
 
 class CannotStep(ArithmeticError):
-    """No step is small enough; the text says why."""
+    """No step is small enough to resolve the motion."""
 
 
 class BudgetSpent(CannotStep):

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques over one period: three numbers, or a function of time in plain Python."""
+"""Torques over one period: three numbers, sines, or a function of time in plain Python."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from sst_ros.dynamics.traced_dynamics import Function, compiled
 from sst_ros.integration.ode import ODE
+from sst_ros.scene.loads import SineTorque
 from sst_ros.state import TorqueFunction, Vector3
+
+Torque = Vector3 | SineTorque | TorqueFunction
 
 
 class AppliedTorque:
@@ -26,16 +30,33 @@ class AppliedTorque:
         self._torque: TorqueFunction | None = None
         self._start = 0.0
 
-    @property
-    def is_function(self) -> bool:
-        """Whether the torques of this period are a function of time."""
-        return self._torque is not None
+    def traced(self, torque: Torque) -> Torque:
+        """Return a sine torque that the limit clamps as a function; all others as they are."""
+        if not isinstance(torque, SineTorque):
+            return torque
+        clamped = self._limit is not None and max(map(abs, torque.amplitude)) > self._limit
+        return sine_function(torque) if clamped else torque
 
-    def begin(self, torque: Vector3 | TorqueFunction, start: float) -> Vector3:
-        """Take the torques of a period that begins at `start` [s]; return them as a drive."""
-        self._torque = torque if callable(torque) else None
+    def begin(self, torque: Torque, start: float) -> Vector3:
+        """Take the torques of a period that begins at `start` [s].
+
+        Returns:
+            Three numbers of the drive: torques [N m], phases of a sine [rad], zero for a function.
+
+        """
         self._start = start
+        if isinstance(torque, SineTorque):
+            rows = zip(torque.frequency, torque.phase, strict=True)
+            first, second, third = (math.fmod(f * start + p, math.tau) for f, p in rows)
+            return first, second, third
+        self._torque = torque if callable(torque) else None
         return (0.0, 0.0, 0.0) if callable(torque) else self.limited(torque)
+
+    def at(self, torque: Torque, time: float) -> Vector3:
+        """Torques that act at a time [s], within the limit [N m]."""
+        if isinstance(torque, SineTorque):
+            torque = sine_function(torque)
+        return self.limited(torque(time) if callable(torque) else torque)
 
     def limited(self, torque: Vector3) -> Vector3:
         """Clamp torques [N m] to the limit of the actuators."""
@@ -56,3 +77,14 @@ class AppliedTorque:
         size = len(self._ode.state)
         torque = self.limited(self._torque(self._start + t))
         return self._rhs(t, *inputs[:size], *torque, *inputs[size + 3 :])
+
+
+def sine_function(torque: SineTorque) -> TorqueFunction:
+    """Return the torques as a function of the time [s]."""
+    rows = tuple(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
+
+    def at(time: float) -> Vector3:
+        first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
+        return first, second, third
+
+    return at

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One module of source for a scene's functions and the loops around them, and two ways to run it.
+"""Source of a scene's functions and the loops around them, as an interpreted or compiled module.
 
 The text is the same for the interpreter and for numba, so both take the same operations in the
 same order. Under numba it is written to a cache folder whose file names are digests of the text
@@ -81,7 +81,7 @@ _FREE_ROUNDING = ', fastmath={"arcp", "contract"}'
 
 
 def numba_version() -> str | None:
-    """Version of numba, None where it cannot be imported or SST_ROS_NUMBA=0 says not to use it."""
+    """Version of numba, None where it cannot be imported or SST_ROS_NUMBA=0 switches it off."""
     if os.environ.get("SST_ROS_NUMBA") == "0":
         return None
     try:

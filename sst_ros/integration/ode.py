@@ -20,6 +20,7 @@ class ODE:
         dynamics: the scene.
         torque: torques over time that replace those of the drive; the drive is then what else
             acts from outside, or nothing.
+        phases: the drive keeps three numbers for the torques: the phases [rad] of `torque`.
         work: append to the state the work [J] that actuators and moments have put in, less what
             friction has taken out.
 
@@ -30,13 +31,19 @@ class ODE:
     """
 
     def __init__(
-        self, dynamics: Dynamics, torque: SineTorque | None = None, *, work: bool = False
+        self,
+        dynamics: Dynamics,
+        torque: SineTorque | None = None,
+        *,
+        work: bool = False,
+        phases: bool = False,
     ) -> None:
         self._dynamics = dynamics
         self._torque = torque
         self._work = work
+        self._phases = phases
         self.state = (*dynamics.state, *(("work",) if work else ()))
-        self.drive = dynamics.drive if torque is None else dynamics.drive[3:]
+        self.drive = dynamics.drive if torque is None or phases else dynamics.drive[3:]
 
     @cached_property
     def program(self) -> Program:
@@ -63,10 +70,10 @@ class ODE:
         state, drive = inputs[:size], inputs[len(self.state) :]
         torque, rest = drive[:3], drive[3:]
         if self._torque is not None:
-            rows = zip(
-                self._torque.amplitude, self._torque.frequency, self._torque.phase, strict=True
-            )
-            torque, rest = tuple(a * sin(f * time + p) for a, f, p in rows), drive
+            phase = torque if self._phases else self._torque.phase
+            rows = zip(self._torque.amplitude, self._torque.frequency, phase, strict=True)
+            torque = tuple(a * sin(f * time + p) for a, f, p in rows)
+            rest = rest if self._phases else drive
         moment = (rest[0], rest[1], rest[2]) if rest else None
         model = self._dynamics.model
         slope = kernel.derivative(model, state, torque, moment)

@@ -17,7 +17,7 @@ from sst_ros.integration.adaptive_stepper import (
     MethodChange,
     StepperCheckpoint,
 )
-from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.applied_torque import AppliedTorque, Torque
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,
@@ -26,13 +26,14 @@ from sst_ros.integration.events import (
     may_occur,
 )
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
-from sst_ros.integration.ode import ode_with_work
+from sst_ros.integration.ode import ODE, ode_with_work
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Scene
-from sst_ros.state import State, TorqueFunction, Vector3
+from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.state import State, Vector3
 
-Torque = Vector3 | TorqueFunction
-Checkpoint = tuple[int, tuple[float, float], StepperCheckpoint, StepperCheckpoint]
+Checkpoint = tuple[
+    int, tuple[float, float], AdaptiveStepper, dict[AdaptiveStepper, StepperCheckpoint]
+]
 
 _SHARP, _SLIDING = 10.0, 5.0
 """A step loses its order where a rate changes by 10 times the smoothing of a Coulomb torque, at
@@ -80,16 +81,18 @@ class Propagator:
         limit = scene.actuators.torque_limit if scene.actuators else None
         self._torque = AppliedTorque(self._ode, limit)
         self._budget = budget
-        self._stepper = AdaptiveStepper(
-            self._ode,
-            integrator,
-            tolerance,
+        self._new_stepper = partial(
+            AdaptiveStepper,
+            method=integrator,
+            tolerance=tolerance,
             compiled=compiled,
             ranges=self._ranges,
             budget=budget,
         )
+        self._constant = self._stepper = self._new_stepper(self._ode)
+        self._sines: dict[SineTorque, AdaptiveStepper] = {}
         # Torque functions are evaluated in Python, and have no Jacobian.
-        self._plain_stepper = AdaptiveStepper(
+        self._function = AdaptiveStepper(
             self._ode,
             "auto" if isinstance(METHODS.get(integrator), Rosenbrock) else integrator,
             tolerance,
@@ -108,13 +111,16 @@ class Propagator:
 
     def _checkpoint(self) -> Checkpoint:
         """All that the next steps depend on beside the point at which they begin."""
-        steppers = self._stepper.checkpoint(), self._plain_stepper.checkpoint()
-        return self.accepted_steps, self._growth, *steppers
+        steppers = {
+            x: x.checkpoint() for x in (self._constant, self._function, *self._sines.values())
+        }
+        return self.accepted_steps, self._growth, self._stepper, steppers
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        self.accepted_steps, self._growth, compiled, plain = checkpoint
-        self._stepper.restore(compiled)
-        self._plain_stepper.restore(plain)
+        self.accepted_steps, self._growth, self._stepper, steppers = checkpoint
+        self._sines = {sine: x for sine, x in self._sines.items() if x in steppers}
+        for stepper, kept in steppers.items():
+            stepper.restore(kept)
 
     @property
     def method(self) -> str:
@@ -131,9 +137,13 @@ class Propagator:
         full = [*y, *(0.0,) * (len(self._ode.state) - 7)]
         return Point(full, list(full), self._dynamics.joints(*full[:7]), self._stepper.method.order)
 
-    def limited(self, torque: Vector3) -> Vector3:
-        """Clamp torques to the limit of the actuators."""
-        return self._torque.limited(torque)
+    def traced(self, torque: Torque) -> Torque:
+        """Return a sine torque that the actuators clamp as a function; all others as they are."""
+        return self._torque.traced(torque)
+
+    def torque_at(self, torque: Torque, time: float) -> Vector3:
+        """Torques that act at a time [s], within the limit of the actuators [N m]."""
+        return self._torque.at(torque, time)
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
@@ -148,11 +158,12 @@ class Propagator:
 
         Returns where the last period ended that was done, and how many were.
         """
-        if callable(torque):
+        if callable(torque) or isinstance(torque, SineTorque):
             return at, 0
         if self._coulomb:  # the joints are looked at after each period
             count = 1
-        before, drive = self._checkpoint(), (*self.limited(torque), *moment)
+        before, drive = self._checkpoint(), (*self._torque.limited(torque), *moment)
+        self._stepper = self._constant
         done, (y, z, joints) = self._stepper.step_many(
             h, count, (at.y, at.z, at.joints), drive, at.order
         )
@@ -181,9 +192,10 @@ class Propagator:
 
         """
         before = self._before = self._checkpoint()
-        self._stepper.origin = start
-        self._budget.begin()
         drive = (*self._torque.begin(torque, start), *moment)
+        self._budget.begin()
+        self._stepper = self._stepper_for(torque)
+        self._stepper.origin = start
         try:
             x = 0.0
             while x < h:
@@ -198,20 +210,29 @@ class Propagator:
     def repeat_part(self, *arguments: Any) -> Point:
         """`advance` through a part of the last period again, and leave everything as it is now."""
         now, before = self._checkpoint(), self._before
-        history = list(self._stepper.history)
+        stepper, history = self._stepper, list(self._stepper.history)
         self._restore(before)
         try:
             return self.advance(*arguments)
         finally:
-            self._stepper.history[:] = history
+            stepper.history[:] = history
             self._restore(now)
             self._before = before
+
+    def _stepper_for(self, torque: Torque) -> AdaptiveStepper:
+        """Return the stepper of constant torques, of a function, or of a sine, which is traced."""
+        if isinstance(torque, SineTorque):
+            if torque not in self._sines:
+                ode = ODE(self._dynamics, torque, work=True, phases=True)
+                self._sines[torque] = self._new_stepper(ode)
+            return self._sines[torque]
+        return self._function if callable(torque) else self._constant
 
     def _until_event(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
         """Go on from x to h, or to the first limit or contact event before."""
-        stepper = self._plain_stepper if self._torque.is_function else self._stepper
+        stepper = self._stepper
         for step in stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
             self.accepted_steps += 1
             end = self._point(step.y, step.z, step.order)

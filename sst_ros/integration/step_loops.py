@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
-"""Loops around a step, as text: `backend` puts them behind a scene's functions and runs them.
+"""Loops around a step, as text: `codegen` puts them behind a scene's functions and runs them.
 
 They run on lists as plain Python and on arrays under numba. Names that are not defined here come
-from the module that `backend` writes.
+from the module that `codegen` writes.
 """
 # ruff: noqa: F821
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 
 def step_pair(t, h, y, z, d, new_y, new_z, error):
-    """Advance y by two steps of h / 2 and its companion z by one of h (global Richardson).
+    """Advance y by two steps of h / 2 and the coarse solution z by one of h (Richardson).
 
     Returns the size of the local error estimate of y, relative to a tolerance of 1.
     """
@@ -23,10 +23,10 @@ def step_pair(t, h, y, z, d, new_y, new_z, error):
     second = size_of(error, middle, new_y, h)
     attempt(t, h, z, y, d, new_z, other)
     # In proportion, so that it counts only where the longer step is unstable.
-    companion = size_of(other, z, new_z, h) * SHARE
+    coarse = size_of(other, z, new_z, h) * SHARE
     normalise(new_y)
     normalise(new_z)
-    return max(first + second, companion)
+    return max(first + second, coarse)
 
 
 def size_of(error, old, new, h):
@@ -99,7 +99,7 @@ def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
 
 
 def all_far(ranges, begin, end, h):
-    """Say quickly that no limit may have been crossed in h.
+    """Test quickly that no limit may have been crossed in h.
 
     That is so where a joint is inside before and after, and its rate has not turned, or the joint
     is farther from the limits than it would come in ten times h.
@@ -109,9 +109,9 @@ def all_far(ranges, begin, end, h):
         if not (row[1] < begin[joint] < row[2] and row[1] <= end[joint] <= row[2]):
             return False
         if begin[joint + 9] * end[joint + 9] < 0.0:
-            way = 10.0 * h * max(abs(begin[joint + 9]), abs(end[joint + 9]))
+            reach = 10.0 * h * max(abs(begin[joint + 9]), abs(end[joint + 9]))
             least, most = min(begin[joint], end[joint]), max(begin[joint], end[joint])
-            if not (row[1] + way < least and most < row[2] - way):
+            if not (row[1] + reach < least and most < row[2] - reach):
                 return False
     return True
 
@@ -120,8 +120,8 @@ def attempt_linearly_implicit(t, h, y, near, d, new_y, error):
     """One step of RODAS4 (Hairer & Wanner, Solving ODEs II, section VI.4), exact Jacobian.
 
     Order 4, L-stable, stiffly accurate; the error estimate is of order 3. The Jacobian is that at
-    `near`: y itself, or for a companion the run, from which it is as far as its error. Beside a
-    kink of a force the two may stand on different sides, and the step is that of the run's.
+    `near`: y itself, or for the coarse solution the fine one, which is near. Beside a kink of a
+    force the two may lie on different sides; the Jacobian is that of the fine one.
     """
     matrix = square(SIZE)
     slope = vector(SIZE)

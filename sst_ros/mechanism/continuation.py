@@ -53,9 +53,9 @@ class BranchEnds(SingularConfiguration):
         self.gamma = gamma
         self.rotation = rotation
         self.det_j2 = float(np.linalg.det(j2))
-        said = np.array2string(gamma, precision=9)
+        angles = np.array2string(gamma, precision=9)
         super().__init__(
-            f"parallel singularity before point {row}: the branch ends at gamma = {said} rad,"
+            f"parallel singularity before point {row}: the branch ends at gamma = {angles} rad,"
             f" det J2 = {self.det_j2:.3e}, least singular value",
             measure,
         )
@@ -93,7 +93,7 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     Raises:
         AssemblyError: rotation is None and there is no unique admissible assembly, rotation is
             no assembly at gamma[0], or gamma is not (n, 3) finite numbers.
-        BranchEnds: a parallel singularity lies in the way (or the motion runs along one so near
+        BranchEnds: a parallel singularity lies on the path (or the motion runs along one so near
             that no number of steps would do); carries where, and how near.
 
     """
@@ -117,7 +117,7 @@ def advance(geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: Arra
     """Return R, shape (3, 3), at gamma = end [rad] of the branch that has `rotation` at start.
 
     Raises:
-        BranchEnds: a parallel singularity lies in the way.
+        BranchEnds: a parallel singularity lies on the path.
 
     """
     first, last = np.array(start, dtype=float), np.array(end, dtype=float)

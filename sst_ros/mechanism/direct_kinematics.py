@@ -7,7 +7,7 @@ rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four in (cos x, sin x)
 from a companion matrix; each is polished on the rotation itself. t_1 and -t_1 give two
 assemblies, R and R Rot(z, pi), that share s: up to eight.
 
-Resolution: two roots are told apart when the residual r_k . t_k midway between them is more than
+Resolution: two roots are distinguished when the residual r_k . t_k midway between them is more than
 rounding, so that they are some 1e-6 rad apart or gamma is some 1e-12 rad off the fold where they
 meet. Closer ones, real or a complex pair, are a double root in this arithmetic, for r_k and e_k
 are rounded too: they come out as one, with det J2 near 0.
@@ -243,7 +243,7 @@ def _arranged(owner: Index, rotation: Array) -> tuple[Index, Array]:
     s = np.round(rotation[:, :, 2], 6)
     order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
     owner, rotation = owner[order], rotation[order]
-    # t_1 first, then -t_1: of the two the one further along the first base vector that tells.
+    # t_1 first, then -t_1: first the one further along the first base vector where they differ.
     t = np.round(rotation[:, :, 1], 6)
     lead = t[np.arange(len(t)), np.argmax(t != 0.0, axis=1)] < 0.0
     rotation = np.where(lead[:, None, None], rotation * [-1.0, -1.0, 1.0], rotation)

@@ -20,7 +20,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.state import Assembly
 
 RESIDUAL = 1e-14
-"""Largest abs(r_k . t_k) of an assembly that is told to be one."""
+"""Largest abs(r_k . t_k) of a root that is accepted as an assembly mode."""
 
 
 NEAR = 0.1
@@ -134,7 +134,7 @@ def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = No
     Args:
         geometry: base triangle and star.
         gamma: actuator angles [rad], shape (3,).
-        near: rotation that says which one is meant where several are admissible: the only one
+        near: rotation that selects one where several are admissible: the only one
             within NEAR of it.
 
     Raises:

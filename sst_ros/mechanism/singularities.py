@@ -50,7 +50,7 @@ class SingularPoses:
 def parallel(chart: OrientationMap) -> SingularPoses:
     """Admissible poses with det J2 = 0, one for each change of sign along psi in the map.
 
-    The poses fill a surface in (s, psi); the map's resolution says how many points of it are
+    The poses fill a surface in (s, psi); the resolution of the map sets how many points of it are
     found. Each is exact to rounding.
     """
     measured, geometry = chart.measures, chart.geometry

@@ -3,7 +3,7 @@
 
 Equation numbers are those of Akbarzadeh & Enferadi, J. Intell. Robot. Syst. 63 (2011) 25-49, with
 the signs that its printed text lost. Rows of (3, 3) arrays named after a leg's vector (r, t, w)
-belong to legs; matrices of Jacobians act on columns. Everything is in {B} unless it says
+belong to legs; matrices of Jacobians act on columns. Everything is in {B} unless stated
 otherwise. The simulation runs `kernel`, which the tests hold against this file.
 """
 

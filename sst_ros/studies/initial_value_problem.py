@@ -25,7 +25,8 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, Torque
+from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import TorqueFunction, Vector3
 
 INTERVALS = 20
 """Solutions are compared at this many instants or more."""
@@ -73,7 +74,9 @@ class InitialValueProblem:
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)
-        self.torque: Torque = sine(scene.torque) if scene.torque else (0.0, 0.0, 0.0)
+        self.torque: Vector3 | TorqueFunction = (
+            sine(scene.torque) if scene.torque else (0.0, 0.0, 0.0)
+        )
         limit = scene.actuators.torque_limit if scene.actuators else None
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
