@@ -17,16 +17,16 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
 from sst_ros.report import states
-from sst_ros.report.fixed_step_motion import COMPILED_FROM, Course, held, module
+from sst_ros.report.fixed_step_motion import COMPILED_FROM, TickSequence, module, recorded_ticks
 from sst_ros.report.reference import CHUNK, PLAIN_TICKS
 
 
 def residual(recording: Recording, missing: list[str]) -> Array | None:
-    """Energy that nobody has put in since the start [J], shape (n,).
+    """Return the energy balance residual since the start [J], shape (n,).
 
     Args:
         recording: a run.
-        missing: gets a line for all that cannot be told.
+        missing: gets a line for all that is not known.
 
     Returns:
         nan where it is not known, None where it cannot be known. Where ticks are lost, the balance
@@ -37,16 +37,16 @@ def residual(recording: Recording, missing: list[str]) -> Array | None:
     if moment and moment.topic and recording.ticks.moment is None:
         missing.append("the moment on the star is not recorded: no energy residual")
         return None
-    course = held(recording)
-    many = len(course.start_ns) > COMPILED_FROM
+    ticks = recorded_ticks(recording)
+    many = len(ticks.start_ns) > COMPILED_FROM
     count = len(recording.time_ns)
     if many and codegen.numba_version() is None:
-        count = int(np.searchsorted(recording.time_ns, course.end_ns[PLAIN_TICKS - 1])) + 1
+        count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
         until = recording.seconds[count - 1]
         missing.append(f"energy after {until:g} s: there is no numba to balance it")
     stored, work = np.full((2, len(recording.time_ns)), np.nan)
     dynamics, geometry = Dynamics.of(recording.scene), Geometry.of(recording.scene)
-    workers = _Workers(dynamics, course, recording, compiled=many)
+    workers = _Workers(dynamics, ticks, recording, compiled=many)
     for part in slices(count, CHUNK, "energy", shown=False):
         rows = slice(part.start, min(part.stop + 1, count))
         state = states.recorded(geometry, recording, rows)
@@ -63,9 +63,9 @@ class _Workers:
     """Energy and work of one scene."""
 
     def __init__(
-        self, dynamics: Dynamics, course: Course, recording: Recording, *, compiled: bool
+        self, dynamics: Dynamics, ticks: TickSequence, recording: Recording, *, compiled: bool
     ) -> None:
-        self._course = course
+        self._ticks = ticks
         self._energy = trace(lambda *state: (_stored(dynamics.model, state),), dynamics.state)
         self._compiled = compiled and codegen.numba_version() is not None
         system = ode_with_work(dynamics)
@@ -79,8 +79,8 @@ class _Workers:
 
     def work(self, state: Array, rows: slice) -> Array:
         """Work from each sample of `rows` to the next [J]; nan where ticks or states are lost."""
-        time, places = self._time[rows], np.searchsorted(self._course.start_ns, self._time[rows])
-        ticks = self._course.part(slice(places[0], places[-1]))
+        time, places = self._time[rows], np.searchsorted(self._ticks.start_ns, self._time[rows])
+        ticks = self._ticks.part(slice(places[0], places[-1]))
         result = np.full(len(state) - 1, np.nan)
         if not len(ticks.start_ns):
             return result

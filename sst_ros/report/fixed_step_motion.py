@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of motion of a scene over many ticks, with fixed steps: the reference's own way.
+"""A scene's equations of motion over many ticks by DOP853 with fixed steps, for references.
 
-The method is DOP853 on the kernel's equations, traced, compiled for long runs.
+The equations are traced from the kernel; the loops are those of `integration.step_loops`, compiled
+for long runs.
 """
 
 from __future__ import annotations
@@ -15,27 +16,23 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, trace
-from sst_ros.dynamics.limits import limits_of
 from sst_ros.dynamics.math_functions import positive, sin
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration import codegen
 from sst_ros.integration.methods import DOP853
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers
 from sst_ros.report import tick_kernel
 from sst_ros.report.states import Vector
 from sst_ros.scene.scene import Scene, SineTorque
 
-TOUCHING = 1e-12
-"""An actuator that is farther beyond its end than this [rad] has hit it."""
-
 COMPILED_FROM = 10_000
-"""From this number of ticks on it is worth compiling."""
+"""From this number of ticks on compilation costs less than it saves."""
 
 
-class Course(NamedTuple):
-    """Ticks to go through.
+class TickSequence(NamedTuple):
+    """Ticks in order of time.
 
     Attributes:
         start_ns, end_ns: relative to the start of the run [ns], shape (m,).
@@ -52,13 +49,13 @@ class Course(NamedTuple):
         """Length of each tick [s]."""
         return np.asarray((self.end_ns - self.start_ns) / NANOSECONDS)
 
-    def part(self, ticks: slice) -> Course:
+    def part(self, ticks: slice) -> TickSequence:
         """Return some of the ticks."""
-        return Course(self.start_ns[ticks], self.end_ns[ticks], self.drives[ticks])
+        return TickSequence(self.start_ns[ticks], self.end_ns[ticks], self.drives[ticks])
 
 
-class Motion:
-    """Motion of a scene up to its next impact.
+class FixedStepMotion:
+    """Motion of a scene, tick by tick.
 
     Args:
         scene: what moves.
@@ -82,59 +79,58 @@ class Motion:
             ("t", *self.dynamics.state, *drive),
         )
         self._module = module(program, self.dynamics, size, len(drive), compiled=self.compiled)
-        ends = limits_of(scene, Geometry.of(scene))
-        rigid = [(end.joint, end.sign, end.end) for end in ends if end.error is None]
-        self._ends: Any = np.array(rigid).reshape(-1, 3) if self.compiled else rigid
 
-    def follow(self, y: Vector, course: Course, counts: Integers) -> tuple[Array, bool]:
-        """Go through ticks, each by its number of steps.
+    def follow(self, y: Vector, ticks: TickSequence, counts: Integers) -> Array:
+        """Integrate over ticks, each by its number of steps.
 
         Returns:
             States at the end of each tick that was done, shape (ticks, size); they are fewer than
-            asked for after an impact, or where there is no finite continuation; and whether it
-            was an impact.
+            asked for where there is no finite continuation.
 
         """
-        times, lengths, drives = course.start_ns / NANOSECONDS, course.lengths, course.drives
+        times, lengths, drives = ticks.start_ns / NANOSECONDS, ticks.lengths, ticks.drives
         reached = np.full((len(times), len(y)), np.nan)
         if self.compiled:
             drives = np.ascontiguousarray(drives)
-            given = times, lengths, counts, drives, self._ends, np.array(y), reached
-            done, hit = self._module.ride(*given)
-            return reached[:done], hit
+            done = self._module.integrate_ticks(
+                times, lengths, counts, drives, np.array(y), reached
+            )
+            return reached[:done]
         state = list(y)
         columns = (each.tolist() for each in (times, lengths, counts, drives))
-        rows = zip(*columns, strict=True)
-        for k, row in enumerate(rows):
+        for k, row in enumerate(zip(*columns, strict=True)):
             end: list[list[float]] = [[0.0] * len(y)]
             try:
-                done, hit = self._module.ride(*([each] for each in row), self._ends, state, end)
+                done = self._module.integrate_ticks(*([each] for each in row), state, end)
             except (ArithmeticError, ValueError):
-                done, hit = 0, False
+                done = 0
             if not done:
-                return reached[:k], hit
+                return reached[:k]
             reached[k] = end[0]
-        return reached, False
+        return reached
 
 
-def held(recording: Recording) -> Course:
+def recorded_ticks(recording: Recording) -> TickSequence:
     """Return the recorded ticks, torques within the limit of the actuators."""
     ticks, dynamics = recording.ticks, Dynamics.of(recording.scene)
     limit = _limit(recording.scene)
     torque = ticks.torque if limit is None else np.clip(ticks.torque, -limit, limit)
     if dynamics.moved and ticks.moment is not None:
         torque = np.hstack([torque, ticks.moment])
-    return Course(ticks.start_ns, ticks.end_ns, torque)
+    return TickSequence(ticks.start_ns, ticks.end_ns, torque)
 
 
 def module(
     program: Program, dynamics: Dynamics, size: int, drive: int, *, compiled: bool
 ) -> ModuleType:
-    """Put the loops of `ride` behind DOP853 and a derivative with the inputs t, state, drive."""
+    """Put the loops of `tick_kernel` behind DOP853 and a derivative of t, state, drive."""
     texts = codegen.source(program, None, dynamics.joints_program, DOP853, size, drive)
-    texts += [inspect.getsource(tick_kernel.ride), inspect.getsource(tick_kernel.work_done)]
-    # Lag and share concern error estimates, which nobody looks at here.
-    constants = {"SIZE": size, "LAG": 0, "SHARE": 1.0, "TOUCHING": TOUCHING}
+    texts += [
+        inspect.getsource(tick_kernel.integrate_ticks),
+        inspect.getsource(tick_kernel.work_done),
+    ]
+    # Lag and share concern error estimates, which are not used here.
+    constants = {"SIZE": size, "LAG": 0, "SHARE": 1.0}
     return codegen.load(texts, constants, numba=compiled, nogil=True)
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long commands take: from a command to the step that applies it.
 
-A command is paired with the first tick that applies its values. Two delays are told:
+A command is paired with the first tick that applies its values. Two delays are measured:
 
 - By the recorder's clock, from the reception of the command to the step. The simulator begins the
   step of a tick when the tick ends, with the newest command that it has; when that was is read from
   the receptions of the samples, at the tick's end between two of them. This holds at any pace and
-  with any clock in the stamps, and has the way of the samples to the recorder in it.
+  with any clock in the stamps, and includes the transport of the samples to the recorder.
 - By stamps, from that of a command, which is that of the sample it answers, to the beginning of the
   tick: simulated time between what was measured and what was done about it.
 """
@@ -83,7 +83,7 @@ def _answered(recording: Recording, begins: Integers) -> tuple[float, float]:
 
 
 def _received(recording: Recording, time_ns: Integers) -> Integers:
-    """When times of the run were told, by the recorder's clock [ns], between samples in line."""
+    """Return when times of the run were received [ns], interpolated between samples."""
     first = recording.received_ns[0]
     since = (recording.received_ns - first).astype(float)
     return np.asarray(first + np.interp(time_ns, recording.time_ns, since).astype(np.int64))

@@ -59,13 +59,16 @@ def overview(
 
 def write(summary: dict[str, Any], page: Path, pictures: Sequence[Path], out: Path) -> None:
     """Write the page as HTML with all pictures inside."""
-    unknown = "".join(f"<li>{html.escape(words)}</li>" for words in summary["not_told"])
+    unknown = "".join(f"<li>{html.escape(words)}</li>" for words in summary["unknown"])
     name = html.escape(str(summary["scene"]))
     parts = [
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
         f"<title>Run of {name}</title><style>{_STYLE}</style></head><body>",
         f"<h1>Run of {name}</h1>",
-        _picture(page, "error, energy, pace, jitter, losses, latency and efforts over the run"),
+        _picture(
+            page,
+            "error, energy, real-time factor, timing, losses, latency and efforts over the run",
+        ),
         f"<h2>What the recording does not contain</h2><ul>{unknown}</ul>" if unknown else "",
         f"<h2>Numbers</h2><pre>{html.escape(table(summary))}</pre>",
         "<h2>Motion</h2><div class='some'>",

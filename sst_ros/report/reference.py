@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a recorded run is from the solution: the run, integrated again, at high accuracy.
+"""Integration error of a recorded run: its states against a reference integrated anew.
 
-The method is DOP853 with two or more steps a tick, on the kernel's equations; nothing of
-`Simulation` takes part. Every comparison integrates twice, with different step sizes; the
-difference of the two is the reference's own error. Long runs are compiled; where there is no numba
-only their first minute or so is compared, and `Comparison.reasons` says so.
+The method is DOP853 with two or more steps a tick, on the kernel's equations. Every comparison
+integrates twice, with different step sizes; the difference of the two estimates the reference's own
+error. Long runs are compiled; without numba only their first minute or so is compared, and
+`Comparison.reasons` reports that.
 
-Actuators that lag are part of the state, and torques are held to the scene's limit. Impacts are
-not solved a second time: after one, the reference begins again at the next recorded sample. A
-moment from a topic must be recorded; without it there is nothing to compare with.
+Actuators that lag are part of the state, and torques are held to the scene's limit. A moment from a
+topic must be recorded; without it there is nothing to compare with.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -24,12 +24,17 @@ from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.report import states
-from sst_ros.report.fixed_step_motion import COMPILED_FROM, Course, Motion, held
+from sst_ros.report.fixed_step_motion import (
+    COMPILED_FROM,
+    FixedStepMotion,
+    TickSequence,
+    recorded_ticks,
+)
 from sst_ros.report.states import Vector
 
 LONGEST_STEP_NS, LONGEST_IDEAL_STEP_NS = 500_000, 1_000_000
 """The coarse steps of the reference are not longer than this [ns]. What hold and transport cost is
-larger than what an integrator gets wrong, and can be told with longer steps."""
+larger than the error of an integrator, and resolved by longer steps."""
 
 PLAIN_TICKS = 60_000
 """So many ticks are compared in plain Python, a minute's work."""
@@ -67,7 +72,7 @@ class Comparison:
         error: recording against reference.
         own: the reference's own error.
         restarts_ns: instants at which the reference had to begin again from a recorded sample,
-            because torques before it were lost, or after an impact [ns].
+            because torques before it were lost [ns].
         steps: steps a tick of the reference.
         reasons: why samples are not compared; empty where all are, or only torques are missing.
 
@@ -86,147 +91,156 @@ class Comparison:
 
 
 def integration(recording: Recording) -> Comparison:
-    """Compare with the exact motion under the recorded torques: what the integrator got wrong.
+    """Compare with the exact motion under the recorded torques: the error of the integrator.
 
-    A sample from which the reference begins again is not compared, and neither are samples
-    between lost torques, or an impact, and the next beginning.
+    A sample from which the reference restarts is not compared, and neither are samples between
+    lost torques and the next restart.
 
     Raises:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    begun = states.begins(recording)
-    start = states.initial(recording.scene) if begun else None
-    course, moment = held(recording), recording.scene.moment
+    moment = recording.scene.moment
     if moment is not None and moment.topic and recording.ticks.moment is None:
         count = len(recording.time_ns)
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
         return Comparison(Deviation.none(count), Deviation.none(count), (), 0, (reason,))
-    motion = Motion(recording.scene, None, compiled=len(course.start_ns) > COMPILED_FROM)
-    return _compare(recording, motion, course, start, LONGEST_STEP_NS, again=True)
+    start = states.initial(recording.scene) if states.begins(recording) else None
+    ticks = recorded_ticks(recording)
+    motion = FixedStepMotion(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
+    reference = _Reference(recording, motion, ticks, LONGEST_STEP_NS)
+    return reference.compare(start, restart=True)
 
 
 def ideal(recording: Recording) -> Comparison | None:
-    """Compare with the motion under the scene's continuous torques: what hold and transport cost.
+    """Compare with the motion under continuous torques: the effect of hold and transport.
 
     None where the scene has no torques, its moment comes from a topic, or the recording lacks the
-    start of the run. The comparison ends at the first impact.
+    start of the run.
 
     Raises:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    torque = recording.scene.torque
-    moment = recording.scene.moment
+    torque, moment = recording.scene.torque, recording.scene.moment
     if torque is None or (moment and moment.topic) or not states.begins(recording):
         return None
     time = recording.time_ns
-    course = Course(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
+    between = TickSequence(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
     many = len(recording.ticks.start_ns) > COMPILED_FROM
-    motion = Motion(recording.scene, torque, compiled=many)
-    start = states.initial(recording.scene)
-    return _compare(recording, motion, course, start, LONGEST_IDEAL_STEP_NS, again=False)
+    motion = FixedStepMotion(recording.scene, torque, compiled=many)
+    reference = _Reference(recording, motion, between, LONGEST_IDEAL_STEP_NS)
+    return reference.compare(states.initial(recording.scene), restart=False)
 
 
-def _compare(
-    recording: Recording,
-    motion: Motion,
-    course: Course,
-    start: Vector | None,
-    longest_ns: int,
-    *,
-    again: bool,
-) -> Comparison:
-    """Go through a course twice, in fine and in coarse steps, and compare at the samples.
+class _Reference:
+    """A run integrated in fine and in coarse steps, compared at its samples.
 
     Args:
         recording: what is compared.
-        motion: how it moves.
-        course: the ticks.
-        start: state at time zero; None where it is not known.
+        motion: the equations of motion.
+        ticks: what acts, tick by tick.
         longest_ns: longest coarse step [ns].
-        again: begin again at a sample where the way was lost.
 
     """
-    tick = recording.ticks.period_ns
-    coarse = math.ceil(tick / longest_ns)
-    fine = max(coarse + 1, math.ceil(1.5 * coarse))
-    time, geometry = recording.time_ns, Geometry.of(recording.scene)
-    breaks = 1 + np.flatnonzero(course.start_ns[1:] != course.end_ns[:-1])
-    error, own = Deviation.none(len(time)), Deviation.none(len(time))
-    restarts: list[int] = []
-    impacts = clock = 0
-    now: list[Vector] = []
-    if start is not None:
+
+    def __init__(
+        self, recording: Recording, motion: FixedStepMotion, ticks: TickSequence, longest_ns: int
+    ) -> None:
+        self._recording, self._motion, self._ticks = recording, motion, ticks
+        self._tick_ns = recording.ticks.period_ns
+        coarse = math.ceil(self._tick_ns / longest_ns)
+        self._steps = max(coarse + 1, math.ceil(1.5 * coarse)), coarse
+        self._error, self._own = (Deviation.none(len(recording.time_ns)) for _ in range(2))
+
+    def compare(self, start: Vector | None, *, restart: bool) -> Comparison:
+        """Integrate and compare.
+
+        Args:
+            start: state at time zero; None where it is not known.
+            restart: begin again at a recorded sample after lost torques; else the end is there.
+
+        """
+        ticks, time = self._ticks, self._recording.time_ns
+        count = self._count()
+        gaps = 1 + np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1])
+        bounds = [0, *gaps[gaps < count].tolist(), count]
+        restarts: list[int] = []
+        if start is not None:
+            self._note(np.array([0]), [np.array([start])] * 2)
+            if ticks.start_ns[0] != 0:
+                start = None
+        for first, stop in itertools.pairwise(bounds):
+            while first < stop:
+                if start is None:
+                    found = self._restart(first, stop) if restart else None
+                    if found is None:
+                        break
+                    first, start = found
+                    restarts.append(int(ticks.start_ns[first]))
+                first = self._integrate(start, first, stop)
+                start = None
+        for values in (self._error.gamma, self._error.gamma_dot, self._error.orientation):
+            values[np.isin(time, restarts)] = np.nan
+        reasons = []
+        if count < len(ticks.start_ns):
+            until = ticks.end_ns[count - 1] / NANOSECONDS
+            reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
+        return Comparison(self._error, self._own, tuple(restarts), self._steps[0], tuple(reasons))
+
+    def _count(self) -> int:
+        """Return the number of ticks that are integrated."""
+        ticks = self._ticks
+        total = len(ticks.start_ns)
+        if self._motion.compiled:
+            return total
+        return min(
+            total, int(PLAIN_TICKS * self._tick_ns // np.median(ticks.end_ns - ticks.start_ns))
+        )
+
+    def _restart(self, first: int, stop: int) -> tuple[int, Vector] | None:
+        """Find the next tick that begins at a sample, and the state of that sample."""
+        recording = self._recording
+        at = places(recording.time_ns, self._ticks.start_ns[first:stop])
+        usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
+        if not len(usable):
+            return None
+        tick = int(usable[0])
+        geometry = Geometry.of(recording.scene)
+        state = states.recorded(geometry, recording, [int(at[tick])])[0]
+        return first + tick, tuple(state.tolist())
+
+    def _integrate(self, start: Vector, first: int, stop: int) -> int:
+        """Integrate ticks without gaps between them; return the first that was not reached."""
         now = [start, start]
-        _note(error, own, recording, motion, np.array([0]), [np.array([start])] * 2)
-    total = len(course.start_ns)
-    plain = int(PLAIN_TICKS * tick // np.median(course.end_ns - course.start_ns))
-    judged = total if motion.compiled else min(total, plain)
-    for part in slices(judged, CHUNK, "reference", shown=again and total > CHUNK):
-        here = course.part(part)
-        at_end, at_start = places(time, here.end_ns), places(time, here.start_ns)
-        anew = np.flatnonzero((at_start >= 0) & np.isfinite(recording.quaternion[at_start, 0]))
-        ticks_in = np.ceil((here.end_ns - here.start_ns) / tick).astype(np.int64)
-        k, count = 0, len(at_end)
-        while k < count:
-            if clock != here.start_ns[k]:
-                now = []
-            if not now:
-                next_start = int(np.searchsorted(anew, k))
-                if not again or next_start == len(anew):
-                    break
-                k = int(anew[next_start])
-                now = [tuple(states.recorded(geometry, recording, [int(at_start[k])])[0])] * 2
-                restarts.append(int(here.start_ns[k]))
-            after = int(np.searchsorted(breaks, part.start + k, side="right"))
-            stop = min(count, int(breaks[after]) - part.start if after < len(breaks) else count)
-            (first, hit), (second, hit_too) = (
-                motion.follow(y, here.part(slice(k, stop)), ticks_in[k:stop] * steps)
-                for y, steps in zip(now, (fine, coarse), strict=True)
-            )
-            done = min(len(first), len(second))
-            rows = at_end[k : k + done]
-            reached = [way[:done][rows >= 0] for way in (first, second)]
-            _note(error, own, recording, motion, rows[rows >= 0], reached)
-            if k + done < stop:
-                # Of two ways one may meet an impact at the end of a tick, the other in the next.
-                impacts += hit or hit_too
-                now = []
-                k += done + 1 + (abs(len(first) - len(second)) == 1)
-            else:
-                now = [tuple(way[-1].tolist()) for way in (first, second)]
-                k, clock = stop, int(here.end_ns[stop - 1])
-    reasons = []
-    if impacts:
-        reasons.append(f"{impacts} impacts: the reference begins again after each")
-    if judged < total:
-        until = course.end_ns[judged - 1] / NANOSECONDS
-        reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
-    for values in (error.gamma, error.gamma_dot, error.orientation):
-        values[np.isin(time, restarts)] = np.nan
-    return Comparison(error, own, tuple(restarts), fine, tuple(reasons))
+        for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):
+            ticks = self._ticks.part(slice(first + part.start, first + part.stop))
+            counts = np.ceil((ticks.end_ns - ticks.start_ns) / self._tick_ns).astype(np.int64)
+            reached = [
+                self._motion.follow(y, ticks, counts * steps)
+                for y, steps in zip(now, self._steps, strict=True)
+            ]
+            done = min(map(len, reached))
+            rows = places(self._recording.time_ns, ticks.end_ns[:done])
+            self._note(rows[rows >= 0], [one[:done][rows >= 0] for one in reached])
+            if done < len(counts):
+                return int(first + part.start + done + 1)
+            now = [tuple(one[-1].tolist()) for one in reached]
+        return stop
 
-
-def _note(
-    error: Deviation,
-    own: Deviation,
-    recording: Recording,
-    motion: Motion,
-    rows: Integers,
-    reached: list[Array],
-) -> None:
-    """Write down how far samples are from the states that were reached finely and coarsely."""
-    fine, coarse = (states.outputs(motion.dynamics, way) for way in reached)
-    sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
-    for deviation, one in ((error, sampled), (own, coarse)):
-        found = _deviation(one, fine)
-        deviation.gamma[rows], deviation.gamma_dot[rows] = found.gamma, found.gamma_dot
-        deviation.orientation[rows] = found.orientation
+    def _note(self, rows: Integers, reached: list[Array]) -> None:
+        """Write down how far samples are from the states of the fine and the coarse steps."""
+        recording = self._recording
+        fine, coarse = (states.outputs(self._motion.dynamics, one) for one in reached)
+        sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
+        for deviation, one in ((self._error, sampled), (self._own, coarse)):
+            found = _deviation(one, fine)
+            deviation.gamma[rows], deviation.gamma_dot[rows] = found.gamma, found.gamma_dot
+            deviation.orientation[rows] = found.orientation
 
 
 def _deviation(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array]) -> Deviation:
-    # Angles are told up to whole turns: a recorded one may count them, a computed one does not.
+    # Recorded angles may count whole turns, computed ones do not.
     turn = 2.0 * np.pi
     difference = first[1] - second[1]
     gamma = np.abs(difference - turn * np.round(difference / turn))

@@ -64,23 +64,23 @@ def summarise(
 
 
 def _run(recording: Recording) -> dict[str, Any]:
-    told = recording.diagnostics
+    reported = recording.diagnostics
     return {
-        "phase": told.get("phase"),
-        "fault": told.get("fault"),
-        "integrator": told.get("integrator"),
-        "ticks": _count(told, "ticks"),
-        "ticks_missed": _count(told, "ticks_missed"),
-        "simulated_time_s": _number(told, "simulated_time_s"),
-        "wall_time_s": _number(told, "wall_time_s"),
-        "real_time_factor": _number(told, "real_time_factor"),
-        "step_mean_us": _number(told, "step_mean_us"),
-        "step_max_us": _number(told, "step_max_us"),
-        "simulator_error_estimate": _number(told, "error_estimate"),
-        "error_limit_rad": _number(told, "tolerance") or ERROR_LIMIT_RAD,
+        "phase": reported.get("phase"),
+        "fault": reported.get("fault"),
+        "integrator": reported.get("integrator"),
+        "ticks": _count(reported, "ticks"),
+        "ticks_missed": _count(reported, "ticks_missed"),
+        "simulated_time_s": _number(reported, "simulated_time_s"),
+        "wall_time_s": _number(reported, "wall_time_s"),
+        "real_time_factor": _number(reported, "real_time_factor"),
+        "step_mean_us": _number(reported, "step_mean_us"),
+        "step_max_us": _number(reported, "step_max_us"),
+        "simulator_error_estimate": _number(reported, "error_estimate"),
+        "error_limit_rad": _number(reported, "tolerance") or ERROR_LIMIT_RAD,
         "duration_s": float(recording.seconds[-1]),
-        "commands_received": _count(told, "commands_received"),
-        "commands_dropped": _count(told, "commands_dropped"),
+        "commands_received": _count(reported, "commands_received"),
+        "commands_dropped": _count(reported, "commands_dropped"),
         "commands_recorded": len(recording.commands.torque),
     }
 
@@ -147,14 +147,14 @@ def _effort(recording: Recording) -> dict[str, Any]:
 
 def _notes(recording: Recording, integration: Comparison, ideal: Comparison | None) -> list[str]:
     notes = []
-    told, last = recording.diagnostics, recording.seconds[-1]
-    if not told:
+    reported, last = recording.diagnostics, recording.seconds[-1]
+    if not reported:
         notes.append("no diagnostics of the run are recorded: what they tell is unknown")
-    elif told.get("phase") not in ("finished", "fault"):
+    elif reported.get("phase") not in ("finished", "fault"):
         notes.append(
-            f"the run was cut short, or its recording was: the last phase is {told.get('phase')}"
+            f"the run or its recording was cut short: the last phase is {reported.get('phase')}"
         )
-    if told.get("phase") == "fault" or told.get("fault"):
+    if reported.get("phase") == "fault" or reported.get("fault"):
         notes.append(
             f"the run ended by a fault; it is compared up to its last sample, at {last:.6f} s"
         )
@@ -212,14 +212,14 @@ def _processor() -> str:
         return platform.machine()
 
 
-def _number(told: dict[str, str], key: str) -> float | None:
+def _number(reported: dict[str, str], key: str) -> float | None:
     try:
-        value = float(told[key])
+        value = float(reported[key])
     except (KeyError, ValueError):
         return None
     return value if math.isfinite(value) else None
 
 
-def _count(told: dict[str, str], key: str) -> int | None:
-    value = _number(told, key)
+def _count(reported: dict[str, str], key: str) -> int | None:
+    value = _number(reported, key)
     return None if value is None else round(value)

@@ -68,7 +68,7 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     if summary["notes"]:
         yield ""
         yield from (f"Note: {note}." for note in summary["notes"])
-    yield from (f"Not told: {words}." for words in summary["not_told"])
+    yield from (f"Not known: {words}." for words in summary["unknown"])
     yield ""
     yield made_line(summary)
 

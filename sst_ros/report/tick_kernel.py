@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
-"""Loops of the report over many ticks, as text: `motion` puts them behind a scene's functions.
+"""Loops of the report over many ticks, as text that `fixed_step_motion` compiles with a scene.
 
 They call `step_fixed` of `integration.step_loops`; like it they run plain and under numba.
 """
@@ -9,30 +9,22 @@ They call `step_fixed` of `integration.step_loops`; like it they run plain and u
 from __future__ import annotations
 
 
-def ride(times, lengths, counts, drives, ends, y, reached):
+def integrate_ticks(times, lengths, counts, drives, y, reached):
     """Take y through ticks, tick k by counts[k] steps; reached[k] becomes the state at its end.
 
-    A row of ends is (joint, sign, angle): there is an impact where sign (q - angle) < -TOUCHING.
-
-    Returns how many ticks were done, and whether it was an impact that ended it; y is then beyond.
+    Returns how many ticks were done; there are fewer where a state is not finite.
     """
-    joints = vector(18)
     for k in range(len(times)):
         h = lengths[k] / counts[k]
         for i in range(counts[k]):
             step_fixed(times[k] + i * h, h, 1, y, drives[k], y)
-            if len(ends):
-                joints_of(y, joints)
-                for end in ends:
-                    if end[1] * (joints[int(end[0])] - end[2]) < -TOUCHING:
-                        return k, True
         total = 0.0
         for i in range(SIZE):
             total += y[i]
             reached[k][i] = y[i]
         if total - total != 0.0:
-            return k, False
-    return len(times), False
+            return k
+    return len(times)
 
 
 def work_done(states, first, lengths, drives, work):

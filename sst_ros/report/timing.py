@@ -32,12 +32,12 @@ class Timing:
         pace_s, pace: times [s] and simulated time per time on the recorder's clock.
         late_us: how much later each sample was received than the promptest one, by its stamp
             [us], shape (n,): it grows where the simulator falls behind.
-        missed_s, missed: times at which the simulator told how many ticks it had dropped so far
+        missed_s, missed: times at which the simulator reported its dropped ticks
             [s], and how many.
         latency: of commands.
-        energy: what each sample has of energy that nobody has put in since the start [J], shape
+        energy: energy balance residual of each sample since the start [J], shape
             (n,); nan where it is not known. None where it cannot be known.
-        missing: what could not be told, and why.
+        missing: what is not known, and why.
 
     """
 
@@ -104,7 +104,7 @@ def numbers(timing: Timing) -> dict[str, Any]:
         ),
         "command_age_mean_s": timing.latency.age_s,
         "energy_residual_max_J": float(np.nanmax(energy)) if known and energy is not None else None,
-        "not_told": list(timing.missing),
+        "unknown": list(timing.missing),
     }
 
 
@@ -130,9 +130,9 @@ def _pace(recording: Recording) -> tuple[Array, Array]:
 
 def _missed(recording: Recording) -> tuple[Array, Array]:
     """Return times [s] and numbers of dropped ticks, from the simulator's reports."""
-    told = [(at, count) for at, values in recording.reports
+    counts = [(at, count) for at, values in recording.reports
             if (count := values.get("ticks_missed", "")).isdecimal()]  # fmt: skip
     first = recording.received_ns[0]
     since = (recording.received_ns - first).astype(float)
-    at = np.interp([at - first for at, _ in told], since, recording.seconds)
-    return at, np.array([int(count) for _, count in told], dtype=float)
+    at = np.interp([at - first for at, _ in counts], since, recording.seconds)
+    return at, np.array([int(count) for _, count in counts], dtype=float)

@@ -31,7 +31,7 @@ def written(long_bag, tmp_path_factory):
 
 def test_a_long_run_is_integrated_compiled(written, monkeypatch):
     rides = 0
-    follow = fixed_step_motion.Motion.follow
+    follow = fixed_step_motion.FixedStepMotion.follow
 
     def counted(*given):
         nonlocal rides
@@ -40,7 +40,7 @@ def test_a_long_run_is_integrated_compiled(written, monkeypatch):
 
     run = recording.read(written)
     assert len(run.time_ns) == 10_001 and len(run.ticks.start_ns) == 20_000
-    monkeypatch.setattr(fixed_step_motion.Motion, "follow", counted)
+    monkeypatch.setattr(fixed_step_motion.FixedStepMotion, "follow", counted)
     integration, ideal = reference.integration(run), reference.ideal(run)
     energy = energy_balance.residual(run, [])
     assert rides == 4  # fine and coarse steps of both, in one call each

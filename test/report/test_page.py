@@ -58,7 +58,7 @@ def test_periods_and_latency_are_what_they_were_made(tmp_path, bags, lively):
     assert numbers["command_stamp_to_tick_mean_us"] is None
     assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
     assert numbers["energy_residual_max_J"] < 1e-12
-    assert not len(found.lost_s) and not len(found.gaps_s) and numbers["not_told"] == []
+    assert not len(found.lost_s) and not len(found.gaps_s) and numbers["unknown"] == []
 
 
 def test_lost_samples_and_dropped_ticks_have_their_times(tmp_path, bags, lively):
@@ -112,15 +112,15 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     assert "http" not in re.sub(r"base64,[^']+", "", text)
     assert "command to its step, mean" in text
     assert "What the recording does not contain" in text
-    assert "Not told: no diagnostics" in table(summary)
+    assert "Not known: no diagnostics" in table(summary)
 
 
 def test_what_is_missing_is_said(tmp_path, bags, example2):
     kept = bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)
     numbers = timing.numbers(_timing(bags, tmp_path, kept))
     assert numbers["command_latency_mean_us"] is None and numbers["commands_followed"] == 0
-    assert any("no commands are recorded" in words for words in numbers["not_told"])
-    assert any("no diagnostics" in words for words in numbers["not_told"])
+    assert any("no commands are recorded" in words for words in numbers["unknown"])
+    assert any("no diagnostics" in words for words in numbers["unknown"])
 
 
 def test_stamps_of_another_clock_do_not_matter(tmp_path, bags, lively):
