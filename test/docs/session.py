@@ -157,7 +157,8 @@ def _stays(words):
 
 
 def _ends_by_itself(words):
-    return "torque_player" in words or any(word.startswith("duration:=") for word in words)
+    given = any(word == "--duration" or word.startswith("duration:=") for word in words)
+    return given or "torque_player" in words
 
 
 def _is_shell(block):
