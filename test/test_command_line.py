@@ -102,6 +102,8 @@ def error_of(words, capsys):
         (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
         (["demo", "--scene", "swing"], "demo feedforward"),
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'"),
+        (["workspace", "example2", "--out", "picture"], "must end in .png or .pdf or .svg"),
+        (["simulate", "example2", "--out", "table.txt"], "must end in .parquet or .csv"),
         (["compile", "--integrator", "nope"], "must be one of auto, rk4"),
         (["scene", "show", "{here}/latin.yaml"], "latin.yaml"),
     ],

@@ -72,6 +72,8 @@ def _simulate(options: argparse.Namespace) -> int:
             trajectory.save(out, overwrite=options.force)
         print(out)
     if picture is not None:
-        trajectory.plot().savefig(picture)
+        from sst_ros.plot.style import save_figure
+
+        save_figure(trajectory.plot(), picture)
         print(picture)
     return 0 if trajectory.success else 1

@@ -7,6 +7,7 @@ A function that draws takes data and returns a `Figure`; `styled` gives it the s
 from __future__ import annotations
 
 import functools
+import io
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -72,9 +73,17 @@ def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 @styled
 def save_figure(figure: Figure, *paths: Path) -> None:
-    """Write a figure into files; their suffixes name the formats."""
+    """Write a figure into files; their suffixes name the formats.
+
+    Raises:
+        OSError: a file cannot be written.
+
+    """
     for path in paths:
-        figure.savefig(path)
+        # Not straight into the file: on a full disk the PDF backend fails without an OSError.
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format=path.suffix.removeprefix("."))
+        path.write_bytes(drawn.getvalue())
 
 
 def free_figure(width: float, height: float) -> Figure:
