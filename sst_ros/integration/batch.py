@@ -19,7 +19,7 @@ from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
 from sst_ros.integration.batch_source import LANES, NOT_FINITE, batch_source
-from sst_ros.integration.initial_states import SAID, starts
+from sst_ros.integration.initial_states import REASONS, initial_states
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.integration.parametric_model import Family
 from sst_ros.integration.scenarios import Variants
@@ -161,7 +161,15 @@ class Batch:
         family, number = self._family, len(angles)
         which = np.broadcast_to(family.geometry, number)
         label = f"{self.scene.name}, starting"
-        quaternion, rate, code = starts(family.geometries, which, angles, rates, label, progress)
+        quaternion, rate, code = initial_states(
+            family.geometries,
+            which,
+            angles,
+            rates,
+            stroke=self.scene.stroke.at_end == "stop",
+            label=label,
+            progress=progress,
+        )
         y = np.zeros((len(self.state), number))
         y[:4], y[4:7] = quaternion.T, rate.T
         return y, code
@@ -213,7 +221,7 @@ class Batch:
         if code == 0:
             return ""
         if code < 0:
-            return SAID[code]
+            return REASONS[code]
         return "not finite" if code == NOT_FINITE else self._family.limits(row)[code - 1].reason
 
 

@@ -8,26 +8,28 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics.initial_state import body_rate
-from sst_ros.errors import SingularConfiguration
+from sst_ros.dynamics.initial_state import SINGULAR
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
 
-NO_ASSEMBLY, NO_RATE = -1, -2
-SAID = {
+NO_ASSEMBLY, NO_RATE, OUTSIDE = -1, -2, -3
+REASONS = {
     NO_ASSEMBLY: "no unique admissible assembly",
     NO_RATE: "gamma_dot does not determine the body rate: singular start",
+    OUTSIDE: "initial gamma outside the stroke",
 }
 """Why a scenario does not start, by its code."""
 
 
-def starts(
+def initial_states(
     geometries: Sequence[Geometry],
     which: NDArray[np.intp],
     gamma: Array,
     gamma_dot: Array,
+    *,
+    stroke: bool,
     label: str,
     progress: bool,
 ) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -38,6 +40,7 @@ def starts(
         which: number of the geometry of each scenario, shape (N,).
         gamma: actuator angles [rad], shape (N, 3).
         gamma_dot: their rates [rad/s], shape (N, 3).
+        stroke: whether gamma must lie in the stroke.
         label: what a bar is called.
         progress: draw a bar on a terminal.
 
@@ -47,17 +50,42 @@ def starts(
     code = np.full(count, NO_ASSEMBLY, dtype=np.int64)
     order = np.argsort(which, kind="stable")
     groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(geometries)))[:-1])
-    for part in slices(len(geometries), 0, label, progress):
-        for geometry, rows in zip(geometries[part], groups[part], strict=True):
-            found = kinematics.direct_many(geometry, gamma[rows])
-            counts = np.bincount(found.configuration[found.admissible], minlength=len(rows))
-            for i in np.flatnonzero(found.admissible):
-                one = found.configuration[i]
-                if counts[one] == 1:
-                    n, rotation = rows[one], found.rotation[i]
-                    try:
-                        rate[n] = body_rate(geometry, gamma[n], gamma_dot[n], rotation)
-                        quaternion[n], code[n] = quaternion_of(rotation), 0
-                    except SingularConfiguration:
-                        code[n] = NO_RATE
+    blocks = [
+        (geometry, rows[first : first + _BLOCK])
+        for geometry, rows in zip(geometries, groups, strict=True)
+        for first in range(0, len(rows), _BLOCK)
+    ]
+    for part in slices(len(blocks), 0, label, progress):
+        for geometry, rows in blocks[part]:
+            different, same = np.unique(gamma[rows], axis=0, return_inverse=True)
+            found = kinematics.direct_many(geometry, different)
+            valid = np.flatnonzero(found.admissible)
+            owner = found.configuration[valid]
+            counts = np.bincount(owner, minlength=len(different))
+            one = np.zeros(len(different), dtype=np.intp)
+            one[owner] = valid
+            starting = counts[same.ravel()] == 1
+            here, chosen = rows[starting], one[same.ravel()[starting]]
+            rotation = found.rotation[chosen]
+            moving = gamma_dot[here].any(axis=1)
+            singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
+            code[here] = np.where(singular, NO_RATE, 0)
+            quaternion[here] = quaternion_of(rotation) if len(here) else 0.0
+            moves = moving & ~singular
+            if moves.any():
+                rate[here[moves]] = _body_rates(geometry, rotation[moves], gamma_dot[here[moves]])
+            if stroke:
+                outside = (gamma[rows] < 0.0) | (gamma[rows] > geometry.arc)
+                code[rows[outside.any(axis=1)]] = OUTSIDE
     return quaternion, rate, code
+
+
+_BLOCK = 20_000
+
+
+def _body_rates(geometry: Geometry, rotation: Array, gamma_dot: Array) -> Array:
+    """Body rates W in {E} of gamma_dot_k = g_k.W, g_k = (w_k - a t_k)/(1 - a^2), a = t_k.w_k."""
+    w = geometry.w @ rotation
+    a = np.sum(geometry.e * w, axis=-1, keepdims=True)
+    g = (w - a * geometry.e) / (1.0 - a * a)
+    return np.asarray(np.linalg.solve(g, gamma_dot[..., None])[..., 0])

@@ -145,3 +145,18 @@ def test_bad_arguments_are_refused_by_name(batch, arguments, said):
 def test_scenes_that_a_batch_cannot_run_are_refused():
     with pytest.raises(InputError, match="torque = None: must be given"):
         Batch(load_scene("stiff"), profile=True)
+
+
+def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario(batch):
+    """Where a simulation refuses it: between gamma_1 = -0.01 and 0 there is an assembly."""
+    outside = np.array([[0.8, 0.8, 0.8], [-0.01, 0.5, 0.6], [0.8, 0.8, 1.6]])
+    for gamma in outside[1:]:
+        with pytest.raises(InputError, match="must lie in the stroke"):
+            Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
+    found = batch.run(outside, (0.0, 0.0, 0.0), step=0.01, count=1)
+    assert found.fault == ("", *("initial gamma outside the stroke",) * 2)
+    assert found.fault_time[1:].tolist() == [0.0, 0.0]
+    free = replace(EXAMPLE2, stroke=replace(EXAMPLE2.stroke, at_end="ignore"))
+    assert "stroke" not in "".join(
+        Batch(free, profile=True).run(outside, (0.0, 0.0, 0.0), step=1e-3, count=1).fault
+    )
