@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross, dot
@@ -89,7 +91,8 @@ def of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     if scene.stroke.stiffness is not None:
         damping = damping_of(scene.stroke)
         stops = CompliantStops(float(geometry.arc[k]), scene.stroke.stiffness, damping)
-    if not (any(friction) or any(by_joint) or any(drive) or any(link) or stops):
+    heavy = any(map(np.any, (*drive, *link)))
+    if not (any(friction) or any(by_joint) or heavy or stops):
         return None
     return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)
 

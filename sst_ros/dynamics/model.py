@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from sst_ros.dynamics import loads
 from sst_ros.dynamics.loads import LegLoads
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, Triple, cross
-from sst_ros.scene.scene import Payload, Scene, Star
+from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross
+from sst_ros.scene.scene import Inertia, Payload, Scene, Star
 
 
 class Leg(NamedTuple):
@@ -57,17 +55,24 @@ class Model(NamedTuple):
 
 
 def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
-    """Collect the constants of a scene; its geometry may be given where it is known."""
-    geometry, star = geometry or Geometry.of(scene), scene.star_inertia
-    drives, links = scene.actuated_inertias, scene.intermediate_inertias
+    """Collect the constants of a scene; its geometry may be given where it is known.
+
+    The numbers of the scene but its geometry may be columns, of many scenes at once.
+    """
+    geometry, star = geometry or Geometry.of(scene), _star(scene)
     legs = []
     for k in range(3):
         w, v, e = (tuple(row[k].tolist()) for row in (geometry.w, geometry.v, geometry.e))
-        link, drive_zz = links[k], float(drives[k][2, 2])
-        xx, yy, zz = (float(link[i, i]) for i in range(3))
-        xy, xz, yz = float(link[0, 1]), float(link[0, 2]), float(link[1, 2])
+        drive_zz = _tensor(scene.actuated_links[k].inertia)[2]
+        if scene.actuators is not None:
+            gear = scene.actuators.gear_ratio
+            drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
+        xx, yy, zz, xy, xz, yz = _tensor(scene.intermediate_links[k].inertia)
         constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
-        star = star + xx * (np.eye(3) - np.outer(geometry.e[k], geometry.e[k]))
+        star = [
+            part + xx * (float(i == j) - e[i] * e[j])
+            for part, (i, j) in zip(star, _PLACES, strict=True)
+        ]
         legs.append(
             Leg(w, v, cross(w, v), e[0], e[1], *constants, loads.of_leg(scene, geometry, k))
         )
@@ -75,13 +80,33 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     if scene.payload is not None:
         carried.append(scene.payload)
     weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    xx, yy, zz, xy, xz, yz = (float(star[i]) for i in pairs)
     return Model(
-        star=(xx, yy, zz, xy, xz, yz),
+        star=(star[0], star[1], star[2], star[3], star[4], star[5]),
         legs=(legs[0], legs[1], legs[2]),
         gravity=None if scene.gravity is None else scene.gravity.acceleration,
         weight=(weight[0], weight[1], weight[2]),
         moment=None if scene.moment is None else scene.moment.value,
         time_constant=None if scene.actuators is None else scene.actuators.time_constant,
     )
+
+
+_PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _star(scene: Scene) -> list[Scalar]:
+    """Inertia of star and payload about O in {E}, in the order of `_PLACES`."""
+    star, payload = _tensor(scene.star.inertia), scene.payload
+    if payload is None:
+        return star
+    mass, c = payload.mass, payload.centre
+    square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+    return [
+        part + (own + mass * (square * float(i == j) - c[i] * c[j]))
+        for part, own, (i, j) in zip(star, _tensor(payload.inertia), _PLACES, strict=True)
+    ]
+
+
+def _tensor(inertia: Inertia | None) -> list[Scalar]:
+    if inertia is None:
+        return [0.0] * 6
+    return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]

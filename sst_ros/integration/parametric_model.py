@@ -21,9 +21,13 @@ from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_source import margins
 from sst_ros.integration.ode import ODE
+from sst_ros.integration.scenario_columns import numbers_of
 from sst_ros.integration.scenario_constants import (
     Constants,
     Member,
+    Places,
+    alike,
+    constants_of,
     joined,
     member_of,
     rebuilt,
@@ -69,27 +73,52 @@ class Family:
         self._limits: dict[int, tuple[Limit, ...]] = {}
         kinds: dict[bytes, tuple[Constants, list[tuple[int, Array]]]] = {}
         known: dict[bytes, int] = {}
-        which, limits = [], []
-        for row, scene in enumerate(variants.scenes(progress)):
+        count = variants.count or 1
+        self.geometry: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
+        self.torque_limit: Array = np.empty(count)
+        regular, together = _together(variants, profile)
+        single = np.ones(count, dtype=bool)
+        single[regular[1:]] = False
+        alone = np.flatnonzero(single).tolist()
+        for row, scene in variants.scenes(alone, progress):
             member = member_of(scene, profile=profile)
             _refuse_clamped(scene, member, f"scenario {row}: " if variants.keys else "")
-            which.append(known.setdefault(member.shape, len(known)))
-            if len(known) > len(self.geometries):
+            here = self.geometry[row] = known.setdefault(member.shape, len(known))
+            if here == len(self.geometries):
                 self.geometries.append(member.geometry)
+            if row in regular[:1]:
+                self.geometry[regular] = here
             terms = np.isnan(member.numbers).tobytes()
-            kinds.setdefault(terms, (member.constants, []))[1].append((row, member.numbers))
-            limits.append(member.torque_limit)
+            if row not in regular[:1]:
+                kinds.setdefault(terms, (member.constants, []))[1].append((row, member.numbers))
+            self.torque_limit[row] = member.torque_limit
             self.scene = scene
+        members = [
+            (constants, np.array([row for row, _ in rows]), np.stack([n for _, n in rows], axis=1))
+            for constants, rows in kinds.values()
+        ]
+        if together is not None:
+            constants, columns, limit = together
+            self.torque_limit[regular] = limit
+            if members:
+                members.append((constants, regular, numbers_of(columns, len(regular))))
         torque = self.scene.torque if profile else None
         dynamics = Dynamics.of(self.scene)
         self.system, self._moved = ODE(dynamics, torque), dynamics.moved
-        self.geometry: NDArray[np.intp] = np.array(which)
-        self.torque_limit: Array = np.array(limits)
-        self._tree: Constants = reduce(joined, [constants for constants, _ in kinds.values()])
-        everywhere, numbers = table(list(kinds.values()))
-        differ = np.flatnonzero(numbers.max(axis=1) != numbers.min(axis=1))
-        self.columns: Array = numbers[differ]
-        self._fixed = dict(zip(everywhere, numbers[:, 0].tolist(), strict=True))
+        everywhere: Places
+        numbers: Sequence[Any] | Array
+        if members:
+            self._tree: Constants = reduce(joined, [constants for constants, _, _ in members])
+            everywhere, numbers = table(members)
+        else:
+            assert together is not None
+            self._tree = constants
+            everywhere, numbers = alike(constants, columns)
+        differ = [i for i, row in enumerate(numbers) if np.max(row) != np.min(row)]
+        self.columns: Array = np.array([numbers[i] for i in differ]).reshape(len(differ), count)
+        self._fixed = {
+            place: float(np.ravel(row)[0]) for place, row in zip(everywhere, numbers, strict=True)
+        }
         self._varied = [everywhere[i] for i in differ]
         self._names = tuple(f"p{i}" for i in range(len(differ)))
 
@@ -129,6 +158,34 @@ class Family:
         numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, present, strict=True))
         tree: Constants = rebuilt(self._tree, numbers)
         return tree
+
+
+def _together(
+    variants: Variants, profile: bool
+) -> tuple[NDArray[np.intp], tuple[Constants, Constants, Any] | None]:
+    """Rows that are prepared as arrays: constants of the first, columns and torque limits of all.
+
+    The first of them is made a scene as well, for what all have in common.
+    """
+    rows, columns = variants.regular()
+    if len(rows) < 2:
+        return rows[:0], None
+    scene = variants.scene(int(rows[0]))
+    actuators = columns.actuators
+    limit = None if actuators is None else actuators.torque_limit
+    limit = np.inf if limit is None else limit
+    if profile and np.any(np.max(np.abs(_stacked(columns.torque.amplitude)), axis=0) > limit):
+        return rows[:0], None
+    own = member_of(scene, profile=profile)
+    return rows, (
+        own.constants,
+        constants_of(scene, columns, own.geometry, profile=profile),
+        limit,
+    )
+
+
+def _stacked(triple: Any) -> Array:
+    return np.array(np.broadcast_arrays(*triple))
 
 
 def _refuse_clamped(scene: Scene, member: Member, where: str) -> None:

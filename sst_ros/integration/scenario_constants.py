@@ -9,9 +9,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.dynamics.kernel import Model, model_of
 from sst_ros.dynamics.limits import limits_of
+from sst_ros.integration.scenario_columns import numbers_in, numbers_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.scene.schema import Section
@@ -65,13 +67,17 @@ class Member(NamedTuple):
 def member_of(scene: Scene, *, profile: bool) -> Member:
     """Collect what a batch needs of a scene, its own torques over time if they act."""
     geometry = Geometry.of(scene)
+    constants = constants_of(scene, scene, geometry, profile=profile)
+    limit = scene.actuators.torque_limit if scene.actuators else None
+    numbers = numbers_of(constants, 1)[:, 0]
+    return Member(constants, numbers, geometry, math.inf if limit is None else limit)
+
+
+def constants_of(scene: Scene, columns: Any, geometry: Geometry, *, profile: bool) -> Constants:
+    """Constants of `columns`, which has the structure of `scene` and numbers or arrays."""
     ends = [limit.end for limit in limits_of(scene, geometry)]
     pairs = tuple(zip(np.cos(ends).tolist(), np.sin(ends).tolist(), strict=True))
-    constants = Constants(model_of(scene, geometry), pairs, scene.torque if profile else None)
-    limit = scene.actuators.torque_limit if scene.actuators else None
-    numbers: list[float] = []
-    _collect(constants, numbers)
-    return Member(constants, np.array(numbers), geometry, math.inf if limit is None else limit)
+    return Constants(model_of(columns, geometry), pairs, columns.torque if profile else None)
 
 
 def joined(one: Any, other: Any) -> Any:
@@ -91,24 +97,32 @@ def rebuilt(value: Any, numbers: dict[Place, Any], place: Place = ()) -> Any:
     return None if value is None else numbers[place]
 
 
-def table(kinds: Sequence[tuple[Constants, Sequence[tuple[int, Array]]]]) -> tuple[Places, Array]:
+def alike(constants: Constants, columns: Constants) -> tuple[Places, list[Any]]:
+    """Return what `table` does for scenes that have the same terms, a number where all have it."""
+    places = tuple(_places(constants, ()))
+    numbers = [x for x in numbers_in(columns) if isinstance(x, np.ndarray) or not math.isnan(x)]
+    return places, numbers
+
+
+def table(
+    kinds: Sequence[tuple[Constants, NDArray[np.intp], Array]],
+) -> tuple[Places, Array]:
     """All places there are, and the numbers there, a column a scene.
 
     A scene that lacks a term gets coefficients of zero.
 
     Args:
-        kinds: for each set of terms the constants of a scene that has it, and of all such scenes
-            their number and `Member.numbers`.
+        kinds: for each set of terms the constants of a scene that has it, the rows of all such
+            scenes, shape (m,), and a column of `Member.numbers` for each.
 
     """
-    own = [tuple(_places(constants, ())) for constants, _ in kinds]
+    own = [tuple(_places(constants, ())) for constants, _, _ in kinds]
     places = tuple(dict.fromkeys(place for some in own for place in some))
     line = {place: i for i, place in enumerate(places)}
-    found = np.full((len(places), sum(len(rows) for _, rows in kinds)), np.nan)
-    for some, (_, rows) in zip(own, kinds, strict=True):
-        values = np.stack([numbers for _, numbers in rows], axis=1)
-        lines, columns = [line[place] for place in some], [row for row, _ in rows]
-        found[np.ix_(lines, columns)] = values[~np.isnan(values[:, 0])]
+    found = np.full((len(places), sum(len(rows) for _, rows, _ in kinds)), np.nan)
+    for some, (_, rows, values) in zip(own, kinds, strict=True):
+        lines = np.array([line[place] for place in some])
+        found[np.ix_(lines, rows)] = values[~np.isnan(values[:, 0])]
     for place, numbers in zip(places, found, strict=True):
         missing = np.isnan(numbers)
         if missing.any():
@@ -119,17 +133,6 @@ def table(kinds: Sequence[tuple[Constants, Sequence[tuple[int, Array]]]]) -> tup
             coulomb = (*place[:-1], "coulomb")
             numbers[:] = np.where(numbers == 0.0, found[line[coulomb]], numbers)
     return places, found
-
-
-def _collect(value: Any, numbers: list[float]) -> None:
-    """Append all numbers of a tree, quickly."""
-    if isinstance(value, float):
-        numbers.append(value)
-    elif value is None:
-        numbers.append(math.nan)
-    else:
-        for entry in value if isinstance(value, tuple) else vars(value).values():
-            _collect(entry, numbers)
 
 
 def _places(value: Any, place: Place) -> Iterator[Place]:

@@ -9,14 +9,15 @@ without inertia.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.integration.scenario_columns import regular_rows, with_columns
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.scene.bodies import Link, Payload, Star
@@ -74,11 +75,12 @@ class Variants:
         self.keys = tuple(parameters)
         self.count: int | None = None
         self._rows: dict[str, Array] = {}
+        self._specs: dict[str, Spec] = {}
         self._tree: Tree = {}
         problems = []
         for key, value in parameters.items():
             try:
-                spec = _entered(self._tree, scene, key.split("."), key)
+                spec = self._specs[key] = _entered(self._tree, scene, key.split("."), key)
                 self._rows[key] = rows = _rows(value, spec, self.count)
                 self.count = len(rows)
             except ValueError as error:
@@ -102,24 +104,38 @@ class Variants:
         assert isinstance(built, Scene)
         return built
 
-    def scenes(self, progress: bool) -> Iterator[Scene]:
-        """Yield the scenes of all rows, with a bar on a terminal if `progress`.
+    def regular(self) -> tuple[NDArray[np.intp], Any]:
+        """Rows with the terms of the document that need no scene of their own, and their columns.
+
+        The columns are the document with an array for each number that varies, see
+        `scenario_columns`; they are those of all rows.
+        """
+        if not self._rows:
+            return np.empty(0, dtype=np.intp), self.document
+        with np.errstate(all="ignore"):
+            columns = with_columns(self.document, self._tree, self._rows)
+            mask = regular_rows(self.document, columns, self._rows, self._specs)
+        rows = np.flatnonzero(mask)
+        chosen = {key: values[rows] for key, values in self._rows.items()}
+        return rows, with_columns(self.document, self._tree, chosen)
+
+    def scenes(self, rows: Sequence[int], progress: bool) -> Iterator[tuple[int, Scene]]:
+        """Yield the scenes of some rows, with a bar on a terminal if `progress`.
 
         Raises:
             InputError: rows make no scene; lists the first ten problems.
 
         """
         problems: list[Problem] = []
-        count = self.count or 1
         label = f"{self.document.name}, preparing"
-        for part in slices(count, 0, label, progress and bool(self.keys)):
-            for row in range(part.start, part.stop):
+        for part in slices(len(rows), 0, label, progress and bool(self.keys)):
+            for row in rows[part]:
                 try:
                     scene = self.scene(row)
                 except InputError as error:
                     problems += error.problems
                 else:
-                    yield scene
+                    yield row, scene
             if len(problems) >= _MOST_PROBLEMS:
                 break
         if problems:

@@ -17,6 +17,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.initial_states import NO_RATE
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4
 from sst_ros.integration.ode import ODE
+from sst_ros.integration.scenarios import Variants
 from sst_ros.mechanism import singularities, workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Initial, Link, Spring
@@ -261,6 +262,30 @@ def test_a_singular_start_stops_no_other():
     assert code.tolist() == [0, 0]
     assert np.all(y[4:7] == 0.0)
     assert batch.start(gamma, (1.0, 0.0, 0.0))[1].tolist() == [NO_RATE, 0]
+
+
+def test_rows_that_have_the_terms_of_the_document_need_no_scene_each(monkeypatch):
+    """A thousand of them take one; zeros and other geometries have scenes of their own."""
+    built = []
+    scene = Variants.scene
+    monkeypatch.setattr(Variants, "scene", lambda self, row: built.append(row) or scene(self, row))
+    rng = np.random.default_rng(3)
+    parameters = {
+        "star.inertia.zz": rng.uniform(0.25, 0.3, 1000),
+        "intermediate_links[1].inertia.xx": rng.uniform(8e-6, 1e-5, 1000),
+        "torque.amplitude": rng.uniform(0.5, 4.0, (1000, 3)),
+    }
+    together = Batch(EXAMPLE2, RK4, profile=True, parameters=parameters)
+    assert len(set(built)) == 1
+    columns = together.drives(REST, 1000)
+    for row in (0, 17, 999):
+        own = Batch(together.scenario(row), RK4, profile=True)
+        at = (0.1, *STATE[:7])
+        assert compiled(together.program)(*at, *columns[:, row]) == compiled(own.program)(*at)
+    parameters["torque.amplitude"][500] = 0.0
+    built.clear()
+    Batch(EXAMPLE2, RK4, profile=True, parameters=parameters)
+    assert len(set(built)) == 2
 
 
 REFUSED = [
