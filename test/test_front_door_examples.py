@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a first user wants, in few lines."""
+
+import numpy as np
+import pytest
+
+OWN = """
+from sst_ros import load_scene, simulate
+scene = load_scene("general").with_values({"star.alpha_deg": [110, 120, 130], "gravity.acceleration": [0, 0, -9.81],
+    "base.v": [[1, 0, 0], [0.1, 1, 0], [0, 0.1, 1]], "payload.mass": 0.2, "payload.centre": [0, 0, 0.2],
+    "friction.gamma.viscous": 0.05, "stroke.at_end": "ignore", "workspace.at_edge": "ignore"})
+motion = simulate(scene, lambda t: (0.3 * t, -0.2, 0.1), 0.3, initial=([0.7, 0.8, 0.75], [0, 0, 0]))
+print(motion.gamma.shape, motion.message)
+motion.plot().savefig("motion.png")
+"""
+
+MONTE_CARLO = """
+import numpy as np
+from matplotlib.figure import Figure
+from sst_ros import Batch, load_scene
+scene, random = load_scene("example2"), np.random.default_rng(1)
+batch = Batch(scene, profile=True, parameters={"star.inertia.zz": random.normal(0.26, 0.01, 2000)})
+runs = batch.run(random.normal(0.785, 0.05, (2000, 3)), (0.0, 0.0, 0.0), step=0.02, count=50)
+print("fraction that leaves the stroke:", sum("gamma" in text for text in runs.fault) / 2000)
+figure = Figure()
+figure.subplots().hist(runs.fault_time[np.isfinite(runs.fault_time)], bins=40)
+figure.savefig("ends.png")
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "picture"), [(OWN, 8, "motion.png"), (MONTE_CARLO, 10, "ends.png")]
+)
+def test_it_takes_few_lines_and_draws(text, most, picture, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    pytest.importorskip("numba", reason="a batch needs numba") if "Batch" in text else None
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(text, names)
+    assert len(text.strip().splitlines()) <= most
+    assert (tmp_path / picture).stat().st_size > 1000
+    print(capsys.readouterr().out)
+    if "motion" in names:
+        assert names["motion"].success
+        assert np.all(np.isfinite(names["motion"].gamma))
+    else:
+        assert 0.0 < sum("gamma" in text for text in names["runs"].fault) / 2000 < 1.0
