@@ -6,10 +6,10 @@ import pytest
 
 OWN = """
 from sst_ros import load_scene, simulate
-scene = load_scene("general").with_values({"star.alpha_deg": [110, 120, 130], "gravity.acceleration": [0, 0, -9.81],
-    "base.v": [[1, 0, 0], [0.1, 1, 0], [0, 0.1, 1]], "payload.mass": 0.2, "payload.centre": [0, 0, 0.2],
-    "friction.gamma.viscous": 0.05, "stroke.at_end": "ignore", "workspace.at_edge": "ignore"})
-motion = simulate(scene, lambda t: (0.3 * t, -0.2, 0.1), 0.3, initial=([0.7, 0.8, 0.75], [0, 0, 0]))
+scene = load_scene("general").with_values({"star.alpha_deg": [110, 120, 130],
+    "base.v": [[1, 0, 0], [0.1, 1, 0], [0, 0.1, 1]], "gravity.acceleration": [0, 0, -9.81],
+    "payload.mass": 0.2, "payload.centre": [0, 0, 0.2], "friction.gamma.viscous": 0.05})
+motion = simulate(scene, lambda t: (0.3 * t, -0.2, 0.1), 0.1, initial=([0.7, 0.8, 0.75], [0] * 3))
 print(motion.gamma.shape, motion.message)
 motion.plot().savefig("motion.png")
 """
@@ -33,7 +33,8 @@ figure.savefig("ends.png")
 )
 def test_it_takes_few_lines_and_draws(text, most, picture, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib")
-    pytest.importorskip("numba", reason="a batch needs numba") if "Batch" in text else None
+    if "Batch" in text:
+        pytest.importorskip("numba", reason="a batch needs numba")
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(text, names)
