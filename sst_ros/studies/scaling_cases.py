@@ -48,7 +48,7 @@ def _scaled_times() -> Iterator[Case]:
 
 
 def _scaled_inertias() -> Iterator[Case]:
-    for scale in (1e-15, 1e-12, 1e-6, 1e6, 1e9, 1e15):
+    for scale in (1e-12, 1e-6, 1e6, 1e9):
         yield Case(
             f"inertia x {scale:g}",
             "the same motion, under torques scaled alike",

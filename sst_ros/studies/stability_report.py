@@ -145,7 +145,8 @@ def summary(cases: Sequence[CaseResult]) -> str:
     """Count the cases in a sentence."""
     failed = sum(not case.passed for case in cases)
     twice = sum(case.same_bits is not None for case in cases)
-    return f"{len(cases)} cases, {failed} failed; {twice} run interpreted and compiled."
+    both = f"{twice} of them run compiled too" if twice else "interpreted runs only"
+    return f"{len(cases)} cases, {failed} failed; {both}."
 
 
 def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
