@@ -201,7 +201,7 @@ def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGINT)
     status, _, err = nodes.stop(process, signal.SIGTERM)
-    assert status == 0, err
+    assert status == (1 if command == "recorder" else 0), err  # its bag is empty
     assert "Traceback" not in err
 
 

@@ -48,13 +48,13 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
     """
     run = tracking.read(twice[0] / "bag")
-    judged = tracking.judged(run)
+    metrics = tracking.metrics(run)
     travel = np.ptp(run.track.gamma, axis=0).max()
     assert travel > 0.2
-    assert judged.samples == 301 and judged.largest.max() < 1e-3 * travel
+    assert metrics.samples == 301 and metrics.largest.max() < 1e-3 * travel
     assert np.nanmax(run.orientation_error) < 1e-3 * travel
-    assert judged.feedforward == pytest.approx(1.0) and not judged.feedback.any()
-    assert judged.settling == 0.0 and judged.limited == 0
+    assert metrics.feedforward == pytest.approx(1.0) and not metrics.feedback.any()
+    assert metrics.settling == 0.0 and metrics.limited == 0
 
 
 def test_the_demo_shows_a_table_and_a_picture(twice):
@@ -206,8 +206,8 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
     run = recording.read(bag)
     assert not run.effort[-1].any() and run.effort[:100].any()  # let go
-    judged = tracking.judged(tracking.read(bag))
-    assert judged.samples > 50 and judged.largest.max() < 1e-3
+    metrics = tracking.metrics(tracking.read(bag))
+    assert metrics.samples > 50 and metrics.largest.max() < 1e-3
 
 
 def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_path):
