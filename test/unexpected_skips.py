@@ -7,6 +7,7 @@ ALLOWED = (
     "long doubles are doubles here",
     "needs /dev/full",
     "needs root to act as a second user",
+    "of a ROS installation",
     "no chromium with chromedriver on the PATH",
 )
 

@@ -25,12 +25,15 @@ def installed(package):
 
 pytestmark = [
     pytest.mark.ros,
+    pytest.mark.timeout(400),  # several launches in a test
     pytest.mark.skipif(
         not (shutil.which("ros2") and installed("ros2launch") and installed("sst_ros")),
         reason="needs `ros2 launch` of a ROS installation with this package built by colcon",
     ),
 ]
-needs_rosbag2 = pytest.mark.skipif(not installed("ros2bag"), reason="needs `ros2 bag`")
+needs_rosbag2 = pytest.mark.skipif(
+    not installed("ros2bag"), reason="needs `ros2 bag` of a ROS installation"
+)
 
 
 class Launch:
@@ -178,7 +181,7 @@ def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):
     assert view.ended() == 0, view.text
 
 
-@pytest.mark.skipif(installed("rviz2"), reason="RViz is installed")
+@pytest.mark.skipif(installed("rviz2"), reason="for a ROS installation without RViz")
 @pytest.mark.parametrize("name", ["view.launch.py", "simulate.launch.py"])
 def test_rviz_without_its_packages_starts_nothing(launch, name):
     run = launch(name, "rviz:=true")
@@ -196,19 +199,19 @@ def test_an_unknown_argument_is_refused(launch):
 
 @needs_rosbag2
 def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
-    words = ["scene:=friction", "play:=true", "sync:=free", "record:=true", "bag:=sst"]
-    first = launch("simulate.launch.py", *words, "output:=bag")
-    assert first.ended() == 0, first.text
-    (tmp_path / "wait.yaml").write_text(
-        "/**: {ros__parameters: {wait_for_command: true, command_timeout: 0.0}}"
+    torques = [f"{k / 100},0.01,0.02,0.03" for k in range(101)]  # by which it hardly moves
+    (tmp_path / "torques.csv").write_text("\n".join(["time,tau_1,tau_2,tau_3", *torques]))
+    (tmp_path / "given.yaml").write_text(
+        "/**: {ros__parameters: {csv: torques.csv, wait_for_command: true, command_timeout: 0.0}}"
     )
-    words = ["scene:=friction", "params_file:=wait.yaml", "duration:=2.0"]
-    fresh = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=again")
+    words = ["params_file:=given.yaml", "record:=true", "bag:=sst"]
+    first = launch("simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag")
+    assert first.ended() == 0, first.text
+    fresh = launch("simulate.launch.py", "duration:=5.0", *words, "output:=again")
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
     player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, "--delay", "10")
     assert player.ended() == 0, player.text
     assert fresh.ended() == 0, fresh.text
-    played = counts(tmp_path / "bag")[topic]
     received = recording.read(tmp_path / "again").diagnostics["commands_received"]
-    assert int(received) == played
+    assert int(received) == counts(tmp_path / "bag")[topic] > 400
