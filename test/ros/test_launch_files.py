@@ -34,8 +34,6 @@ pytestmark = [
 needs_rosbag2 = pytest.mark.skipif(
     not installed("ros2bag"), reason="needs `ros2 bag` of a ROS installation"
 )
-    not installed("ros2bag"), reason="needs `ros2 bag` of a ROS installation"
-)
 
 
 class Launch:
