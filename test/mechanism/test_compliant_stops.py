@@ -6,11 +6,12 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
-from one_freedom import inertia, slope
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics.loads import damping_of
 from sst_ros.errors import InputError
+from sst_ros.mechanism.symmetric_motion import inertia
+from sst_ros.mechanism.symmetric_motion import inertia_slope as slope
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import load
 from sst_ros.simulation import Simulation
