@@ -43,6 +43,7 @@ def actions(given: Given) -> list[Action]:
     if play:
         played = {
             "scene": given["scene"],
+            "rate": given["publish_rate"],
             "stamped": "true" if run["sync"] == "lockstep" else "",
             "wait_for_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }

@@ -183,7 +183,7 @@ PLAYED = Endpoint(
     depth=1000,
 )
 PLAYER = (
-    *_torques("the profile's torques [N m] at the stamp of each joint_states"),
+    *_torques("the profile's torques [N m] for the hold that each joint_states begins"),
     PLAYED,
     Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
 )

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torque player: answers every joint state with the torque of its instant."""
+"""The torque player: answers every joint state with the torque of the hold that begins there.
+
+A torque is held until the next sample. That of the hold's middle makes the motion second order in
+the period, that of its start first order only.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +37,8 @@ class TorquePlayer:
         self._profile, self._duration = self._load()
         self._commands = TorqueCommands(self.node, self._parameters)
         self._start_ns: int | None = None
+        self._last_ns = 0
+        self._warned = False
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         phase = f"{self._parameters.simulator}/phase"
         self.node.create_subscription(String, phase, self._hear, latched)
@@ -59,7 +65,7 @@ class TorquePlayer:
             raise SstError(f"the simulator stopped: {phase.data}")
 
     def _answer(self, state: JointState) -> None:
-        """Play the torque of the sample's instant; before the run, that of its start."""
+        """Play the torque of the hold that a sample begins; before the run, that of the first."""
         self._commands.received()
         # Once begun, the simulator may end before its last sample has arrived.
         if self._start_ns is None and not self._commands.subscribed():
@@ -67,17 +73,39 @@ class TorquePlayer:
         stamp_ns = self._commands.answering(state)
         if stamp_ns == 0:
             if self._start_ns is None:
-                self._commands.send(self._profile(0.0))
+                self._commands.send(self._held(0))
             return
         if self._start_ns is None:
-            self._start_ns = stamp_ns
-        elapsed = (stamp_ns - self._start_ns) / NANOSECONDS
-        if elapsed < self._duration:
-            self._commands.send(self._profile(elapsed))
+            self._start_ns = self._last_ns = stamp_ns
+        elapsed_ns = stamp_ns - self._start_ns
+        if elapsed_ns / NANOSECONDS < self._duration:
+            self._check_period(stamp_ns)
+            self._commands.send(self._held(elapsed_ns))
         else:
             self._commands.send(ZERO)
             self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
             self.done.set()
+
+    def _held(self, elapsed_ns: int) -> torque_profiles.Torque:
+        """Torques [N m] from this time of the profile [ns] until the next sample or its end."""
+        given = self._parameters
+        end_ns = round(self._duration * NANOSECONDS)
+        hold_ns = min(given.period_ns, max(0, end_ns - elapsed_ns))
+        at_ns = elapsed_ns + (hold_ns / 2 if given.hold == "middle" else 0)
+        return self._profile(at_ns / NANOSECONDS)
+
+    def _check_period(self, stamp_ns: int) -> None:
+        """Warn once where the samples come at another period than that of `rate`."""
+        apart_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
+        given = self._parameters
+        if self._warned or given.hold != "middle" or apart_ns in (0, given.period_ns):
+            return
+        self._warned = True
+        self.node.get_logger().warning(
+            f"two samples are {apart_ns / NANOSECONDS:g} s apart, not 1 / rate = "
+            f"{given.period_ns / NANOSECONDS:g} s: torques are not those of the middle of the hold;"
+            " give rate = publish_rate of the simulator, or hold:=start"
+        )
 
 
 def main(args: list[str] | None = None) -> int:

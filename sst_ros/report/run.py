@@ -91,7 +91,7 @@ def _pictures(
     motion = [Solution("run", run.seconds[rows], run.quaternion[rows], run.euler[rows])]
     errors = {"(a) integration error, against the same torques": page.error_curves(integration)}
     if ideal is not None:
-        errors["(b) against continuous torques"] = page.error_curves(ideal)
+        errors["(b) sample-and-hold error, against continuous torques"] = page.error_curves(ideal)
     figures = {
         "path_of_E": paper_figures.path(scene, motion),
         "position_of_E": paper_figures.position_of_e(scene, motion),

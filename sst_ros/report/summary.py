@@ -50,6 +50,7 @@ def summarise(
     if ideal:
         summary |= _largest("ideal_difference", ideal.error, recording.seconds)
         summary |= _largest("ideal_reference_error", ideal.own)
+        summary["hold_order"] = hold_order(recording)
     summary |= {
         "formulation_difference_relative": formulation.relative,
         "formulation_states": formulation.states,
@@ -134,6 +135,24 @@ def _largest(name: str, deviation: Deviation, seconds: Array | None = None) -> d
         at = float(seconds[np.nanargmax(deviation.gamma)]) if known.any() else None
         result[f"{name}_gamma_largest_at_s"] = at
     return result
+
+
+def hold_order(recording: Recording) -> int | None:
+    """Order in the control period of the sample-and-hold error, by the torques that were held.
+
+    Two where most of them are the scene's profile at the middle of a hold, one where they are that
+    of another instant; None where the scene has no profile or nothing was held.
+    """
+    torque, ticks = recording.scene.torque, recording.ticks
+    if torque is None or not len(ticks.start_ns):
+        return None
+    changes = 1 + np.flatnonzero(np.any(ticks.torque[1:] != ticks.torque[:-1], axis=1))
+    first, last = np.append(0, changes), np.append(changes, len(ticks.start_ns)) - 1
+    middle = (ticks.start_ns[first] + ticks.end_ns[last]) / 2 / NANOSECONDS
+    amplitude, frequency, phase = map(np.array, (torque.amplitude, torque.frequency, torque.phase))
+    expected = amplitude * np.sin(np.outer(middle, frequency) + phase)
+    off = np.abs(ticks.torque[first] - expected).max(axis=1)
+    return 2 if np.median(off) <= 1e-9 * np.abs(amplitude).max() else 1
 
 
 def _effort(recording: Recording) -> dict[str, Any]:

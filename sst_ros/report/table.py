@@ -58,7 +58,8 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield _errors("(a) integration error", "integration_error", summary)
     yield _errors("    its reference's own error", "integration_reference_error", summary)
     if "ideal_difference_gamma_rad" in summary:
-        yield _errors("(b) against continuous torques", "ideal_difference", summary)
+        order = f", order {summary['hold_order']}" if summary["hold_order"] else ""
+        yield _errors(f"(b) sample-and-hold error{order}", "ideal_difference", summary)
         yield _errors("    its reference's own error", "ideal_reference_error", summary)
     states = f"(relative, {summary['formulation_states']} states)"
     yield _row(

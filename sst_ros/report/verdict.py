@@ -73,12 +73,14 @@ def _figures(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
         ("reception period, 99.9 %", "period_p99_9_us", ".1f", " us"),
         ("integration error, gamma", "integration_error_gamma_rad", ".1e", " rad"),
         ("error estimate of the simulator", "simulator_error_estimate", ".1e", " rad"),
-        ("effect of the zero-order hold", "ideal_difference_gamma_rad", ".1e", " rad"),
+        ("sample-and-hold error, gamma", "ideal_difference_gamma_rad", ".1e", " rad"),
         ("energy balance residual", "energy_residual_max_J", ".1e", " J"),
     )
     for label, key, form, unit in pairs:
         if summary.get(key) is not None:
-            yield label, f"{summary[key]:{form}}{unit}"
+            order = summary.get("hold_order") if key.startswith("ideal") else None
+            theory = f", of order {order} in the period" if order else ""
+            yield label, f"{summary[key]:{form}}{unit}{theory}"
     yield "peak torques", _three(summary["torque_peak_N_m"], "N m")
     if summary["tracking_error_rms_rad"] is not None:
         yield "tracking error, RMS", _three(summary["tracking_error_rms_rad"], "rad")

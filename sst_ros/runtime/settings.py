@@ -143,6 +143,19 @@ class PlayerParameters(Section):
 
     scene: str = text("scene whose torque is played, by name or by path", default="example2")
     csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
+    hold: str = choice(
+        "instant whose torque is held from a sample until the next: the middle of the hold gives "
+        "an error of second order in the period, its start one of first order",
+        ("middle", "start"),
+        default="middle",
+    )
+    rate: int = integer(
+        "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
+        "Hz",
+        default=500,
+        least=1,
+        most=100000,
+    )
     simulator: str = text("name of the simulator's node", default="sst_simulator")
     stamped: bool = flag(
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
@@ -153,6 +166,16 @@ class PlayerParameters(Section):
     timeout: float = number(
         "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6
     )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse a rate without a whole period."""
+        if NANOSECONDS % self.rate:
+            yield Problem("rate", self.rate, "must divide 1e9, so that a period is whole")
+
+    @property
+    def period_ns(self) -> int:
+        """Time from one command to the next [ns]."""
+        return NANOSECONDS // self.rate
 
 
 def default_topics() -> tuple[str, ...]:

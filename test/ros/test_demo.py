@@ -45,6 +45,9 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
         assert summary[f"integration_error_{quantity}"] <= 1e-9
         assert summary[f"integration_reference_error_{quantity}"] <= 1e-12
     assert summary["formulation_difference_relative"] <= 1e-12
+    # 500 Hz: held from the middle of the profile; from its start example2 has 1.58e-2 rad.
+    assert 0.0 < summary["ideal_difference_gamma_rad"] <= 5e-5
+    assert summary["hold_order"] == 2
 
 
 def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
@@ -54,7 +57,7 @@ def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
     simulation = Simulation(played)
     expected = [simulation.state.joints.gamma]
     for sample in range(500):
-        simulation.steps(profile(2_000_000 * sample / 1e9), 1_000_000, 2)
+        simulation.steps(profile((2_000_000 * sample + 1_000_000) / 1e9), 1_000_000, 2)
         expected.append(simulation.state.joints.gamma)
     assert np.array_equal(recording.gamma, expected)
 
@@ -72,6 +75,10 @@ def test_in_example_1_e_stays_at_the_centre_and_psi_comes_back(out):
     psi = np.unwrap(recording.euler[:, 2])
     swing = psi.max() - psi.min()
     assert swing > 0.1
+    # The last sample is that of the step in which the period ends, 0.4 ms after it.
+    late = recording.seconds[-1] - math.pi / 6.0
+    assert 0.0 <= late < 1e-3
+    back = psi[-1] - late * (psi[-1] - psi[-2]) / (recording.seconds[-1] - recording.seconds[-2])
     # What is left is the hold of the torques, which the report measures against continuous ones.
     held = json.loads((out / "example1" / "summary.json").read_text())
-    assert abs(psi[-1] - psi[0]) <= held["ideal_difference_orientation_rad"] + 1e-9
+    assert abs(back - psi[0]) <= held["ideal_difference_orientation_rad"] + 1e-9
