@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder: topics into a rosbag2 in MCAP, without a ROS installation.
 
-Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken in
-batches, straight from the readers, because one executor wake-up a message costs far more.
+Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken in batches
+from the subscriptions: 1850 messages a second cost 7 % of a core that way and 27 % by callbacks of
+an executor, measured in two processes at once.
 """
 
 from __future__ import annotations
