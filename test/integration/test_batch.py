@@ -15,6 +15,8 @@ from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Actuators, Initial, Moment
 
+pytest.importorskip("numba", reason="a batch needs numba")
+
 EXAMPLE2 = load_scene("example2")
 N = 100
 

@@ -22,6 +22,8 @@ from sst_ros.mechanism import singularities, workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Initial, Link, Spring
 
+pytest.importorskip("numba", reason="a batch needs numba")
+
 EXAMPLE2 = load_scene("example2")
 HOME = np.pi / 4
 N = batch_source.LANES + 5
