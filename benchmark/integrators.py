@@ -26,7 +26,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 REPEATS = 7
 MOST_STEPS = 2**20

@@ -27,7 +27,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
 from sst_ros.integration.ode import ODE
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}
 FLAGS = {"C -O3": ("-O3",), "C -O3 -march=native": ("-O3", "-march=native")}

@@ -25,7 +25,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, RODAS4
 from sst_ros.integration.ode import ODE
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 SPAN = 0.4
 PUSH = (0.02, 0.03, -0.02)

@@ -19,7 +19,7 @@ from benchmark.timing import interleaved
 from sst_ros import scene as scenes
 from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
 from sst_ros.integration.ode import ODE
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 SCENES = ("example2", "general", "gravity_payload", "friction")
 AGREE = 1e-12

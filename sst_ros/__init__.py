@@ -35,10 +35,11 @@ if TYPE_CHECKING:
     from sst_ros.scene.loads import SineTorque
     from sst_ros.scene.scene import Scene
     from sst_ros.scene.scene import load as load_scene
-    from sst_ros.simulate_motion import simulate
-    from sst_ros.simulation import Simulation, State
-    from sst_ros.torque import PolynomialTorque, TorqueTable
-    from sst_ros.trajectory import Trajectory
+    from sst_ros.simulation.simulate import simulate
+    from sst_ros.simulation.simulation import Simulation
+    from sst_ros.simulation.torque import PolynomialTorque, TorqueTable
+    from sst_ros.simulation.trajectory import Trajectory
+    from sst_ros.state import State
 
 __version__ = "0.1.0"
 
@@ -83,18 +84,18 @@ _MODULES = {
     "Geometry": "mechanism.geometry",
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
-    "PolynomialTorque": "torque",
+    "PolynomialTorque": "simulation.torque",
     "Recording": "recording.recording",
     "ReferenceMotion": "control.reference",
     "RunStopped": "errors",
     "Scene": "scene.scene",
-    "Simulation": "simulation",
+    "Simulation": "simulation.simulation",
     "SineTorque": "scene.loads",
     "SingularConfiguration": "errors",
     "SstError": "errors",
-    "State": "simulation",
-    "TorqueTable": "torque",
-    "Trajectory": "trajectory",
+    "State": "state",
+    "TorqueTable": "simulation.torque",
+    "Trajectory": "simulation.trajectory",
     "arc_inertia": "scene.arcs",
     "direct_kinematics": "mechanism.kinematics:direct",
     "inverse_kinematics": "mechanism.kinematics:inverse",
@@ -102,7 +103,7 @@ _MODULES = {
     "plot_workspace": "plot.workspace",
     "read_bag": "recording.recording:read",
     "reference_motion": "control.reference_motions",
-    "simulate": "simulate_motion",
+    "simulate": "simulation.simulate",
     "workspace": "mechanism.workspace",
 }
 

@@ -18,7 +18,7 @@ from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.scene import yaml_document
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 STORE = get_typestore(Stores.ROS2_KILTED)
 START_NS = 1_700_000_000_123_456_789

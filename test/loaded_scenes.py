@@ -17,7 +17,7 @@ from sst_ros.scene.scene import (
     Workspace,
     load,
 )
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 REST = (0.0, 0.0, 0.0)
 IGNORE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}

@@ -10,7 +10,7 @@ import pytest
 
 from sst_ros.__main__ import main
 from sst_ros.cli.main import COMMANDS, NODES, parser
-from sst_ros.trajectory import Trajectory
+from sst_ros.simulation.trajectory import Trajectory
 
 BLOCKED = """
 import sys

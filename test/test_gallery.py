@@ -16,7 +16,7 @@ from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.scene.scene import load, names
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 REST = (0.0, 0.0, 0.0)

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The house: imports run one way, and rclpy stays in its rooms."""
+"""Structure of the package: rooms in one order, no import cycle, each class name defined once."""
 
 import ast
+import subprocess
+import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -11,13 +14,12 @@ import sst_ros
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
     {"state"},
-    {"child_process", "errors", "extras", "output_folder", "progress"},
+    {"errors", "extras", "child_process", "output_folder", "progress"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},
     {"integration"},
-    {"simulation", "torque", "interpolation", "trajectory", "trajectory_file"}
-    | {"simulate_gauss", "simulate_steps", "simulate_motion"},
+    {"simulation"},
     {"control", "description"},
     {"recording"},
     {"plot", "view"},
@@ -26,46 +28,85 @@ FLOORS = (
     {"runtime"},
     {"nodes"},
     {"demo", "launch_parts"},
-    {"cli", "__main__"},
+    {"cli"},
+    {"__main__"},
 )
+"""Rooms from the lowest to the highest; a file imports from its own floor and from those below."""
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-FILES = sorted(PACKAGE.rglob("*.py"))
-ROS = ("rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs", "geometry_msgs", "diagnostic_msgs")
+FILES = {
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces")
+HEAVY = ("scipy.spatial", "matplotlib", "numba", "rclpy", "pandas", "rosbags")
+FACE = "sst_ros"
+"""The package's face imports every room: it has no floor."""
 
 
-def imports(path):
-    """Modules that a file imports when it runs, in functions too: `sst_ros.x` by its full name."""
-    tree = ast.parse(path.read_text())
-    types = (node for node in ast.walk(tree) if isinstance(node, ast.If))
-    told = {
-        id(line)
-        for node in types
-        if ast.unparse(node.test) == "TYPE_CHECKING"
-        for line in node.body
-    }
-    for node in ast.walk(tree):
-        if id(node) in told:
-            continue
+def imports(name):
+    """Every module that a file names in an import, in functions and under TYPE_CHECKING too."""
+    path = FILES[name]
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (name.name for name in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module == "sst_ros":
-            yield from (f"sst_ros.{name.name}" for name in node.names)
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield node.module
+            base = node.module or ""
+            if node.level:
+                parts = package.split(".")
+                base = ".".join([*parts[: len(parts) - node.level + 1], *filter(None, [base])])
+            for alias in node.names:
+                full = f"{base}.{alias.name}"
+                yield full if full in FILES else base
 
 
-def room(path):
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+GRAPH = {name: {one for one in imports(name) if one in FILES and one != name} for name in FILES}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_file_imports_what_lies_below_it(path):
-    if path == PACKAGE / "__init__.py":
-        return
-    here = FLOOR[room(path)]
-    for name in imports(path):
-        if name.startswith("sst_ros."):
-            other = name.split(".")[1]
-            assert FLOOR.get(other, -1) <= here, f"{path} imports {name}"
-        if name.split(".")[0] in ROS:
-            assert room(path) == "nodes", f"{path} imports {name}"
+def room(name):
+    return name.split(".")[1] if "." in name else FACE
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name != FACE])
+def test_a_file_imports_from_its_own_floor_and_below(name):
+    here = FLOOR[room(name)]
+    for other in GRAPH[name] - {FACE}:
+        assert FLOOR[room(other)] <= here, f"{name} imports {other}"
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_only_nodes_import_ros(name):
+    for other in imports(name):
+        top = other.split(".")[0]
+        if top in ROS or top.endswith(("_msgs", "_srvs")):
+            assert room(name) == "nodes", f"{name} imports {other}"
+
+
+def test_no_import_cycle():
+    graph = {name: others - {FACE} for name, others in GRAPH.items() if name != FACE}
+    while graph:
+        free = [name for name, others in graph.items() if not others & graph.keys()]
+        assert free, f"these files import each other: {sorted(graph)}"
+        for name in free:
+            del graph[name]
+
+
+def test_every_class_name_has_one_definition():
+    places = defaultdict(list)
+    for name, path in FILES.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(name)
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def test_every_test_file_has_a_name_of_its_own():
+    # launch_testing's collector, which every ROS installation loads, refuses equal names.
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
+
+
+def test_importing_the_package_is_light():
+    code = f"import sys, sst_ros; print([m for m in {HEAVY} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

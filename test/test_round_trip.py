@@ -11,7 +11,7 @@ import numpy as np
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import angle_between, quaternion_of
 from sst_ros.scene.scene import Initial, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 STEP_NS, STEPS = 4_000_000, 250
 EXAMPLE2 = load("example2")

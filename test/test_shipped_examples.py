@@ -13,7 +13,7 @@ from sst_ros.errors import StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.symmetric_motion import inertia, inertia_slope
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 EXAMPLE1, EXAMPLE2, THIN = load("example1"), load("example2"), load("example2_thin")

@@ -8,8 +8,8 @@ from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
 from sst_ros.scene.values import plain
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulate_motion import simulate
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2")
 

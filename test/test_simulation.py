@@ -28,7 +28,7 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Actuators, Initial, Stroke, Workspace, load
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 REST = (0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.scene.loads import Friction, JointFriction, Stroke, Workspace
 from sst_ros.scene.scene import Inertia, Link, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 EXAMPLE2 = load("example2")

@@ -13,7 +13,7 @@ from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Workspace, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 TORQUES = ((0.3, -0.2, 0.1), (-1.5, 0.5, 2.0), (0.0, 0.0, 0.0), (4.0, 4.0, -4.0))

@@ -6,10 +6,10 @@ import pytest
 
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
-from sst_ros.simulate_motion import simulate
-from sst_ros.simulation import Simulation
-from sst_ros.torque import PolynomialTorque, TorqueTable
-from sst_ros.trajectory import Trajectory
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.simulation.torque import PolynomialTorque, TorqueTable
+from sst_ros.simulation.trajectory import Trajectory
 
 EXAMPLE2 = load("example2")
 ARRAYS = (

@@ -17,7 +17,7 @@ from sst_ros.description.shapes import end_point
 from sst_ros.description.tree import BASE, LEGS, STAR, actuated, intermediate
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import PageServer
 from sst_ros.view.source import ViewState

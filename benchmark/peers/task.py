@@ -17,7 +17,7 @@ from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 DURATION = 1.0
 JOINTS = ("g0", "m0", "b0", "g1", "m1", "g2", "m2")

@@ -24,7 +24,7 @@ def _compile(options: argparse.Namespace) -> int:
     from sst_ros.integration import code_cache, codegen
     from sst_ros.integration.cache_folder import cache_folder, configured_folder
     from sst_ros.scene.scene import load
-    from sst_ros.simulation import INTEGRATORS
+    from sst_ros.simulation.simulation import INTEGRATORS
 
     if options.integrator not in INTEGRATORS:
         allowed = f"must be one of {', '.join(INTEGRATORS)}"

@@ -12,7 +12,7 @@ from pathlib import Path
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.scene.scene import Scene, text_of
 from sst_ros.scene.yaml_document import line_of, read
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 
 def check(name_or_path: str | Path) -> Scene:

@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
 
 def _simulate(options: argparse.Namespace) -> int:
     from sst_ros.extras import require
-    from sst_ros.simulate_motion import simulate
+    from sst_ros.simulation.simulate import simulate
 
     out, picture = options.out, None
     if out is not None:

@@ -39,7 +39,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import State
+from sst_ros.simulation.simulation import State
 
 __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 

@@ -15,7 +15,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import State
+from sst_ros.simulation.simulation import State
 
 SINGULAR = 1e-10
 """sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""

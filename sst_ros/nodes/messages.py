@@ -14,7 +14,7 @@ from sst_ros.errors import SstError
 from sst_ros.nodes.cdr import CdrMessage, Write
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS
-from sst_ros.simulation import NANOSECONDS, State
+from sst_ros.simulation.simulation import NANOSECONDS, State
 
 MOMENTS = ("moment_x", "moment_y", "moment_z")
 _ZEROS = (0.0,) * len(JOINTS)

@@ -27,7 +27,7 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation import State, Triple
+from sst_ros.simulation.simulation import State, Triple
 
 _HISTORY_S = 2
 _FAST = 10

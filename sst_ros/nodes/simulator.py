@@ -28,7 +28,7 @@ from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 _WATCH_S = 0.1

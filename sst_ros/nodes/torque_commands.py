@@ -18,7 +18,7 @@ from sst_ros.nodes.messages import nanoseconds
 from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.simulation import Triple
+from sst_ros.simulation.simulation import Triple
 
 
 class TorqueCommands:

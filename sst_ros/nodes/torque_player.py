@@ -24,7 +24,7 @@ from sst_ros.nodes import parameters, process, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
-from sst_ros.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS
 
 
 class TorquePlayer:

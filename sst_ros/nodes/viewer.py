@@ -30,7 +30,7 @@ from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Triple
+from sst_ros.simulation.simulation import NANOSECONDS, Triple
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 

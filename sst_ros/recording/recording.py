@@ -33,8 +33,8 @@ from sst_ros.recording.topic_tables import (
     TICKS,
 )
 from sst_ros.scene.scene import Scene
-from sst_ros.torque import TorqueTable
-from sst_ros.trajectory import Trajectory
+from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd

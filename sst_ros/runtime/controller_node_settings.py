@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.scene.schema import choice, flag, integer, number, text
-from sst_ros.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS
 
 
 @dataclass(frozen=True)

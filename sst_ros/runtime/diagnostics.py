@@ -12,7 +12,7 @@ from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase
 from sst_ros.runtime.torque_input import TorqueInput
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
 _ROWS = 16

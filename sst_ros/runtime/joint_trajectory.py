@@ -11,7 +11,7 @@ from sst_ros.control.waypoints import waypoints
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:

@@ -22,7 +22,7 @@ from sst_ros.runtime.run_types import PendingReply, Phase, Reply, RunOutput
 from sst_ros.runtime.tick_loop import NoAnswer, TickLoop
 from sst_ros.runtime.torque_input import HasParameters, TorqueInput
 from sst_ros.scene.scene import Initial, Scene
-from sst_ros.simulation import Simulation, Triple
+from sst_ros.simulation.simulation import Simulation, Triple
 
 IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001

@@ -7,7 +7,7 @@ import threading
 from enum import Enum
 from typing import NamedTuple, Protocol
 
-from sst_ros.simulation import State, Triple
+from sst_ros.simulation.simulation import State, Triple
 
 
 class Phase(str, Enum):

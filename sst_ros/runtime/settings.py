@@ -10,7 +10,7 @@ from typing import ClassVar
 from sst_ros.errors import Problem
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
-from sst_ros.simulation import INTEGRATORS, NANOSECONDS
+from sst_ros.simulation.simulation import INTEGRATORS, NANOSECONDS
 
 
 @dataclass(frozen=True)

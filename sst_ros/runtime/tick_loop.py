@@ -13,7 +13,7 @@ from sst_ros.runtime.counters import Counters
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_types import RunOutput
 from sst_ros.runtime.torque_input import ZERO, HasParameters, TorqueInput
-from sst_ros.simulation import Simulation, Triple
+from sst_ros.simulation.simulation import Simulation, Triple
 
 _POLL_S = 0.001
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1

@@ -12,7 +12,7 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.simulation import NANOSECONDS, Triple
+from sst_ros.simulation.simulation import NANOSECONDS, Triple
 
 ZERO: Triple = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]

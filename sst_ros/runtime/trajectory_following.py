@@ -25,7 +25,7 @@ from sst_ros.mechanism.vec3 import ZERO, axpy, dot
 from sst_ros.runtime import joint_trajectory
 from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.scene.scene import Actuators, Scene
-from sst_ros.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS
 
 _COLUMNS = 22
 """Numbers of a sample of a `TrackingRecord`."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.studies.control_loop import ControlLoop, run_loop
 from sst_ros.studies.sampled_data import largest_stable, stability_limit
 

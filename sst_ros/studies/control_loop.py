@@ -17,7 +17,7 @@ from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
-from sst_ros.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.studies.channel import Channel, ChannelState
 
 WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)

@@ -11,7 +11,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 
 Triple = tuple[float, float, float]
 Deviation = Callable[[Simulation], float]

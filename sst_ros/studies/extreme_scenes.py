@@ -11,7 +11,7 @@ from sst_ros.errors import RunStopped
 from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 
 Triple = tuple[float, float, float]
 

@@ -22,7 +22,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial, Workspace
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import Case
 

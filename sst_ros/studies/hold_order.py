@@ -11,7 +11,7 @@ import numpy as np
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import ReferenceMotion, Triple
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.studies.control_loop import ControlLoop, at_start, run_loop
 
 EXACT_TOLERANCE = 1e-13

@@ -25,7 +25,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import TorqueFunction, Vector3
 
 INTERVALS = 20

@@ -18,7 +18,7 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import Case, Triple
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import Case
 

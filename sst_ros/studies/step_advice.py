@@ -17,7 +17,7 @@ from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 
 LONGEST_STEP = 1e-2
 """Longest control period that is recommended [s]."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import Triple
+from sst_ros.simulation.simulation import Triple
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Initial, Moment
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from test.models import seeded_samples
 
 PERIOD = 0.002

@@ -26,7 +26,7 @@ from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 FEW = settings(FAST, max_examples=25)  # each traces programs of its own
 EPS = np.finfo(float).eps

@@ -35,7 +35,7 @@ from sst_ros.scene.motions import (
     Waypoint,
 )
 from sst_ros.scene.scene import Initial, Scene, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 START = (0.75, 0.7, 0.75)
 POINTS = ((0.4, (0.8, 0.75, 0.8)), (0.9, (0.9, 0.55, 0.7)), (1.6, (0.6, 0.8, 0.65)))

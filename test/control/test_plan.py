@@ -40,7 +40,7 @@ from sst_ros.scene.scene import (
     load,
     text_of,
 )
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 HOME = (math.pi / 4,) * 3
 EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))

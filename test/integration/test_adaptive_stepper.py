@@ -16,7 +16,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.errors import Diverged, StepBudgetExceeded, StrokeExceeded, WorkspaceLeft
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Stroke, Workspace, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2")
 MILLISECOND = 1_000_000

@@ -13,12 +13,12 @@ from loaded_scenes import REST
 
 from sst_ros.integration import codegen
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 SOURCE = """\
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 simulation = Simulation(load("example1"), "rk4", compiled=True)
 print(simulation.step((1.0, 2.0, 3.0), 1_000_000).quaternion, simulation.compiled)
 """

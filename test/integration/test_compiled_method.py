@@ -20,7 +20,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 DRIVE = (3.0, -2.0, 1.0)
 MOMENT = (0.1, 0.2, 0.3)

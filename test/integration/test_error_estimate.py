@@ -17,7 +17,7 @@ from loaded_scenes import REST, apart, run
 from sst_ros.control.torque_profiles import sine
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 ROUNDING = 1e-12
 PERIOD = 0.01

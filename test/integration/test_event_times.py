@@ -22,7 +22,7 @@ from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2")
 NOTHING = Link(inertia=inertia_of(1e-18 * np.eye(3)))

@@ -19,7 +19,7 @@ from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 CONDITION = 1e-13
 EXPLICIT = [method for method in METHODS.values() if isinstance(method, Tableau)]

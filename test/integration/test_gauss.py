@@ -19,7 +19,7 @@ from sst_ros.integration.gauss import Collocation, tables
 from sst_ros.integration.ode import ODE
 from sst_ros.integration.sine_source import flat_sin
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2")
 START = Simulation(EXAMPLE2).state

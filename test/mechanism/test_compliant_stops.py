@@ -14,7 +14,7 @@ from sst_ros.mechanism.symmetric_motion import inertia
 from sst_ros.mechanism.symmetric_motion import inertia_slope as slope
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE1 = load("example1")
 START = np.pi / 4

@@ -14,7 +14,7 @@ from sst_ros.plot import energy, pictures
 from sst_ros.plot.pictures import PICTURES, draw
 from sst_ros.recording import recording, signals
 from sst_ros.report import energy_balance
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 GAMMA = math.pi / 4
 

@@ -12,7 +12,7 @@ from sst_ros.control import torque_profiles
 from sst_ros.demo import demo
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.recording.recording import read
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 PICTURES = {

@@ -26,7 +26,7 @@ from sst_ros.nodes.messages import (
     zyz_angles as angles_of,
 )
 from sst_ros.scene.loads import JOINTS
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 1_700_000_000_123_456_789

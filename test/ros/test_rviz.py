@@ -12,7 +12,7 @@ from sst_ros.description.frame_ids import BASE_FRAME
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
 from sst_ros.scene.scene import load, names
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 pytestmark = pytest.mark.ros
 LAYOUT = Path(__file__).parents[2] / "config" / "sst_ros.rviz"

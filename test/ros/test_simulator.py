@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 from sst_ros import load_scene
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import read
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 pytestmark = pytest.mark.ros
 COMMANDS = "/sst_simulator/commands"

@@ -18,7 +18,7 @@ from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ZERO, TorqueInput
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 
 class Output:

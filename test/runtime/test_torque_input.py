@@ -11,7 +11,7 @@ from sst_ros import load_scene
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ZERO, MessageRefused, TorqueInput, by_name
 from sst_ros.scene.scene import Actuators
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 
 def array(*data):

@@ -14,7 +14,7 @@ from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Initial
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 
 PERIOD_NS = 2_000_000
 START_NS = 1_700_000_000_123_456_789

@@ -25,7 +25,7 @@ from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Initial, load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import case_catalogue, extreme_cases
 
 CASES = list(case_catalogue.cases())

@@ -11,7 +11,7 @@ from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.ode import ODE
 from sst_ros.report import states
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies.step_advice import step_advice
 
 

@@ -21,7 +21,7 @@ from sst_ros.description.tree import BASE, STAR
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import load
-from sst_ros.simulation import Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing, add_shape
 from sst_ros.view.server import PageServer
 from sst_ros.view.source import ViewState

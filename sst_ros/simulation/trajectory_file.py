@@ -14,14 +14,13 @@ import numpy as np
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.torque import TorqueProfile, profile_from
+from sst_ros.simulation.sampled_motion import SampledMotion, T
+from sst_ros.simulation.torque import TorqueProfile, profile_from
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
-
-    from sst_ros.trajectory import Trajectory
 
 _KEY = b"sst_ros"
 _FORMAT = 1
@@ -50,7 +49,7 @@ UNITS = {
 _FIGURES = ("status", "message", "method", "error_estimate", "energy_residual", "evaluations")
 
 
-def frame(trajectory: Trajectory) -> pd.DataFrame:
+def frame(trajectory: SampledMotion) -> pd.DataFrame:
     """See `Trajectory.to_pandas`."""
     pd = _needed("pandas", "record")
     table = pd.DataFrame(_columns(trajectory))
@@ -58,7 +57,7 @@ def frame(trajectory: Trajectory) -> pd.DataFrame:
     return table
 
 
-def dataset(trajectory: Trajectory) -> xr.Dataset:
+def dataset(trajectory: SampledMotion) -> xr.Dataset:
     """See `Trajectory.to_xarray`."""
     package = _needed("xarray", "all")
     second = {4: "part", 3: "leg"}
@@ -82,7 +81,7 @@ def dataset(trajectory: Trajectory) -> xr.Dataset:
     return found
 
 
-def save(trajectory: Trajectory, path: Path, *, overwrite: bool) -> None:
+def save(trajectory: SampledMotion, path: Path, *, overwrite: bool) -> None:
     """See `Trajectory.save`."""
     pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
 
@@ -107,7 +106,7 @@ def save(trajectory: Trajectory, path: Path, *, overwrite: bool) -> None:
         raise InputError("save", [Problem("path", str(path), allowed)]) from None
 
 
-def load(cls: type[Trajectory], path: Path) -> Trajectory:
+def load(cls: type[T], path: Path) -> T:
     """See `Trajectory.load`."""
     pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
 
@@ -137,37 +136,29 @@ def load(cls: type[Trajectory], path: Path) -> Trajectory:
     )
 
 
-def draw(trajectory: Trajectory) -> Figure:
+def draw(trajectory: SampledMotion) -> Figure:
     """See `Trajectory.plot`."""
     _needed("matplotlib", "plot")
     from matplotlib.figure import Figure
 
-    t = trajectory.t
-    shown = trajectory
-    if 2 <= len(t) < _FEW:
-        shown = trajectory.at(np.union1d(t, np.linspace(t[0], t[-1], _FEW)))
     figure = Figure(figsize=(8.0, 9.0), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
     rows = (("gamma", "rad"), ("gamma_dot", "rad/s"), ("torque", "N m"))
     for axes, (name, unit) in zip(panels, rows, strict=False):
-        for k, column in enumerate(getattr(shown, name).T, start=1):
-            axes.plot(shown.t, column, label=f"leg {k}", linewidth=1.2)
+        for k, column in enumerate(getattr(trajectory, name).T, start=1):
+            axes.plot(trajectory.t, column, label=f"leg {k}", linewidth=1.2)
         axes.set_ylabel(f"{name} [{unit}]")
         axes.grid(alpha=0.3)
     panels[0].legend(loc="best", ncols=3)
-    panels[3].plot(shown.t, shown.energy, color="black", linewidth=1.2)
+    panels[3].plot(trajectory.t, trajectory.energy, color="black", linewidth=1.2)
     panels[3].set(ylabel="energy [J]", xlabel="time [s]")
     panels[3].grid(alpha=0.3)
     figure.suptitle(f"{trajectory.scene.name}: {trajectory.message}")
     return figure
 
 
-_FEW = 300
-"""Samples below which a picture asks for more."""
-
-
-def html(trajectory: Trajectory) -> str:
-    """Summary as a table, and the picture where matplotlib is installed."""
+def html(trajectory: SampledMotion, shown: SampledMotion) -> str:
+    """Return a summary as a table, and a picture of `shown` where matplotlib is installed."""
     rows = {
         "scene": trajectory.scene.name,
         "samples": f"{len(trajectory)}, {trajectory.t[0]:g} to {trajectory.t[-1]:g} s",
@@ -179,10 +170,10 @@ def html(trajectory: Trajectory) -> str:
         f"<tr><th style='text-align:left'>{name}</th><td>{html_text.escape(value)}</td></tr>"
         for name, value in rows.items()
     )
-    return f"<table>{cells}</table>{_picture(trajectory)}"
+    return f"<table>{cells}</table>{_picture(shown)}"
 
 
-def _picture(trajectory: Trajectory) -> str:
+def _picture(trajectory: SampledMotion) -> str:
     import io
 
     try:
@@ -194,7 +185,7 @@ def _picture(trajectory: Trajectory) -> str:
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 
-def _columns(trajectory: Trajectory) -> dict[str, Any]:
+def _columns(trajectory: SampledMotion) -> dict[str, Any]:
     columns: dict[str, Any] = {"t": trajectory.t}
     for name, (_, parts) in QUANTITIES.items():
         array = getattr(trajectory, name)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation import State
+from sst_ros.simulation.simulation import State
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

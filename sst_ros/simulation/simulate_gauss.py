@@ -13,9 +13,9 @@ from sst_ros.integration.gauss import NODES
 from sst_ros.integration.gauss_motion import GaussMotion, NotSmooth
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, Simulation
-from sst_ros.torque import ConstantTorque, SineProfile
-from sst_ros.trajectory import Trajectory
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.torque import ConstantTorque, SineProfile
+from sst_ros.simulation.trajectory import Trajectory
 
 _FINEST_PER_SECOND, _FINEST = 256, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""

@@ -1,35 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory: a motion of a scene as arrays over time, simulated or recorded."""
+"""The arrays of a motion over time, and what follows from them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros import trajectory_file
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
-from sst_ros.interpolation import Law, integrated
 from sst_ros.mechanism import frames
 from sst_ros.scene.scene import Scene
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-    from matplotlib.figure import Figure
+from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile
 
 Array = NDArray[np.float64]
+Law: TypeAlias = TorqueProfile | FeedbackFunction
+T = TypeVar("T", bound="SampledMotion")
 
-JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 
-
-class Trajectory:
+class SampledMotion:
     """A motion over n instants. Arrays are shared between calls: treat them as read-only.
 
     Args:
@@ -95,7 +88,7 @@ class Trajectory:
         self._residual = energy_residual
 
     @classmethod
-    def _shared(cls, shared: dict[str, Any], y: Array) -> Trajectory:
+    def _shared(cls: type[T], shared: dict[str, Any], y: Array) -> T:
         """Build one from its other attributes and checked states (n, 7 or 10), for `simulate`."""
         new = cls.__new__(cls)
         new.__dict__.update(shared)
@@ -178,81 +171,6 @@ class Trajectory:
             t = rotation @ np.array((leg.e0, leg.e1, 0.0))
             worst = max(worst, float(np.abs(np.einsum("ni,ni->n", r, t)).max(initial=0.0)))
         return worst
-
-    def at(self, t: ArrayLike) -> Trajectory:
-        """Sample the motion at other times, to the accuracy of the run.
-
-        Each state is integrated from the sample before it, under the torques that act there.
-
-        Args:
-            t: one time or times [s], shape (m,), within the trajectory.
-
-        Raises:
-            InputError: a time lies outside.
-
-        """
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        inside = (times >= self.t[0]) & (times <= self.t[-1])
-        if times.ndim != 1 or not np.all(inside):
-            allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
-            raise InputError("at", [Problem("t", t, allowed)])
-        y = integrated(self, times)
-        return Trajectory(
-            self.scene,
-            times,
-            y[:, :4],
-            y[:, 4:7],
-            y[:, 7:10],
-            status=self.status,
-            message=self.message,
-            method=self.method,
-            error_estimate=self.error_estimate,
-            energy_residual=self._residual,
-            evaluations=self.evaluations,
-            law=self.law,
-            dense=self.dense,
-        )
-
-    def to_pandas(self) -> pd.DataFrame:
-        """Table with a row an instant and a column a number, units in its `attrs`."""
-        return trajectory_file.frame(self)
-
-    def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimensions time, leg, axis and part; needs the package xarray."""
-        return trajectory_file.dataset(self)
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write a Parquet file that `load` reads back to the bit, units and scene included.
-
-        Raises:
-            InputError: the file exists, unless `overwrite`; or pyarrow is not installed.
-
-        """
-        trajectory_file.save(self, Path(path), overwrite=overwrite)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Trajectory:
-        """Read a file that `save` has written.
-
-        Raises:
-            InputError: there is no such file, or it holds no trajectory.
-
-        """
-        return trajectory_file.load(cls, Path(path))
-
-    def plot(self) -> Figure:
-        """Draw actuator angles, rates, torques and the energy over time; needs matplotlib."""
-        return trajectory_file.draw(self)
-
-    def __repr__(self) -> str:
-        span = f"{self.t[0]:g} to {self.t[-1]:g} s" if len(self) else "no samples"
-        return (
-            f"<Trajectory of {self.scene.name}: {len(self)} samples, {span}; {self.message}; "
-            f"{self.method}; error estimate {self.error_estimate:.1e} rad>"
-        )
-
-    def _repr_html_(self) -> str:
-        return trajectory_file.html(self)
 
     @property
     def _dynamics(self) -> Dynamics:

@@ -16,10 +16,10 @@ from sst_ros.integration.gauss_motion import NotSmooth
 from sst_ros.scene.given import scene_of, with_initial
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.simulate_gauss import CollocatedMotion
-from sst_ros.simulate_steps import SteppedMotion
-from sst_ros.simulation import AUTO, INTEGRATORS, NANOSECONDS
-from sst_ros.torque import (
+from sst_ros.simulation.simulate_gauss import CollocatedMotion
+from sst_ros.simulation.simulate_steps import SteppedMotion
+from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
+from sst_ros.simulation.torque import (
     ConstantTorque,
     FeedbackFunction,
     FunctionTorque,
@@ -28,7 +28,7 @@ from sst_ros.torque import (
     TorqueProfile,
     profile_of,
 )
-from sst_ros.trajectory import Array, Trajectory
+from sst_ros.simulation.trajectory import Array, Trajectory
 
 GAUSS = "gauss"
 METHODS = (*INTEGRATORS, GAUSS)

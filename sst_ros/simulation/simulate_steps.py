@@ -11,9 +11,9 @@ import numpy as np
 from sst_ros.errors import Diverged, RunStopped
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
-from sst_ros.torque import FeedbackFunction, TorqueProfile, TorqueTable, Triple, three
-from sst_ros.trajectory import Trajectory
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
+from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile, TorqueTable, Triple, three
+from sst_ros.simulation.trajectory import Trajectory
 
 SAMPLES = 200
 """Intervals of a motion whose times nobody has named."""

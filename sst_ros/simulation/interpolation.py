@@ -4,28 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_ros.dynamics.kernel import Joints
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation import NANOSECONDS, State
-from sst_ros.torque import ConstantTorque, FeedbackFunction, TorqueProfile
-
-if TYPE_CHECKING:
-    from sst_ros.trajectory import Trajectory
-
-Array = NDArray[np.float64]
-Law: TypeAlias = TorqueProfile | FeedbackFunction
+from sst_ros.simulation.sampled_motion import Array, SampledMotion
+from sst_ros.simulation.simulation import NANOSECONDS, State
+from sst_ros.simulation.torque import ConstantTorque, FeedbackFunction, TorqueProfile
 
 _ACCURACY = 1e-13
 """Error of a step; gaps between samples are short, so that steps do not add up."""
 
 
-def integrated(trajectory: Trajectory, times: Array) -> Array:
+def integrated(trajectory: SampledMotion, times: Array) -> Array:
     """States (quaternion, body rate, acting torque) at times [s] inside, shape (m, 10)."""
     if trajectory.dense is not None:
         states = trajectory.dense(times)
@@ -66,7 +59,7 @@ def _torque_limit(scene: Scene) -> float:
 class _Gap:
     """Integrates from a sample towards the next one."""
 
-    def __init__(self, trajectory: Trajectory) -> None:
+    def __init__(self, trajectory: SampledMotion) -> None:
         scene = trajectory.scene
         self._dynamics = Dynamics.of(scene)
         self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
