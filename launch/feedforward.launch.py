@@ -48,7 +48,7 @@ def actions(given: Given) -> list[Action]:
         "rate": given["control_rate"],
         "stamped": "true" if given["sync"] == "lockstep" else "",
         "wait_for_recorder": given["record"],
-        "wait_for_subscribers": "2" if recorded else "",  # the recorder reads the commands, too
+        "min_subscribers": "2" if recorded else "",  # the recorder reads the commands, too
     }
     return [
         *([launch_parts.recorder(given)] if recorded else []),

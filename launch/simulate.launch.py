@@ -45,7 +45,7 @@ def actions(given: Given) -> list[Action]:
             "scene": given["scene"],
             "rate": given["publish_rate"],
             "stamped": "true" if run["sync"] == "lockstep" else "",
-            "wait_for_subscribers": "2" if recorded else "",  # the recorder reads them, too
+            "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }
         endless = bool(given["duration"]) and float(given["duration"]) == 0.0
         nodes.append(launch_parts.node(given, "torque_player", played, ends=endless))

@@ -8,8 +8,8 @@ loops; `Batch` runs many scenarios of one scene. All names are imported when the
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
 
+TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
     from sst_ros.control.controller import Controller
     from sst_ros.control.controller_settings import ControllerSettings

@@ -74,7 +74,7 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
     with _recorded(bag, publish_rate=CONTROL_RATE, **run):
         followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
         followed |= {"stamped": True, "feedforward_at": "middle"}
-        waits = {"wait_for_subscribers": 2, "wait_for_recorder": True}
+        waits = {"min_subscribers": 2, "wait_for_recorder": True}
         with _node("inverse_dynamics", **followed, **waits) as controller:
             _wait_for_end("inverse_dynamics", controller, 20.0 * seconds + _END_S)
 
@@ -91,7 +91,7 @@ def record(name: str, bag: Path) -> None:
     duration = scene.load(name).duration or 1.0
     with (
         _recorded(bag, scene=name, sync="lockstep", duration=duration),
-        _node("torque_player", scene=name, stamped=True, wait_for_subscribers=2) as player,
+        _node("torque_player", scene=name, stamped=True, min_subscribers=2) as player,
     ):
         _wait_for_end("torque_player", player, duration + _END_S)
 

@@ -44,7 +44,7 @@ class TorqueCommands:
 
     def subscribed(self) -> bool:
         """Whether they have as many subscribers as the parameters ask for."""
-        return self.publisher.get_subscription_count() >= self._given.wait_for_subscribers
+        return self.publisher.get_subscription_count() >= self._given.min_subscribers
 
     def answering(self, state: JointState) -> int:
         """Give the next commands the stamp of a state; return it [ns], 0 where it is no sample."""

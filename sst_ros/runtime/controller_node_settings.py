@@ -48,8 +48,12 @@ class ControllerNodeParameters(ControllerSettings):
     stamped: bool = flag(
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
-    wait_for_subscribers: int = integer(
-        "subscribers of the commands to wait for", "1", default=1, least=1, most=100
+    min_subscribers: int = integer(
+        "least number of subscribers of the commands, before which none is sent",
+        "1",
+        default=1,
+        least=1,
+        most=100,
     )
     wait_for_recorder: bool = flag(
         "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",

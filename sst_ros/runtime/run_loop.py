@@ -178,7 +178,7 @@ class RunLoop:
                 if not self._ticks.to_next_sample(paced=False):
                     return Reply(False, "not done: the node is shutting down")
             except NoAnswer as none:
-                return Reply(False, f"not done: {none}")
+                return Reply(False, f"not done, no controller answers: {none}")
             except RunStopped as stopped:
                 self._fail(str(stopped))
             if self.fault:

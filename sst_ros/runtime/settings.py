@@ -160,8 +160,12 @@ class PlayerParameters(Section):
     stamped: bool = flag(
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
-    wait_for_subscribers: int = integer(
-        "subscribers of the commands to wait for", "1", default=1, least=1, most=100
+    min_subscribers: int = integer(
+        "least number of subscribers of the commands, before which none is sent",
+        "1",
+        default=1,
+        least=1,
+        most=100,
     )
     timeout: float = number(
         "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6

@@ -16,6 +16,8 @@ from sst_ros.runtime.torque_input import ZERO, HasParameters, TorqueInput
 from sst_ros.simulation.simulation import Simulation, Triple
 
 _POLL_S = 0.001
+_STEP_ANSWER_S = 0.4
+"""Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.steps`, after which requests are served."""
 
@@ -104,7 +106,8 @@ class TickLoop:
 
         Raises:
             RunStopped: the run ends before; the ticks before it are done and logged.
-            NoAnswer: in lockstep no answer came within lockstep_timeout.
+            NoAnswer: in lockstep no answer came within lockstep_timeout, or within 0.4 s where a
+                paused run is stepped.
 
         """
         answer = self._answer(paced) if self._lockstep else None
@@ -168,6 +171,7 @@ class TickLoop:
                 return None
             waited = time.monotonic() - self._awaited_since
             timeout = self._owner.parameters.lockstep_timeout or math.inf
+            timeout = timeout if paced else min(timeout, _STEP_ANSWER_S)
             if waited > timeout:
                 raise NoAnswer(
                     f"no command answered the sample of {self._stamp_ns} ns within {timeout:g} s"

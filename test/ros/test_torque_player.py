@@ -60,7 +60,7 @@ def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, tmp
     other = observer.node.create_subscription(
         Float64MultiArray, "/sst_simulator/commands", lambda message: None, 10
     )
-    player = nodes.run("torque_player", csv=table, wait_for_subscribers=2)
+    player = nodes.run("torque_player", csv=table, min_subscribers=2)
     states = observer.publisher(JointState, "/joint_states")
     message = JointState()
     message.header.stamp.nanosec = 500

@@ -259,6 +259,25 @@ def test_a_pause_does_not_count_as_waiting_for_an_answer():
         bench.until(lambda: len(bench.output.samples) > 1)
 
 
+def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests():
+    """Its wait has a bound of its own, and an answer that comes later is used by the next step."""
+    bench = Bench(sync="lockstep", lockstep_timeout=10.0)
+    with bench.running() as loop:
+        assert loop.ask(partial(loop.pause, True)).success
+        began = time.monotonic()
+        waiting = threading.Thread(target=loop.ask, args=(loop.step,))
+        waiting.start()
+        assert loop.ask(partial(loop.pause, True)) == (True, "already paused")
+        waiting.join()
+        reply = loop.ask(loop.step)
+        assert time.monotonic() - began < 2.0
+        assert not reply.success and "no controller answers: no command answered" in reply.message
+        assert loop.phase is Phase.PAUSED and not loop.fault
+        bench.stamped.append(answer(stamps(bench)[-1]))
+        assert loop.ask(loop.step).success
+        assert len(stamps(bench)) == 2
+
+
 def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
     class Stuck(Simulation):
         stuck = threading.Event()
