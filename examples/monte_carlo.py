@@ -18,7 +18,7 @@ inertia = {
 }
 batch = Batch(scene, profile=True, parameters=inertia)
 runs = batch.run(scene.initial.gamma, scene.initial.gamma_dot, step=1e-3, count=1000)
-left = np.isfinite(runs.fault_time)
+left = np.char.startswith(runs.message, "gamma")
 print(f"{left.mean():.1%} leave the stroke")
 plt.hist([spread[~left], spread[left]], 40, stacked=True, label=["stay", "leave the stroke"])
 plt.xlabel("inertia of the star over its nominal value")

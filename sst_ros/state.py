@@ -69,3 +69,26 @@ class Assembly:
     beta: NDArray[np.float64]
     det_j2: float
     admissible: bool
+
+
+QUANTITIES = {
+    "quaternion": ("1", "part"),
+    "body_rate": ("rad/s", "axis"),
+    "torque": ("N m", "leg"),
+    "gamma": ("rad", "leg"),
+    "mu": ("rad", "leg"),
+    "beta": ("rad", "leg"),
+    "gamma_dot": ("rad/s", "leg"),
+    "mu_dot": ("rad/s", "leg"),
+    "beta_dot": ("rad/s", "leg"),
+    "euler_zyz": ("rad", "angle"),
+}
+"""Unit and dimension of each array of a motion with more than one column."""
+
+DIMENSIONS: dict[str, list[str] | list[int]] = {
+    "part": ["x", "y", "z", "w"],
+    "axis": ["x", "y", "z"],
+    "leg": [1, 2, 3],
+    "angle": ["theta", "phi", "psi"],
+}
+"""Coordinates of each dimension."""

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from functools import cached_property, lru_cache
 from typing import Any
 
+import numpy as np
+
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.mechanism.vec3 import rotation_rows
@@ -140,4 +142,13 @@ def compiled(program: Program) -> Function:
     names: dict[str, Any] = {name: getattr(math, name) for name in FUNCTIONS}
     exec(program.source("function"), names)
     function: Function = names["function"]
+    return function
+
+
+def compiled_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
+    """Turn a program into a function of NumPy arrays, element by element."""
+    names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
+    names["atan2"] = np.arctan2
+    exec(program.source("function"), names)
+    function: Callable[..., tuple[Any, ...]] = names["function"]
     return function

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -18,6 +17,7 @@ from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
+from sst_ros.integration.batch_result import BatchResult, BatchStates
 from sst_ros.integration.batch_source import LANES, NOT_FINITE, batch_source
 from sst_ros.integration.initial_states import REASONS, initial_states
 from sst_ros.integration.methods import DOP853, Tableau
@@ -31,29 +31,6 @@ _UNUSED = {
     "initial": "is given to run, not as a parameter",
     **dict.fromkeys(("motion", "duration"), "is nothing that a batch uses"),
 }
-
-
-@dataclass(frozen=True)
-class Scenarios:
-    """What became of N scenarios. A faulted one keeps its last valid state.
-
-    Attributes:
-        quaternion: orientations (x, y, z, w), shape (N, 4).
-        body_rate: angular velocities in {E} [rad/s], shape (N, 3).
-        fault: why a scenario ended early, "" where it did not, N texts.
-        fault_time: end of the step in which it ended [s], nan where it did not, shape (N,).
-        local_error: largest local error estimate of a quaternion in a step, shape (N,).
-        kept: states (quaternion, body rate) every `keep_every` steps from the start on, shape
-            (samples, N, 7); None unless asked for.
-
-    """
-
-    quaternion: Array
-    body_rate: Array
-    fault: tuple[str, ...]
-    fault_time: Array
-    local_error: Array
-    kept: Array | None
 
 
 class Batch:
@@ -113,7 +90,7 @@ class Batch:
         keep_every: int = 0,
         threads: int = 0,
         progress: bool = False,
-    ) -> Scenarios:
+    ) -> BatchResult:
         """Run all scenarios for `count` steps.
 
         Args:
@@ -123,7 +100,7 @@ class Batch:
                 they have one; not used with a profile.
             step: length of a step [s].
             count: number of steps.
-            keep_every: keep the states every so many steps; 0 keeps none.
+            keep_every: keep the states every so many steps, see `BatchResult.kept`; 0 keeps none.
             threads: how many; 0 takes all cores. No bit depends on it.
             progress: draw a bar on a terminal.
 
@@ -136,20 +113,32 @@ class Batch:
         number = y.shape[1]
         given = self.drives(torque, number)
         when, error = np.full(number, np.nan), np.zeros(number)
-        kept = [y[:7].T.copy()] if keep_every else []
+        kept, ends = [y.copy()], [0]
         for part in slices(count, keep_every, self.scene.name, progress):
             span = part.stop - part.start
             self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
             if keep_every and span == keep_every:
-                kept.append(y[:7].T.copy())
+                kept.append(y.copy())
+                ends.append(part.stop)
         when[code < 0] = 0.0
-        return Scenarios(
-            quaternion=y[:4].T.copy(),
-            body_rate=y[4:7].T.copy(),
-            fault=tuple(self._said(row, int(number)) for row, number in enumerate(code)),
+        # A step that a limit ended is left out: its beginning is the last valid state.
+        last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(when / step) - 1, count)) * step
+        torques = given[:3].T if self._family.system.drive[:3] == TORQUE else np.zeros((number, 3))
+        valid = code >= 0
+        samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
+        return BatchResult(
+            self._family,
+            last,
+            y.copy(),
+            torques,
+            valid,
+            status=np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code)),
+            message=tuple(self._message(row, int(number)) for row, number in enumerate(code)),
             fault_time=when,
             local_error=error,
-            kept=np.stack(kept) if kept else None,
+            kept=BatchStates(self._family, samples, np.stack(kept), torques, valid)
+            if keep_every
+            else None,
         )
 
     def start(
@@ -217,9 +206,9 @@ class Batch:
         text = batch_source(self.program, self.margins, self._method, len(self.state))
         return codegen.load([text], {"NODES": self._method.c}, numba=True, nogil=True)
 
-    def _said(self, row: int, code: int) -> str:
+    def _message(self, row: int, code: int) -> str:
         if code == 0:
-            return ""
+            return "reached the end"
         if code < 0:
             return REASONS[code]
         return "not finite" if code == NOT_FINITE else self._family.limits(row)[code - 1].reason

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
@@ -151,6 +152,23 @@ class Family:
             return margins(limits, at.ends, at.model, inputs[:7])
 
         return trace(signs, (*QUATERNION, *RATE, *self._names))
+
+    @cached_property
+    def outputs(self) -> Program:
+        """Angles and rates of the joints (18 numbers) and the energy [J]; inputs as `margins`."""
+
+        def values(*inputs: Expression) -> tuple[Any, ...]:
+            model, state = self._constants(inputs[7:]).model, inputs[:7]
+            joints = [number for triple in kernel.joints(model, state) for number in triple]
+            return (*joints, energy.kinetic(model, state) + energy.potential(model, state))
+
+        return trace(values, (*QUATERNION, *RATE, *self._names))
+
+    @property
+    def torque_columns(self) -> Any:
+        """Torques of the profile, numbers or a column where they differ; None without a profile."""
+        numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, self.columns, strict=True))
+        return rebuilt(self._tree, numbers).torque
 
     def _constants(self, inputs: Sequence[Expression]) -> Constants:
         """Return the constants, with expressions where they differ."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sst_ros import Simulation, load_scene
+from sst_ros import Simulation, load_scene, simulate
 from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, RunStopped
@@ -14,6 +14,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Actuators, Initial, Moment
+from sst_ros.state import QUANTITIES
 
 pytest.importorskip("numba", reason="a batch needs numba")
 
@@ -57,25 +58,25 @@ def test_a_scenario_equals_a_run_of_its_own(result, gamma, n):
     sign = np.sign(result.quaternion[n] @ state.quaternion)
     np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=1e-10)
     np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=1e-9)
-    assert result.fault[n] == ("" if stopped is None else stopped.reason)
+    assert result.message[n] == ("reached the end" if stopped is None else stopped.reason)
     if stopped is not None:
         assert 0.0 <= result.fault_time[n] - stopped.time <= 0.01 + 1e-12
 
 
 def test_faults_stay_with_their_scenario(result):
-    assert result.fault[7] == "no unique admissible assembly"
-    assert 0 < sum(map(bool, result.fault)) < N
+    assert result.message[7] == "no unique admissible assembly"
+    assert 0 < np.count_nonzero(result.status) < N
     assert np.all(np.isfinite(result.quaternion))
     assert np.all(np.isfinite(result.body_rate))
-    ended = np.array([bool(text) for text in result.fault])
-    assert np.array_equal(np.isfinite(result.fault_time), ended)
+    assert result.status[7] == -1
+    assert np.array_equal(np.isfinite(result.fault_time), result.status != 0)
 
 
 def test_threads_change_no_bit(batch, gamma, result):
     again = batch.run(gamma, (0.0, 0.0, 0.0), step=0.01, count=100, threads=1)
     assert np.array_equal(again.quaternion, result.quaternion)
     assert np.array_equal(again.body_rate, result.body_rate)
-    assert again.fault == result.fault
+    assert again.message == result.message
 
 
 @pytest.mark.parametrize("method", [DORMAND_PRINCE, DOP853])
@@ -95,13 +96,14 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
 
 
 def test_trajectories_are_kept_when_asked_for(result, gamma):
-    assert result.kept.shape == (5, N, 7)
-    assert np.array_equal(result.kept[-1, :, :4], result.quaternion)
-    assert np.all(np.isfinite(result.kept))
+    assert result.kept.quaternion.shape == (5, N, 4)
+    assert np.array_equal(result.kept.quaternion[-1], result.quaternion)
+    assert np.array_equal(result.kept.gamma[-1], result.gamma, equal_nan=True)
+    assert np.all(np.isfinite(result.kept.body_rate))
 
 
 def test_its_local_error_is_told_and_small(result):
-    started = np.array([text != "no unique admissible assembly" for text in result.fault])
+    started = result.status >= 0
     assert np.all(result.local_error[started] < 1e-9)
     assert np.all(result.local_error[started] > 0.0)
 
@@ -156,9 +158,61 @@ def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario(batch):
         with pytest.raises(InputError, match="must lie in the stroke"):
             Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
     found = batch.run(outside, (0.0, 0.0, 0.0), step=0.01, count=1)
-    assert found.fault == ("", *("initial gamma outside the stroke",) * 2)
+    assert found.message == ("reached the end", *("initial gamma outside the stroke",) * 2)
     assert found.fault_time[1:].tolist() == [0.0, 0.0]
     free = replace(EXAMPLE2, stroke=replace(EXAMPLE2.stroke, at_end="ignore"))
     assert "stroke" not in "".join(
-        Batch(free, profile=True).run(outside, (0.0, 0.0, 0.0), step=1e-3, count=1).fault
+        Batch(free, profile=True).run(outside, (0.0, 0.0, 0.0), step=1e-3, count=1).message
     )
+
+
+LAGGING = {
+    **{f"actuators.{key}": value for key, value in {"time_constant": 0.02}.items()},
+    "payload.mass": 0.3,
+    "payload.centre": [0.0, 0.0, 0.2],
+    "gravity.acceleration": [0.0, 0.0, -9.81],
+}
+
+
+@pytest.mark.parametrize("changes", [{}, LAGGING])
+def test_the_result_has_the_quantities_of_simulate(changes):
+    """Scenario by scenario, with another inertia and amplitude in each."""
+    scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
+    parameters = {"star.inertia.zz": [0.25, 0.3], "torque.amplitude": [[1, 2, 3], [2, 0.1, 1]]}
+    batch = Batch(scene, profile=True, parameters=parameters)
+    found = batch.run(scene.initial.gamma, (0, 0, 0), step=1e-3, count=100, keep_every=50)
+    assert found.success.all()
+    assert set(found.message) == {"reached the end"}
+    for row in range(2):
+        motion = simulate(batch.scenario(row), t_eval=[0.0, 0.05, 0.1], tolerance=1e-10)
+        for name in (*QUANTITIES, "energy"):
+            expected, kept = getattr(motion, name), getattr(found.kept, name)[:, row]
+            np.testing.assert_allclose(kept, expected, atol=2e-8, err_msg=name)
+            assert np.array_equal(getattr(found, name)[row], kept[-1])
+    np.testing.assert_allclose(found.kept.t, [[0.0] * 2, [0.05] * 2, [0.1] * 2], rtol=1e-15)
+
+
+def test_a_scenario_that_ends_early_has_the_time_of_its_last_state(result, gamma):
+    row = int(np.flatnonzero(result.status == 1)[0])
+    scene = replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma[row])))
+    assert result.fault_time[row] - result.t[row] == pytest.approx(0.01)
+    alone = simulate(scene, t_eval=[result.t[row]], duration=1.0)
+    np.testing.assert_allclose(result.gamma[row], alone.gamma[0], atol=1e-9)
+    np.testing.assert_allclose(result.torque[row], alone.torque[0], atol=1e-12)
+    assert np.all(np.isnan(result.gamma[7]))
+
+
+def test_tables_have_units_and_a_row_a_scenario(result):
+    pytest.importorskip("pandas", reason="tables need pandas")
+    pytest.importorskip("xarray", reason="datasets need xarray")
+    table, data = result.to_pandas(), result.to_xarray()
+    assert len(table) == N
+    assert table.attrs["units"]["gamma_1"] == "rad"
+    assert np.array_equal(table["gamma_2"], result.gamma[:, 1], equal_nan=True)
+    assert data["gamma"].dims == ("scenario", "leg")
+    assert data["gamma"].attrs["units"] == "rad"
+    assert data["message"].values.tolist() == list(result.message)
+    assert float((data["status"] == 1).mean()) == np.mean(result.status == 1)
+    kept = result.kept.to_xarray()
+    assert kept["beta"].dims == ("time", "scenario", "leg")
+    assert np.array_equal(kept["beta"].sel(leg=3), result.kept.beta[..., 2], equal_nan=True)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a batch returns: states of many scenarios as arrays, in the names of `simulate`."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.dynamics.traced_dynamics import compiled_for_arrays
+from sst_ros.extras import require
+from sst_ros.integration.parametric_model import Family
+from sst_ros.mechanism import frames
+from sst_ros.mechanism.geometry import Array
+from sst_ros.state import DIMENSIONS, QUANTITIES
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+_BLOCK = 8192
+"""Scenarios whose joints are computed at once: all numbers of the program are arrays as long."""
+
+_SCENARIO = ("status", "message", "fault_time", "local_error")
+
+
+class BatchStates:
+    """States of N scenarios, at one time or at several. Treat the arrays as read-only.
+
+    Args:
+        family: scenes of the scenarios.
+        t: times [s] of the states, shape (N,) or (samples, N).
+        y: state of the integration (quaternion, body rate, with lag three torques), shape
+            (state, N) or (samples, state, N).
+        torque: commanded torques [N m], shape (N, 3); not used under a profile.
+        valid: whether a scenario has started, shape (N,).
+
+    Attributes:
+        t: times of the states [s], shape (N,) or (samples, N): those of the last valid state in a
+            scenario that has ended.
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4) or (samples, N, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3) or (samples, N, 3).
+
+    """
+
+    def __init__(
+        self, family: Family, t: Array, y: Array, torque: Array, valid: NDArray[np.bool_]
+    ) -> None:
+        self._family, self._torque, self._valid = family, torque, valid
+        self._state = np.moveaxis(y, -2, -1)
+        self.t = t
+        self.quaternion: Array = self._state[..., :4]
+        self.body_rate: Array = self._state[..., 4:7]
+
+    @property
+    def gamma(self) -> Array:
+        """Angles of the actuators [rad], shape (..., N, 3); nan where a scenario has no start."""
+        return self._outputs[..., 0:3]
+
+    @property
+    def mu(self) -> Array:
+        """Angles between base arcs and arcs of the star [rad], shape (..., N, 3)."""
+        return self._outputs[..., 3:6]
+
+    @property
+    def beta(self) -> Array:
+        """Angles from the carriages to E [rad], shape (..., N, 3)."""
+        return self._outputs[..., 6:9]
+
+    @property
+    def gamma_dot(self) -> Array:
+        """Rates of gamma [rad/s], shape (..., N, 3)."""
+        return self._outputs[..., 9:12]
+
+    @property
+    def mu_dot(self) -> Array:
+        """Rates of mu [rad/s], shape (..., N, 3)."""
+        return self._outputs[..., 12:15]
+
+    @property
+    def beta_dot(self) -> Array:
+        """Rates of beta [rad/s], shape (..., N, 3)."""
+        return self._outputs[..., 15:18]
+
+    @property
+    def energy(self) -> Array:
+        """Kinetic and potential energy [J], shape (..., N)."""
+        return self._outputs[..., 18]
+
+    @cached_property
+    def euler_zyz(self) -> Array:
+        """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., N, 3)."""
+        return np.asarray(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+
+    @cached_property
+    def torque(self) -> Array:
+        """Torques that act at the actuators [N m], shape (..., N, 3)."""
+        if self._state.shape[-1] > 7:
+            return self._state[..., 7:10]
+        profile = self._family.torque_columns
+        if profile is None:
+            return np.broadcast_to(self._torque, self.body_rate.shape)
+        rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
+        return np.stack([a * np.sin(f * self.t + p) for a, f, p in rows], axis=-1)
+
+    @cached_property
+    def _outputs(self) -> Array:
+        """Angles and rates of the joints and the energy, shape (..., N, 19)."""
+        program = self._family.outputs
+        function = compiled_for_arrays(program)
+        found = np.full((*self.t.shape, len(program.outputs)), np.nan)
+        flat = found.reshape(-1, *found.shape[-2:])
+        states = self._state.reshape(-1, *self._state.shape[-2:])
+        started = np.flatnonzero(self._valid)
+        blocks = [started[i : i + _BLOCK] for i in range(0, len(started), _BLOCK)]
+        columns = self._family.columns
+        for sample, of_sample in enumerate(states):
+            for rows in blocks:
+                own = columns[:, rows] if columns.shape[1] > 1 else columns
+                with np.errstate(all="ignore"):
+                    numbers = function(*of_sample[rows, :7].T, *own)
+                for j, number in enumerate(numbers):
+                    flat[sample, rows, j] = number
+        return found
+
+    def to_xarray(self) -> xr.Dataset:
+        """Arrays with the dimension scenario, before it time if there are several; needs xarray."""
+        first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
+        arrays: dict[str, Any] = {
+            name: ((*first, dimension), getattr(self, name), {"units": unit})
+            for name, (unit, dimension) in QUANTITIES.items()
+        }
+        arrays["energy"] = (first, self.energy, {"units": "J"})
+        arrays["t"] = (first, self.t, {"units": "s"})
+        coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
+        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS)
+        found.attrs["scene"] = self._family.scene.name
+        return found
+
+
+class BatchResult(BatchStates):
+    """What became of N scenarios: their states at the end, or the last valid ones.
+
+    Attributes:
+        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
+            start or its numbers ceased to be finite, shape (N,).
+        message: the same in words, N texts.
+        fault_time: end of the step in which a scenario ended [s], nan where it reached its end,
+            shape (N,).
+        local_error: largest local error estimate of a quaternion in a step, shape (N,).
+        kept: states every `keep_every` steps from the start on, arrays (samples, N, ...); None
+            unless asked for.
+
+    """
+
+    def __init__(
+        self,
+        *states: Any,
+        status: NDArray[np.int64],
+        message: tuple[str, ...],
+        fault_time: Array,
+        local_error: Array,
+        kept: BatchStates | None,
+    ) -> None:
+        super().__init__(*states)
+        self.status, self.message = status, message
+        self.fault_time, self.local_error, self.kept = fault_time, local_error, kept
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether a scenario reached its end, shape (N,)."""
+        return np.equal(self.status, 0)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Arrays with the dimension scenario; needs the package xarray. See `kept` for times."""
+        found = super().to_xarray()
+        for name in _SCENARIO:
+            found[name] = ("scenario", np.array(getattr(self, name)))
+        found["fault_time"].attrs["units"] = "s"
+        return found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table with a row a scenario and a column a number, units in its `attrs`."""
+        columns: dict[str, Any] = {name: getattr(self, name) for name in _SCENARIO}
+        columns["t"] = self.t
+        units = {"t": "s", "fault_time": "s", "energy": "J"}
+        for name, (unit, dimension) in QUANTITIES.items():
+            array = getattr(self, name)
+            for i, part in enumerate(DIMENSIONS[dimension]):
+                columns[f"{name}_{part}"] = array[:, i]
+                units[f"{name}_{part}"] = unit
+        table: pd.DataFrame = require("pandas").DataFrame(columns | {"energy": self.energy})
+        table.index.name = "scenario"
+        table.attrs = {"units": units, "scene": self._family.scene.name}
+        return table
+
+    def __repr__(self) -> str:
+        name, ended = self._family.scene.name, np.count_nonzero(self.status)
+        return f"<BatchResult of {name}: {len(self)} scenarios, {ended} ended early>"
