@@ -21,7 +21,7 @@ def seconds(call):
 
 
 def main():
-    scene = load_scene("example2")
+    scene = load_scene("example2_heavy")
     state = Simulation(scene).state
     motion = GaussMotion(scene, scene.torque, [*state.quaternion, *state.body_rate], 1.0, 1e-9)
 

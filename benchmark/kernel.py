@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What one evaluation and one step cost: numba, plain Python, and C from the same traced program.
 
-python -m benchmark.kernel [--scene example2] [--rounds 15] [--json FILE]
+python -m benchmark.kernel [--scene example2_heavy] [--rounds 15] [--json FILE]
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def slopes(count, y):
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
     parser = argparse.ArgumentParser(prog="python -m benchmark.kernel", description=__doc__)
-    parser.add_argument("--scene", default="example2")
+    parser.add_argument("--scene", default="example2_heavy")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)

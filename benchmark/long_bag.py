@@ -51,7 +51,7 @@ _MARK = 1.2345678901234567e300
 
 def endless() -> Scene:
     """Return a scene whose motion goes on inside for ever."""
-    example = scenes.load("example2")
+    example = scenes.load("example2_heavy")
     springs = tuple(Spring(joint=f"gamma_{k}", stiffness=40.0, rest=math.pi / 4) for k in (1, 2, 3))
     friction = JointFriction(gamma=Friction(viscous=1.0))
     return dataclasses.replace(

@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _orders() -> None:
     """Truth: SciPy's DOP853 at its tightest, in short steps, on the kernel before tracing."""
-    scene = scenes.load("example2")
+    scene = scenes.load("example2_heavy")
     assert scene.torque is not None
     model, torque = kernel.model_of(scene), sine(scene.torque)
     state = Simulation(scene).state
@@ -57,7 +57,7 @@ def _orders() -> None:
         (0.0, SPAN), start, method="DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.002,
     ).y[:, -1]  # fmt: skip
     system = ODE(Dynamics.of(scene), scene.torque)
-    print(f"Orders on example2, {SPAN} s: error with n steps and with 2 n")
+    print(f"Orders on example2_heavy, {SPAN} s: error with n steps and with 2 n")
 
     def told(name: str, order: int, n: int, errors: list[float]) -> None:
         found = math.log(errors[0] / errors[1]) / math.log(2.0)
@@ -89,7 +89,7 @@ def _energy(seconds: int) -> None:
 
 def _between() -> None:
     """What `within` costs and is worth, beside a polynomial through a step (SciPy's, order 7)."""
-    scene = scenes.load("example2")
+    scene = scenes.load("example2_heavy")
     assert scene.torque is not None
     print("\nStates inside a step of 10 ms")
     for compiled in (False, True):

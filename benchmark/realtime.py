@@ -293,7 +293,7 @@ def main() -> None:
     )
     parser.add_argument("--minutes", type=float, default=1.0, help="of each run at 1 kHz; 0: none")
     parser.add_argument("--usual", type=float, help="minutes without SCHED_FIFO; half as many")
-    parser.add_argument("--scene", default="example2")
+    parser.add_argument("--scene", default="example2_heavy")
     parser.add_argument("--plain", action="store_true", help="plain Python, no machine code")
     parser.add_argument("--priority", type=int, default=20, help="of SCHED_FIFO")
     parser.add_argument("--fleet", type=int, default=0, help="only so many simulators at once")

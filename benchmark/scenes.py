@@ -4,8 +4,8 @@
     python -m benchmark.scenes [--markdown]
 
 `bare` is a kernel that was written without any optional term (test/mechanism/bare_kernel.py) on
-the bodies of example2. Every round times every program once, in an order that changes, and ratios
-are taken within a round; what is told is the median of the rounds. `python` runs the flat
+the bodies of example2_heavy. Every round times every program once, in an order that changes, and
+ratios are taken within a round; what is told is the median of the rounds. `python` runs the flat
 function in the interpreter, `numba` the same source compiled, in a loop of compiled code.
 """
 
@@ -33,7 +33,7 @@ from sst_ros.dynamics.expression import Program  # noqa: E402
 from sst_ros.dynamics.traced_dynamics import Dynamics  # noqa: E402
 from sst_ros.scene.scene import load, names  # noqa: E402
 
-PLAIN = "example2"
+PLAIN = "example2_heavy"
 ROUNDS = 41
 CALLS = {"python": 400, "numba": 20_000}
 

@@ -21,7 +21,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
 from sst_ros.integration.ode import ODE
 from sst_ros.simulation.simulation import Simulation
 
-SCENES = ("example2", "general", "gravity_payload", "friction")
+SCENES = ("example2_heavy", "general", "gravity_payload", "friction")
 AGREE = 1e-12
 REPEATS = 1000
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_ros import Batch, load_scene
 
-scene = load_scene("example2")
+scene = load_scene("example2_heavy")
 spread = np.random.default_rng(1).normal(1.0, 0.1, 2000)
 inertia = {
     f"star.inertia.{ii}": getattr(scene.star.inertia, ii) * spread for ii in ("xx", "yy", "zz")

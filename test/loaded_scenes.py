@@ -42,14 +42,14 @@ def loaded() -> Scene:
 
 
 def viscous(coefficient: float, stiffness: float = 500.0) -> Scene:
-    """Springs at the actuators of example2 against viscous friction."""
+    """Springs at the actuators of example2_heavy against viscous friction."""
     rests = (0.9, 0.7, 0.8)
     springs = [
         Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=rest)
         for k, rest in enumerate(rests)
     ]
     friction = JointFriction(gamma=Friction(viscous=coefficient))
-    return replace(load("example2"), friction=friction, springs=tuple(springs))
+    return replace(load("example2_heavy"), friction=friction, springs=tuple(springs))
 
 
 def run(simulation: Simulation, seconds: float, period: float, torque=REST) -> Simulation:

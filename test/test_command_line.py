@@ -234,7 +234,12 @@ def test_scene_names_are_completed(tmp_path):
              "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "found"), "_ARGCOMPLETE_IFS": "\n"},
         timeout=60, check=True,
     )  # fmt: skip
-    assert (tmp_path / "found").read_text().split() == ["example1", "example2", "example2_thin"]
+    assert (tmp_path / "found").read_text().split() == [
+        "example1",
+        "example2",
+        "example2_heavy",
+        "example2_stroke",
+    ]
 
 
 def test_importing_the_package_imports_nothing_slow():
@@ -262,7 +267,7 @@ def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsy
     assert trajectory.t[-1] == 0.05
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert "exists already" in error_of(words, capsys)
-    assert main(["simulate", "example2", "--duration", "5"]) == 1
+    assert main(["simulate", "example2_heavy", "--duration", "5"]) == 1
     said = capsys.readouterr()
     assert "stopped at t = 1.2853" in said.out
     assert said.err == ""

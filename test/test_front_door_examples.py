@@ -18,7 +18,7 @@ MONTE_CARLO = """
 import numpy as np
 import matplotlib.pyplot as plt
 from sst_ros import Batch, load_scene
-scene, random = load_scene("example2"), np.random.default_rng(1)
+scene, random = load_scene("example2_heavy"), np.random.default_rng(1)
 batch = Batch(scene, profile=True, parameters={"star.inertia.zz": random.normal(0.26, 0.01, 2000)})
 runs = batch.run(random.normal(0.785, 0.05, (2000, 3)), (0.0, 0.0, 0.0), step=0.02, count=50)
 left = np.char.startswith(runs.message, "gamma")

@@ -75,14 +75,24 @@ def test_example1_swings_about_a_centre_at_rest():
         assert rotation_matrix(state.quaternion)[:, 2] == pytest.approx([3.0**-0.5] * 3, abs=1e-11)
 
 
-def test_example2_stays_in_its_stroke_for_the_whole_second():
-    gamma = of("example2", "gamma")
+def test_example2_passes_the_ends_that_it_ignores():
+    """With every printed number: gamma_1 from 0.9125 s, beta_2 from 0.9326 s to the end at 1 s."""
+    gamma, beta = np.degrees(of("example2", "gamma")), np.degrees(of("example2", "beta"))
     assert run("example2")[1][-1].time_ns == 1_000_000_000
+    assert gamma[-1, 0] == gamma.max() == pytest.approx(93.986, abs=1e-3) and gamma.min() > 0.0
+    assert np.flatnonzero(gamma[:, 0] > 90.0)[0] * STEP_NS == 914_000_000
+    assert beta[-1, 1] == beta.min() == pytest.approx(-5.157, abs=1e-3)
+    assert np.flatnonzero(beta[:, 1] < 0.0)[0] * STEP_NS == 934_000_000
+
+
+def test_example2_heavy_stays_in_its_stroke_for_the_whole_second():
+    gamma = of("example2_heavy", "gamma")
+    assert run("example2_heavy")[1][-1].time_ns == 1_000_000_000
     assert gamma.min() > 0.0 and gamma.max() < np.pi / 2
 
 
-def test_example2_thin_meets_the_end_of_a_stroke():
-    _, states, stopped = run("example2_thin")
+def test_example2_stroke_meets_the_end_of_a_stroke():
+    _, states, stopped = run("example2_stroke")
     assert isinstance(stopped, StrokeExceeded) and stopped.reason.startswith("gamma_1 > ")
     assert 0.9 < stopped.time < 1.0
     assert states[-1].joints.gamma[0] == pytest.approx(np.pi / 2, abs=0.02)

@@ -21,7 +21,7 @@ SCHEMA = json_schema(Scene, "sst_ros scene")
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 
 
-def tree(name="example2"):
+def tree(name="example2_heavy"):
     path = ROOT / "config" / "scenes" / f"{name}.yaml"
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 

@@ -14,7 +14,7 @@ from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation.simulation import Simulation
 
 STEP_NS, STEPS = 4_000_000, 250
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 
 
 def about(axis, angle):

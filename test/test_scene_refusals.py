@@ -13,7 +13,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
-SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")
+SOURCE = (FOLDER / "example2_heavy.yaml").read_text(encoding="utf-8")
 
 
 def changed(old, new):
@@ -91,7 +91,7 @@ REFUSED = {
     "negative frequency": (
         "frequency: [18, 12, 24]", "frequency: [18, -12, 24]", r"frequency = .*: must be .*>= 0"
     ),
-    "empty name": ("name: example2", "name: ''", r"name = '': must be text"),
+    "empty name": ("name: example2_heavy", "name: ''", r"name = '': must be text"),
     "section is text": ("duration: 1 ", "workspace: big\nduration: 1 ", r"'big': must be a map"),
     "unknown provenance": (
         "  duration: printed", "  speed: guessed\n  duration: printed",

@@ -16,7 +16,7 @@ from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.yaml_document import read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
-SOURCE = (FOLDER / "example2.yaml").read_text(encoding="utf-8")
+SOURCE = (FOLDER / "example2_heavy.yaml").read_text(encoding="utf-8")
 BODIES = SOURCE[: SOURCE.index("provenance:")]
 
 # One more section at the end of example 2, and what must be said of it after "origin: line N: ".
@@ -195,7 +195,7 @@ def test_links_without_inertia_are_legal_and_cost_nothing():
     counts = [
         sum(Dynamics.of(scene).program.operations.values())
         for scene in (
-            load("example2"),
+            load("example2_heavy"),
             massless("actuated"),
             massless("intermediate"),
             massless("actuated", "intermediate"),
@@ -228,6 +228,6 @@ def test_a_scene_that_cannot_start_is_told_with_key_and_line(tmp_path, gamma, me
         check(path)
 
 
-@pytest.mark.parametrize("name", ["example2", FOLDER / "general.yaml"])
+@pytest.mark.parametrize("name", ["example2_heavy", FOLDER / "general.yaml"])
 def test_a_scene_that_can_start_is_returned(name):
     assert check(name) == load(name)

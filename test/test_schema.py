@@ -20,9 +20,11 @@ from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star, Strok
 from sst_ros.scene.schema import Section, flag, integer, texts
 from sst_ros.scene.yaml_document import dump, read
 
-SOURCE = (Path(__file__).parents[1] / "config/scenes/example2.yaml").read_text(encoding="utf-8")
+SOURCE = (Path(__file__).parents[1] / "config/scenes/example2_heavy.yaml").read_text(
+    encoding="utf-8"
+)
 TREE = yaml.safe_load(SOURCE)
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 FUZZ = settings(FAST, max_examples=150)
 
 
@@ -107,7 +109,7 @@ def test_numbers_and_text_survive_a_dump_bit_by_bit(rates, description):
 
 def test_sections_are_frozen():
     with pytest.raises(FrozenInstanceError):
-        load("example2").duration = 2.0
+        load("example2_heavy").duration = 2.0
 
 
 def test_arrays_are_taken_and_frozen():

@@ -32,7 +32,7 @@ from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
 REST = (0.0, 0.0, 0.0)
-EXAMPLE2, THIN = load("example2"), load("example2_thin")
+EXAMPLE2, THIN = load("example2_heavy"), load("example2_stroke")
 IGNORE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
 
 
@@ -246,7 +246,7 @@ def test_a_start_without_admissible_assembly_is_refused():
         Simulation(replace(EXAMPLE2, initial=Initial(gamma=(0.05, 0.05, 1.5))))
 
 
-@pytest.mark.parametrize("name", ["example2", "impacts", "friction"])
+@pytest.mark.parametrize("name", ["example2_heavy", "impacts", "friction"])
 def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
     scene = load(name)
     torque = sine(scene.torque)
@@ -287,7 +287,7 @@ def test_what_the_same_constants_move_is_traced_once():
     assert Simulation(load("swing")).dynamics is not again.dynamics
 
 
-@pytest.mark.parametrize("scene", ["example2", EXAMPLE2, yaml.safe_load(dump(EXAMPLE2))])
+@pytest.mark.parametrize("scene", ["example2_heavy", EXAMPLE2, yaml.safe_load(dump(EXAMPLE2))])
 def test_a_scene_is_given_as_it_is_or_by_name_or_as_a_document(scene):
     assert Simulation(scene).scene == EXAMPLE2
 
@@ -317,7 +317,7 @@ def sine_runs(scene, compiled, torque, count=100):
     return simulation
 
 
-@pytest.mark.parametrize("name", ["example2", "friction"])
+@pytest.mark.parametrize("name", ["example2_heavy", "friction"])
 def test_a_sine_torque_moves_as_its_function_does(name):
     scene = load(name)
     one = sine_runs(scene, False, scene.torque, 50)

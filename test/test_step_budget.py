@@ -15,7 +15,7 @@ from sst_ros.scene.scene import Inertia, Link, load
 from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 
 
 def light(about_z, across=1.0):
@@ -72,11 +72,11 @@ def test_sharp_coulomb_friction_is_stiff_from_the_first_step(coulomb, smoothing)
 
 
 def test_the_budget_is_an_argument():
-    simulation = Simulation("example2", step_budget=10)
+    simulation = Simulation("example2_heavy", step_budget=10)
     with pytest.raises(StepBudgetExceeded, match="10 evaluations do not reach the end"):
         simulation.step((1.0, 1.0, 1.0), 100 * MILLISECOND)
     with pytest.raises(InputError, match="step_budget = 0: must be > 0"):
-        Simulation("example2", step_budget=0)
+        Simulation("example2_heavy", step_budget=0)
 
 
 @pytest.mark.skipif(numba_version() is None, reason="needs numba")
@@ -88,7 +88,7 @@ def test_many_steps_in_one_call_return_to_python_within_the_budget(monkeypatch):
         return step_many(self, h, count, *more)
 
     monkeypatch.setattr(CompiledMethod, "step_many", counted)
-    simulation = Simulation("example2", compiled=True, step_budget=1000)
+    simulation = Simulation("example2_heavy", compiled=True, step_budget=1000)
     simulation.steps((0.0, 0.0, 0.0), MILLISECOND, 200)
     assert max(counts) * 3 * len(DORMAND_PRINCE.a) <= 1000
     assert simulation.time_ns == 200 * MILLISECOND

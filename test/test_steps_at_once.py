@@ -23,16 +23,16 @@ INWARDS = {
     "workspace": Workspace(at_edge="ignore"),
 }
 CASES = {
-    "example2": (load("example2"), {}),
+    "example2_heavy": (load("example2_heavy"), {}),
     "loaded": (loaded(), {}),
     "elastic": (replace(load("elastic_stops"), **INWARDS), {}),
     "stiff": (viscous(300.0), {"tolerance": 1e-9}),
     "rodas4": (viscous(3.0), {"integrator": "rodas4", "tolerance": 1e-8}),
-    "rk4": (load("example2"), {"integrator": "rk4"}),
+    "rk4": (load("example2_heavy"), {"integrator": "rk4"}),
 }
 needs_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
 BY_NUMBA = [
-    pytest.param(name, marks=() if name == "example2" else pytest.mark.slow) for name in CASES
+    pytest.param(name, marks=() if name == "example2_heavy" else pytest.mark.slow) for name in CASES
 ]
 
 
@@ -81,7 +81,7 @@ def held_against_single_ticks(name, ticks, glided, *, compiled):
     glided.clear()
     for at_once in (20, 60):
         assert run(scene, at_once, ticks, compiled=compiled, **how) == one
-    if name in ("example2", "loaded", "rk4"):
+    if name in ("example2_heavy", "loaded", "rk4"):
         assert (60, 60) in glided
     if name == "elastic":
         assert any(0 < done < count for count, done in glided)
@@ -104,7 +104,7 @@ def test_numba_gives_the_bits_of_plain_python_however_many_ticks(name, glided):
 def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
     ends = []
     for at_once in (1, 50):
-        simulation = Simulation(load("example2"), compiled=compiled)
+        simulation = Simulation(load("example2_heavy"), compiled=compiled)
         with pytest.raises(StrokeExceeded) as caught:
             for _ in range(10_000):
                 simulation.steps((8.0, 0.0, 0.0), MILLISECOND, at_once)
@@ -118,7 +118,7 @@ def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_numba)])
 def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside(compiled):
     scene = replace(
-        load("example2"),
+        load("example2_heavy"),
         initial=Initial(gamma=(math.pi / 2 - 0.005, 0.4, 1.0), gamma_dot=(0.5, 0.0, 0.0)),
         workspace=Workspace(at_edge="ignore"),
     )
@@ -132,7 +132,7 @@ def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside(com
 
 
 def test_a_state_within_ticks_that_were_done_at_once_is_on_the_way():
-    one, other = (Simulation(load("example2")) for _ in range(2))
+    one, other = (Simulation(load("example2_heavy")) for _ in range(2))
     one.steps((1.0, 2.0, 3.0), MILLISECOND, 20)
     other.step((1.0, 2.0, 3.0), 7 * MILLISECOND)
     found = one.within(7 * MILLISECOND)

@@ -11,7 +11,7 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.simulation.torque import PolynomialTorque, TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 ARRAYS = (
     "t", "quaternion", "body_rate", "torque", "gamma", "mu", "beta", "gamma_dot", "mu_dot",
     "beta_dot", "euler_zyz", "energy",

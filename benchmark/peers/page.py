@@ -14,9 +14,10 @@ TEXT = """\
 
 <!-- Written by `python -m benchmark.peers`: run it again rather than edit this. -->
 
-{date}. One second of Example 2 of the paper (scene `example2`: three sine torques, from rest) on
-every engine, with the same seven links. The error is the angle between the star's orientation at
-t = 1 s and the reference; the time is that of the whole second, in seconds of the processor.
+{date}. One second of Example 2 of the paper (scene `example2_heavy`: its star is 1.25 times
+as heavy; three sine torques, from rest) on every engine, with the same seven links. The error is
+the angle between the star's orientation at t = 1 s and the reference; the time is that of the whole
+second, in seconds of the processor.
 
 ![Error against processor time](peers.png)
 

@@ -64,7 +64,7 @@ class Task:
     """
 
     def __init__(self) -> None:
-        self.scene = scenes.load("example2")
+        self.scene = scenes.load("example2_heavy")
         assert self.scene.torque is not None
         self.torque = self.scene.torque
         self.dynamics = Dynamics.of(self.scene)

@@ -39,13 +39,15 @@ def _show(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from sst_ros.cli.scene_check import check
+    from sst_ros.cli.scene_check import check, implausible
 
     failed = 0
     for path in options.files:
         try:
-            check(path)
-            print(f"{path}: valid")
+            warnings = implausible(check(path))
+            print(f"{path}: valid" + (", with warnings" if warnings else ""))
+            for text in warnings:
+                print(f"{path}: warning: {text}")
         except SstError as error:
             failed = 1
             print(error)

@@ -14,6 +14,24 @@ from sst_ros.scene.scene import Scene, text_of
 from sst_ros.scene.yaml_document import line_of, read
 from sst_ros.simulation.simulation import Simulation
 
+ROUNDING = 1e-6
+"""Relative rounding of inertias that a person has typed."""
+
+
+def implausible(scene: Scene) -> list[str]:
+    """Describe numbers that no body can have though each alone is allowed.
+
+    A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O, whatever its shape.
+    """
+    star = scene.star
+    trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
+    if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
+        return []
+    return [
+        f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass = {star.mass:g} kg "
+        f"within star.radius = {star.radius:g} m has at most 2 m r^2 = {most:g} kg m^2"
+    ]
+
 
 def check(name_or_path: str | Path) -> Scene:
     """Read a scene and assemble it at its initial state.

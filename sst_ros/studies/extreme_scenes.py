@@ -25,7 +25,7 @@ PUSH: Triple = (0.4, 0.5, 0.3)
 
 def base() -> Scene:
     """Return example 2."""
-    return load("example2")
+    return load("example2_heavy")
 
 
 def spun(rate: float) -> Scene:

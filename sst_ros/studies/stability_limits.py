@@ -92,12 +92,12 @@ def damped(coefficient: float) -> Scene:
 
 
 def oscillating(stiffness: float) -> Scene:
-    """Return the star of example2 on springs [N m/rad], close to their rest."""
+    """Return the star of example2_heavy on springs [N m/rad], close to their rest."""
     start = (0.7, 0.8, 0.75)
     springs = tuple(Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=rest - AMPLITUDE)
                     for k, rest in enumerate(start))  # fmt: skip
     return dataclasses.replace(
-        scenes.load("example2"), springs=springs, initial=Initial(gamma=start), torque=None,
+        scenes.load("example2_heavy"), springs=springs, initial=Initial(gamma=start), torque=None,
         stroke=Stroke(at_end="ignore"), workspace=Workspace(at_edge="ignore"),
     )  # fmt: skip
 

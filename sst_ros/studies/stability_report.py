@@ -160,9 +160,9 @@ def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
     parts += ["## Largest stable steps", "", "![largest stable steps](stability.png)", "",
               "In milliseconds, in brackets times the largest modulus of the eigenvalues. The "
               "damped family is `stiff` with other viscous coefficients [N m s/rad]; the "
-              "oscillating one is the star of `example2` on springs [N m/rad]. A step counts as "
-              "stable if rates do not grow tenfold in 400 steps: growth as weak as that of dopri5 "
-              "on the imaginary axis beyond 0.997 i is not seen.", ""]  # fmt: skip
+              "oscillating one is the star of `example2_heavy` on springs [N m/rad]. A step "
+              "counts as stable if rates do not grow tenfold in 400 steps: growth as weak as that "
+              "of dopri5 on the imaginary axis beyond 0.997 i is not seen.", ""]  # fmt: skip
     for family in ("decay", "oscillation"):
         parts += [f"### {family.capitalize()}", "", markdown(step_table(steps, family)), ""]
     parts += ["## Cases", ""]

@@ -20,7 +20,7 @@ def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monk
     pytest.importorskip("numba", reason="a batch needs numba")
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
     number = LANES + 3
-    scene, method = load("example2"), METHODS["rk4"]
+    scene, method = load("example2_heavy"), METHODS["rk4"]
     batch = Batch(scene, method, profile=True)
     gamma = np.array(scene.initial.gamma) + np.linspace(-0.05, 0.05, number)[:, None]
     y, code = batch.start(gamma, (0.0, 0.0, 0.0))

@@ -176,7 +176,7 @@ def loop(model, plant, motion, settings, seconds, period=PERIOD):
 
 @pytest.mark.parametrize(("instant", "order"), [("start", 1), ("middle", 2)])
 def test_what_a_hold_costs_the_feedforward_is_of_its_order(instant, order):
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     motion = turned(model, (0.3, -0.2, 0.4))
     periods = np.array([0.008, 0.004, 0.002])
     settings = ControllerSettings(feedforward_at=instant)
@@ -187,7 +187,7 @@ def test_what_a_hold_costs_the_feedforward_is_of_its_order(instant, order):
 
 @pytest.mark.parametrize("space", ["gamma", "so3"])
 def test_computed_torque_brings_the_manipulator_to_the_motion(space):
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     off = dataclasses.replace(
         model, initial=Initial(gamma=tuple(np.add(model.initial.gamma, (0.2, -0.15, 0.1))))
     )
@@ -198,7 +198,7 @@ def test_computed_torque_brings_the_manipulator_to_the_motion(space):
 
 
 def test_the_integral_takes_out_what_the_model_does_not_know():
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     pushed = dataclasses.replace(model, moment=Moment(value=(0.5, -0.4, 0.3)))
     motion = turned(model, (0.1, 0.1, -0.2), duration=0.2)
     for mode in ("feedforward_pd", "computed_torque"):
@@ -213,7 +213,7 @@ def test_the_integral_takes_out_what_the_model_does_not_know():
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_an_integral_that_would_be_unstable_is_refused(mode):
     """The bound is where a root of s^3 + kd s^2 + kp s + kp r crosses the imaginary axis."""
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     motion, w, zeta = turned(model, (0.1, 0.0, 0.0)), 30.0, 0.8
     for share, sound in ((0.999, True), (1.001, False)):
         r = share * 2.0 * zeta * w
@@ -230,7 +230,7 @@ def test_an_integral_that_would_be_unstable_is_refused(mode):
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
     """A second of an error that saturates leaves nothing behind; without a limit it winds up."""
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     motion = turned(model, (0.1, 0.0, 0.0))
     begin = motion.at(0.0)
     away = tuple(angle - 0.1 for angle in begin.gamma)
@@ -248,7 +248,7 @@ def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
 
 
 def test_the_limit_of_the_models_actuators_holds_too():
-    model = dataclasses.replace(scene.load("example2"), actuators=Actuators(torque_limit=0.5))
+    model = dataclasses.replace(scene.load("example2_heavy"), actuators=Actuators(torque_limit=0.5))
     motion = turned(model, (0.1, 0.0, 0.0))
     away = Measurement(tuple(angle - 0.2 for angle in model.initial.gamma), ZERO)
     for limit, expected in ((0.0, 0.5), (0.2, 0.2), (0.9, 0.5)):
@@ -260,7 +260,7 @@ def test_the_limit_of_the_models_actuators_holds_too():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_what_is_not_finite_is_refused_until_a_reset(mode):
-    model = scene.load("example2")
+    model = scene.load("example2_heavy")
     acting = Controller(
         model, turned(model, (0.1, 0.0, 0.0)), ControllerSettings(mode=mode), PERIOD
     )

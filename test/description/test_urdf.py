@@ -103,7 +103,9 @@ def test_inertias_of_every_scene(name):
 
 
 def test_a_rotor_weighs_about_its_axis_alone():
-    scene = replace(load("example2"), actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0))
+    scene = replace(
+        load("example2_heavy"), actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0)
+    )
     read = Read(scene)
     tensor = read.model.inertias[read.model.getJointId("gamma_1")].matrix()[3:, 3:]
     own = scene.actuated_links[0].inertia.matrix
@@ -112,7 +114,7 @@ def test_a_rotor_weighs_about_its_axis_alone():
 
 
 def test_masses_are_those_of_the_scene_or_said_to_be_assumed():
-    weighed, bare = load("gravity_payload"), load("example2")
+    weighed, bare = load("gravity_payload"), load("example2_heavy")
     masses = {
         name.get("name"): float(name.find("inertial/mass").get("value"))
         for name in ET.fromstring(urdf(weighed)).iter("link")
@@ -247,7 +249,7 @@ def test_ends_limits_and_friction_are_in_it():
     assert float(first.find("limit").get("upper")) == pytest.approx(np.pi / 2)
     friction = load("friction").friction.gamma
     assert float(first.find("dynamics").get("damping")) == friction.viscous
-    limited = replace(load("example2"), actuators=Actuators(torque_limit=4.0))
+    limited = replace(load("example2_heavy"), actuators=Actuators(torque_limit=4.0))
     effort = ET.fromstring(urdf(limited)).find("joint[@name='gamma_2']/limit").get("effort")
     assert float(effort) == 4.0
 

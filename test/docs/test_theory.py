@@ -120,8 +120,9 @@ def test_a_pointer_points_at_a_test(pointer):
 def test_the_assumed_inertias_are_those_of_the_scenes():
     from sst_ros.scene.scene import load
 
-    star, thin = load("example2").star.inertia, load("example2_thin").star.inertia
+    star, thin = load("example2_heavy").star.inertia, load("example2").star.inertia
     assert f"diag({thin.xx:g}, {thin.yy:g}, {thin.zz:g})" in PAGE
+    assert thin == load("example1").star.inertia == load("example2_stroke").star.inertia
     assert star.xx / thin.xx == pytest.approx(1.25)
     link = load("example2").intermediate_links[0].inertia
     assert f"diag({link.xx:.0e}, {link.yy:g}, {link.zz:g})".replace("e-06", "e-6") in PAGE

@@ -18,7 +18,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 MILLISECOND = 1_000_000
 
 
@@ -157,7 +157,7 @@ def stopped(simulation, torque, error, limit=2000):
 
 @pytest.mark.parametrize("method", ["dop853", "auto"])
 def test_the_end_of_a_stroke_is_met_within_a_picosecond(method):
-    scene = load("example2_thin")
+    scene = load("example2_stroke")
     error = stopped(Simulation(scene, method, tolerance=1e-14), sine(scene.torque), StrokeExceeded)
     assert abs(error.time - independent(scene, 0, math.pi / 2, 0.95)) < 1e-12
 

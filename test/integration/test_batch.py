@@ -18,7 +18,7 @@ from sst_ros.state import QUANTITIES
 
 pytest.importorskip("numba", reason="a batch needs numba")
 
-EXAMPLE2 = load_scene("example2")
+EXAMPLE2 = load_scene("example2_heavy")
 N = 100
 
 

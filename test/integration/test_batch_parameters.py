@@ -24,7 +24,7 @@ from sst_ros.scene.scene import Actuators, Initial, Link, Spring
 
 pytest.importorskip("numba", reason="a batch needs numba")
 
-EXAMPLE2 = load_scene("example2")
+EXAMPLE2 = load_scene("example2_heavy")
 HOME = np.pi / 4
 N = batch_source.LANES + 5
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")

@@ -24,7 +24,7 @@ from sst_ros.simulation.simulation import Simulation
 
 DRIVE = (3.0, -2.0, 1.0)
 MOMENT = (0.1, 0.2, 0.3)
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 
 
 def start(scene, size):

@@ -23,8 +23,8 @@ ROUNDING = 1e-12
 PERIOD = 0.01
 SPANS = {
     "example1": 0.5,
-    "example2": 1.0,
-    "example2_thin": 0.9,
+    "example2_heavy": 1.0,
+    "example2_stroke": 0.9,
     "general": 1.0,
     "friction": 1.0,
     "fast_spin": 0.1,
@@ -119,9 +119,9 @@ def test_springs_keep_their_energy_for_1000_seconds():
 
 
 SHARP = [  # underestimated 27, 11, 16 and 10 times by an estimate that took order 4 for granted
-    ("example2", 0.05, 1e-4, 1),
-    ("example2", 0.5, 1e-3, 5),
-    ("example2", 0.5, 1e-4, 5),
+    ("example2_heavy", 0.05, 1e-4, 1),
+    ("example2_heavy", 0.5, 1e-3, 5),
+    ("example2_heavy", 0.5, 1e-4, 5),
     ("friction", 0.05, 1e-4, 2),
 ]
 

@@ -24,7 +24,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 NOTHING = Link(inertia=inertia_of(1e-18 * np.eye(3)))
 FREE_STAR = replace(
     EXAMPLE2,

@@ -110,7 +110,7 @@ def test_error_weights_vanish_up_to_the_embedded_order_and_no_further(weights, t
     assert max(abs(e @ stage_weights(tree, a)) for tree in trees(order + 1)) > 1e-6
 
 
-SCENE = load("example2")
+SCENE = load("example2_heavy")
 MODEL = kernel.model_of(SCENE)
 TORQUE = sine(SCENE.torque)
 SPAN = 0.4

@@ -21,7 +21,7 @@ from sst_ros.integration.sine_source import flat_sin
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 START = Simulation(EXAMPLE2).state
 STATE = [*START.quaternion, *START.body_rate]
 

@@ -76,7 +76,7 @@ def test_the_heavier_star_returns_after_one_period():
 @pytest.mark.parametrize(
     ("name", "values", "key"),
     [
-        ("example2", {}, "torque"),
+        ("example2_heavy", {}, "torque"),
         ("swing", {}, "torque"),
         ("example1", {"star.alpha_deg": [110, 120, 130]}, "star.alpha_deg"),
         ("example1", {"gravity": {"acceleration": [0, 0, -9.81]}}, "gravity"),

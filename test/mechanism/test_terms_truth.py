@@ -172,7 +172,7 @@ def period(scene, start, direction):
 
 
 @pytest.mark.parametrize("mode", range(3))
-@pytest.mark.parametrize("name", ["example2_thin", "general"])
+@pytest.mark.parametrize("name", ["example2_stroke", "general"])
 def test_small_swings_between_springs_have_the_periods_of_t1_and_stiffness(name, mode):
     """Springs at all kinds of joints, relaxed at the start; errors go with the amplitude, 1e-5."""
     scene = load_scene(name)
@@ -239,8 +239,8 @@ def test_a_tool_that_hangs_in_springs_swings_with_the_periods_of_its_height():
 
 
 def test_commands_beyond_the_torque_limit_are_clamped_to_it():
-    scene = replace(load_scene("example2"), actuators=Actuators(torque_limit=2.0))
-    limited, free = Simulation(scene), Simulation(load_scene("example2"))
+    scene = replace(load_scene("example2_heavy"), actuators=Actuators(torque_limit=2.0))
+    limited, free = Simulation(scene), Simulation(load_scene("example2_heavy"))
     for _ in range(20):
         state = limited.step((9.0, -3.0, 1.5), 1_000_000)
         expected = free.step((2.0, -2.0, 1.5), 1_000_000)
@@ -250,7 +250,7 @@ def test_commands_beyond_the_torque_limit_are_clamped_to_it():
 
 def test_a_command_is_clamped_before_it_lags():
     actuators = Actuators(torque_limit=2.0, time_constant=0.01)
-    simulation = Simulation(replace(load_scene("example2"), actuators=actuators))
+    simulation = Simulation(replace(load_scene("example2_heavy"), actuators=actuators))
     for _ in range(30):
         state = simulation.step((9.0, 0.0, 0.0), 1_000_000)
     assert state.torque[0] == pytest.approx(2.0 * (1.0 - np.exp(-3.0)), rel=1e-9)
@@ -258,9 +258,9 @@ def test_a_command_is_clamped_before_it_lags():
 
 def test_a_moment_from_a_topic_is_the_constant_one():
     value = (0.3, -0.2, 0.1)
-    given = Simulation(replace(load_scene("example2"), moment=Moment(value=value)))
-    told = Simulation(replace(load_scene("example2"), moment=Moment(topic=True)))
-    deaf = Simulation(load_scene("example2"))
+    given = Simulation(replace(load_scene("example2_heavy"), moment=Moment(value=value)))
+    told = Simulation(replace(load_scene("example2_heavy"), moment=Moment(topic=True)))
+    deaf = Simulation(load_scene("example2_heavy"))
     for _ in range(20):
         one = given.step(REST, 1_000_000)
         other = told.step(REST, 1_000_000, value)
@@ -270,7 +270,7 @@ def test_a_moment_from_a_topic_is_the_constant_one():
 
 
 def test_a_link_without_inertia_is_one_of_vanishing_inertia():
-    scene = load_scene("example2")
+    scene = load_scene("example2_heavy")
     tiny = replace(scene.intermediate_links[0].inertia, xx=1e-12, yy=1e-12, zz=1e-12)
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
     bare = replace(scene, intermediate_links=(Link(),) * 3)

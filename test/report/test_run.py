@@ -106,7 +106,7 @@ def test_what_is_not_recorded_is_unknown(tmp_path, bags, example2):
 
 def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags):
     start = scene.Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
-    near = dataclasses.replace(scene.load("example2"), name="near_the_end", initial=start)
+    near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
     entries = bags.simulated(near, 0.3)
     summary = report(bags.write(tmp_path / "bag", entries), tmp_path / "out")
     assert summary["phase"] == "fault" and summary["fault"].startswith("stopped at t = 0.0")

@@ -150,7 +150,7 @@ def test_reset_goes_back_and_stamps_go_on():
 
 
 def test_a_fault_is_latched_until_a_reset():
-    bench = Bench(scene="example2")
+    bench = Bench(scene="example2_heavy")
     with bench.running() as loop:
         loop.ask(partial(loop.pause, True))
         bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
@@ -172,7 +172,7 @@ def test_a_fault_is_latched_until_a_reset():
 
 
 def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick():
-    bench = Bench(scene="example2", publish_rate=10, wait_for_command=True)
+    bench = Bench(scene="example2_heavy", publish_rate=10, wait_for_command=True)
     bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
     with bench.running() as loop:
         bench.until(lambda: loop.phase is Phase.FAULT)
@@ -312,7 +312,7 @@ def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
 
 
 def test_a_fault_ends_a_run_with_a_duration():
-    bench = Bench(scene="example2", duration=10.0, wait_for_command=True)
+    bench = Bench(scene="example2_heavy", duration=10.0, wait_for_command=True)
     bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
     bench.loop.run()
     assert bench.loop.phase is Phase.FAULT and bench.loop.failed

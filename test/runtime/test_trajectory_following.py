@@ -19,7 +19,7 @@ from sst_ros.simulation.simulation import Simulation
 PERIOD_NS = 2_000_000
 START_NS = 1_700_000_000_123_456_789
 MOVE = DesiredMotion(spiral=Spiral(phi=0.02, theta=0.5, psi=0.03, duration=0.05))
-MODEL = dataclasses.replace(scene.load("example2"), motion=MOVE, torque=None)
+MODEL = dataclasses.replace(scene.load("example2_heavy"), motion=MOVE, torque=None)
 
 
 def seen(state):

@@ -10,7 +10,7 @@ from sst_ros.errors import InputError
 from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.yaml_document import read
 
-SOURCE = text_of("example2")[0]
+SOURCE = text_of("example2_heavy")[0]
 
 
 def refusal(source):
@@ -62,7 +62,7 @@ def test_what_a_terminal_obeys_is_printed_as_an_escape(line, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", [r"\ud800", r"a\eb", r"a\0b"])
 def test_a_name_is_text_that_can_be_printed(name):
-    error = refusal(SOURCE.replace("name: example2", f'name: "{name}"'))
+    error = refusal(SOURCE.replace("name: example2_heavy", f'name: "{name}"'))
     assert "name = " in str(error)
     str(error).encode("utf-8")
 
@@ -82,7 +82,7 @@ def test_numbers_of_yaml_1_2_are_read_as_it_reads_them(text, value):
 
 @pytest.mark.parametrize("word", ["yes", "no", "on", "off"])
 def test_the_switches_of_yaml_1_1_are_words(word):
-    changed = SOURCE.replace("name: example2", f"name: {word}")
+    changed = SOURCE.replace("name: example2_heavy", f"name: {word}")
     assert read(Scene, changed, "origin").name == word
     error = refusal(SOURCE + f"moment: {{topic: {word}}}\n")
     assert "moment.topic = " in str(error)
@@ -106,5 +106,5 @@ def test_the_switches_of_yaml_1_1_are_words(word):
 )  # fmt: skip
 def test_numbers_that_only_a_slip_can_make_are_refused(old, new, key):
     with pytest.raises(InputError) as caught:
-        load("example2").with_values({old: new})
+        load("example2_heavy").with_values({old: new})
     assert any(problem.key.startswith(key) for problem in caught.value.problems)

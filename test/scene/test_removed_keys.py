@@ -8,7 +8,7 @@ from sst_ros.scene.scene import Scene, load
 
 
 def test_markers_are_ignored_with_a_warning_that_names_the_line():
-    scene = load("example2")
+    scene = load("example2_heavy")
     text = yaml_document.dump(scene)
     line = text.count("\n") + 1
     with pytest.warns(FutureWarning, match=f"line {line}: markers is ignored: .*robot_description"):

@@ -7,7 +7,7 @@ import pytest
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 
 
 def test_numbers_lists_sections_and_choices():

@@ -29,7 +29,7 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import case_catalogue, extreme_cases
 
 CASES = list(case_catalogue.cases())
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 LONGEST = 60.0
 """Seconds for any case on a busy machine: what must not happen is an endless loop."""
 
@@ -80,7 +80,7 @@ def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
 
 
 def edge(beta):
-    """Pose of example2 whose beta_1 is this; E is that near to the arc P_1 P_2."""
+    """Pose of example2_heavy whose beta_1 is this; E is that near to the arc P_1 P_2."""
 
     def posed(height):
         s = np.array([1.0, 0.9, height])

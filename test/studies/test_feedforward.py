@@ -178,7 +178,7 @@ def test_errors_that_a_scene_cannot_have_are_listed():
 
 def test_a_scene_without_a_motion_is_refused():
     with pytest.raises(InputError, match="the scene has no desired motion"):
-        feedforward_study(FeedforwardPlan(load("example2")))
+        feedforward_study(FeedforwardPlan(load("example2_heavy")))
 
 
 def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
@@ -208,7 +208,7 @@ def test_the_command_tells_what_it_takes():
         (["--workers", "0"], "--workers = 0: must be >= 1"),
         (["--bandwidths", "-3"], "bandwidth = -3.0: must be"),
         (["--scene", "nowhere"], "must be a readable .yaml file or one of"),
-        (["--scene", "example2"], "the scene has no desired motion"),
+        (["--scene", "example2_heavy"], "the scene has no desired motion"),
     ],
 )
 def test_what_is_not_allowed_is_told_without_a_traceback(words, said):

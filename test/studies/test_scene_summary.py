@@ -24,7 +24,7 @@ from sst_ros.studies.scene_summary import WIDTH, summary
 from sst_ros.studies.step_advice import step_advice
 from sst_ros.studies.term_costs import TERMS, costs, operations
 
-EXAMPLE2 = load("example2")
+EXAMPLE2 = load("example2_heavy")
 every_scene = pytest.mark.parametrize("name", names())
 
 
@@ -43,15 +43,15 @@ def everything() -> Scene:
 
 
 def test_the_plain_scene_costs_what_a_kernel_without_optional_terms_costs():
-    """At most 3 % more; example2 has diagonal link inertias, general has full ones."""
-    for name in ("example2", "general"):
+    """At most 3 % more; example2_heavy has diagonal link inertias, general has full ones."""
+    for name in ("example2_heavy", "general"):
         scene = load(name)
         assert operations(scene) <= 1.03 * program_of(scene).operations.total()
 
 
 def test_the_kernel_without_optional_terms_is_the_same_physics():
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
-    for name in ("example2", "general"):
+    for name in ("example2_heavy", "general"):
         bare = compiled(program_of(load(name)))(*inputs)
         assert Dynamics.of(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
 
@@ -69,7 +69,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
         if term.name not in ("actuated links", "intermediate links"):
             assert term.value(scene), term.name
             scene = term.without(scene)
-    assert Dynamics.of(scene).program == Dynamics.of(load("example2_thin")).program
+    assert Dynamics.of(scene).program == Dynamics.of(load("example2_stroke")).program
 
 
 def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():

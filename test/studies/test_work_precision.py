@@ -23,7 +23,7 @@ from sst_ros.studies.scene_summary import summary
 from sst_ros.studies.solver_grid import FIXED, TOLERANCE
 from sst_ros.studies.work_precision import ABOVE_REFERENCE, SolverResult, work_precision
 
-SHORT = dataclasses.replace(scene.load("example2"), duration=0.2)
+SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
 EXACT = np.finfo(np.longdouble).eps < 1e-18
 
@@ -93,7 +93,7 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     assert [float(row["wall_min_s"]) for row in rows] == [row.wall_s[0] for row in short.rows]
     document = json.loads((tmp_path / "accuracy.json").read_text())
     assert document["studies"][0]["rows"][0]["method"] == "rk4" and "date" in document["report"]
-    assert "accuracy_example2.png" in (tmp_path / "accuracy.md").read_text()
+    assert "accuracy_example2_heavy.png" in (tmp_path / "accuracy.md").read_text()
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
 
@@ -175,7 +175,7 @@ def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
 
 
 def test_a_run_that_stops_is_compared_up_to_its_end():
-    problem = InitialValueProblem(scene.load("example2_thin"))
+    problem = InitialValueProblem(scene.load("example2_stroke"))
     assert problem.seconds == pytest.approx(0.9) and "gamma_1 >" in problem.ends
 
 
