@@ -158,3 +158,91 @@ def test_a_scene_without_a_duration_asks_for_one():
 
     with pytest.raises(InputError, match=r"duration(.|\n)*must be given"):
         simulate(replace(EXAMPLE2, duration=None))
+
+
+def spring(t, state):
+    return [
+        -4.0 * (angle - 0.8) - 0.1 * rate - t for angle, rate in zip(*angles_of(state), strict=True)
+    ]
+
+
+def angles_of(state):
+    return state.joints.gamma, state.joints.gamma_dot
+
+
+@pytest.mark.parametrize("method", ["auto", "dopri5", "dop853", "rodas4"])
+def test_a_state_feedback_is_part_of_the_differential_equation(method):
+    """The reference is SciPy's DOP853 at 1e-13 on the derivative of the scene."""
+    from scipy.integrate import solve_ivp
+
+    from sst_ros.dynamics.traced_dynamics import Dynamics
+
+    dynamics = Dynamics.of(EXAMPLE2)
+    start = Simulation(EXAMPLE2).state
+
+    def slope(t, y):
+        j = dynamics.joints(*y)
+        torque = [-4.0 * (j[k] - 0.8) - 0.1 * j[9 + k] - t for k in range(3)]
+        return dynamics.derivative(*y, *torque)
+
+    y = [*start.quaternion, *start.body_rate]
+    expected = solve_ivp(slope, (0.0, 0.3), y, "DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    found = simulate(EXAMPLE2, spring, 0.3, method=method, t_eval=[0.0, 0.3], tolerance=1e-10)
+    assert found.success, found.message
+    assert np.abs(found.quaternion[-1] - expected[:4]).max() < 1e-10
+    assert np.abs(found.body_rate[-1] - expected[4:]).max() < 1e-9
+    assert found.error_estimate <= 1e-10
+    assert abs(found.energy_residual) < 1e-9
+    assert found.evaluations > 10
+    for k in range(2):
+        assert found.torque[k].tolist() == spring(found.t[k], Rebuilt(found, k))
+    np.testing.assert_allclose(
+        found.at(0.15).gamma[0],
+        simulate(EXAMPLE2, spring, 0.15, tolerance=1e-11).gamma[-1],
+        atol=1e-10,
+    )
+
+
+class Rebuilt:
+    """What `spring` reads of a state, from a sample of a trajectory."""
+
+    def __init__(self, motion, k):
+        self.joints = self
+        self.gamma, self.gamma_dot = motion.gamma[k], motion.gamma_dot[k]
+
+
+def test_a_held_feedback_tends_to_the_continuous_one_in_proportion_to_the_period():
+    continuous = simulate(EXAMPLE2, spring, 0.2).gamma[-1]
+    apart = [
+        np.abs(simulate(EXAMPLE2, spring, 0.2, control_period=h).gamma[-1] - continuous).max()
+        for h in (4e-3, 2e-3, 1e-3)
+    ]
+    assert apart[2] > 1e-6
+    assert 1.9 < apart[0] / apart[1] < 2.1
+    assert 1.9 < apart[1] / apart[2] < 2.1
+
+
+def test_a_feedback_has_the_limit_and_the_lag_of_the_actuators():
+    limited = EXAMPLE2.with_values({"actuators.torque_limit": 0.125})
+    assert np.abs(simulate(limited, spring, 0.2).torque).max() == 0.125
+    lagging = EXAMPLE2.with_values({"actuators.time_constant": 0.01})
+    seen = []
+    found = simulate(lagging, lambda t, state: seen.append(state.torque) or (1.0, 0.0, 0.0), 0.1)
+    assert found.torque[0].tolist() == [0.0] * 3
+    np.testing.assert_allclose(found.torque[-1], [1.0 - np.exp(-10.0), 0.0, 0.0], atol=1e-9)
+    assert max(torque[0] for torque in seen) > 0.9
+
+
+def test_a_feedback_that_returns_no_torques_is_refused():
+    with pytest.raises(InputError, match=r"torque\(0\) = None: must be three finite"):
+        simulate(EXAMPLE2, lambda t, state: None, 0.1)
+
+
+def test_the_error_estimate_at_the_end_is_within_the_tolerance():
+    """A tolerance of the local errors alone leaves 3.3e-9 rad after 10 s, three times as much."""
+    options = {"method": "dopri5", "t_eval": [10.0]}
+    found = simulate("swing", lambda t: (0.0, 0.0, 0.0), 10.0, tolerance=1e-9, **options)
+    assert found.success
+    assert found.error_estimate <= 1e-9
+    finer = simulate("swing", lambda t: (0.0, 0.0, 0.0), 10.0, tolerance=1e-11, **options)
+    assert np.abs(found.quaternion - finer.quaternion).max() <= 1e-9

@@ -141,9 +141,14 @@ class Propagator:
         """Return a sine torque that the actuators clamp as a function; all others as they are."""
         return self._torque.traced(torque)
 
-    def torque_at(self, torque: Torque, time: float) -> Vector3:
-        """Torques that act at a time [s], within the limit of the actuators [N m]."""
-        return self._torque.at(torque, time)
+    def torque_at(self, torque: Torque, time: float, y: list[float]) -> Vector3:
+        """Torques that act at a time [s] and a state, within the limit of the actuators [N m]."""
+        return self._torque.at(torque, time, y)
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the derivative so far; a Jacobian counts as `JACOBIAN_COST`."""
+        return self._budget.spent
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""

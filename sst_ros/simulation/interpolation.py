@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sst_ros.dynamics.kernel import Joints
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.applied_torque import StateFeedback
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.sampled_motion import Array, SampledMotion
-from sst_ros.simulation.simulation import NANOSECONDS, State
 from sst_ros.simulation.torque import ConstantTorque, FeedbackFunction, TorqueProfile
 
 _ACCURACY = 1e-13
@@ -35,20 +34,6 @@ def integrated(trajectory: SampledMotion, times: Array) -> Array:
         order = rows[np.argsort(times[rows], kind="stable")]
         found[order] = gap.states(int(k), samples[k], times[order])
     return found
-
-
-def state_of(dynamics: Dynamics, t: float, y: Sequence[float], torque: Sequence[float]) -> State:
-    """Put a state together from its numbers."""
-    j = dynamics.joints(*y[:7])
-    joints = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])  # type: ignore[arg-type]
-    first, second, third = torque
-    return State(
-        round(t * NANOSECONDS),
-        (y[0], y[1], y[2], y[3]),
-        (y[4], y[5], y[6]),
-        joints,
-        (first, second, third),
-    )
 
 
 def _torque_limit(scene: Scene) -> float:
@@ -113,12 +98,8 @@ class _Gap:
         return lambda t, y: np.clip(torque(t), -self._limit, self._limit)
 
     def _feedback(self, function: FeedbackFunction) -> Callable[[float, Array], Array]:
-        def torque(t: float, y: Array) -> Array:
-            given = tuple(y[7:10]) if len(y) > 7 else (0.0, 0.0, 0.0)
-            state = state_of(self._dynamics, t, y.tolist(), given)
-            return np.clip(function(t, state), -self._limit, self._limit)
-
-        return torque
+        torque = StateFeedback(function, self._dynamics)
+        return lambda t, y: np.clip(torque(t, y.tolist()), -self._limit, self._limit)
 
     def _slope(self, torque: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
         def slope(t: float, y: Array) -> Array:

@@ -17,7 +17,7 @@ from sst_ros.scene.given import scene_of, with_initial
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
-from sst_ros.simulation.simulate_steps import SteppedMotion
+from sst_ros.simulation.simulate_steps import stepped
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
 from sst_ros.simulation.torque import (
     ConstantTorque,
@@ -70,10 +70,13 @@ def simulate(
             periods, or 200 even intervals.
         method: "gauss" (Gauss collocation), "dopri5", "dop853", "rk4" (explicit Runge-Kutta of
             order 5, 8, 4), "rodas4" (Rosenbrock, order 4, for stiff scenes) or "auto".
-        tolerance: error of the orientation that is allowed [rad]: estimated for the whole motion
-            with "gauss", for each step with the other methods.
+        tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
+            `error_estimate` exceeds it is run again by smaller steps, up to twice. With
+            `control_period` it runs once, and the tolerance is that of the local error of a step;
+            "rk4" has none.
         control_period: a function is called once a period [s], at its beginning, and its torques
-            are held until the next, as those of a controller.
+            are held until the next, as those of a controller. Without it a function is part of the
+            differential equation, called in each stage of a step, and must have no memory.
         progress: draw a bar on a terminal.
 
     Raises:
@@ -108,8 +111,7 @@ def simulate(
             if key is not None:
                 _remember(key, (scene, torque, motion))
             return motion.trajectory(times)
-    motion_by_steps = SteppedMotion(given, law, method, tolerance, span, period, reason)
-    return motion_by_steps.run(times, progress)
+    return stepped(given, law, method, tolerance, span, period, reason, times, progress)
 
 
 _known: dict[Any, tuple[Any, Any, CollocatedMotion]] = {}
@@ -152,9 +154,6 @@ def _nanoseconds(name: str, value: Any) -> int:
 
 def _checked_period(period: float | None, law: Any) -> int | None:
     if period is None:
-        if not isinstance(law, TorqueProfile):
-            allowed = "must be given for a function f(t, state), whose torques are held between"
-            raise InputError("simulate", [Problem("control_period", None, allowed)])
         return None
     if isinstance(law, TorqueProfile) and not isinstance(law, FunctionTorque):
         allowed = "is for a function; give none for numbers and profiles"

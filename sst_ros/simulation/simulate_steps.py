@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sst_ros.errors import Diverged, RunStopped
+from sst_ros.integration.applied_torque import StateFeedback
+from sst_ros.integration.methods import RK4
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
@@ -17,6 +20,37 @@ from sst_ros.simulation.trajectory import Trajectory
 
 SAMPLES = 200
 """Intervals of a motion whose times nobody has named."""
+
+
+_ATTEMPTS, _FINEST = 3, 1e-14
+"""Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
+
+
+def stepped(
+    scene: Scene,
+    law: TorqueProfile | FeedbackFunction,
+    method: str,
+    tolerance: float,
+    span: int,
+    period: int | None,
+    reason: str,
+    times: np.ndarray | None,
+    progress: bool,
+) -> Trajectory:
+    """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
+
+    A function whose torques are held is called once a period and may have a memory: one run.
+    Arguments are those of `SteppedMotion` and `SteppedMotion.run`.
+    """
+    local, once, spent = tolerance, period is not None or method == RK4.name, 0
+    for attempt in range(1, _ATTEMPTS + 1):
+        motion = SteppedMotion(scene, law, method, local, span, period, reason).run(times, progress)
+        motion.evaluations = spent = spent + motion.evaluations
+        excess = motion.error_estimate / tolerance
+        if once or attempt == _ATTEMPTS or motion.status < 0 or not excess > 1.0:
+            break
+        local = max(local / (5.0 * excess), _FINEST)
+    return motion
 
 
 class SteppedMotion:
@@ -48,6 +82,8 @@ class SteppedMotion:
             scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
         )
         self._method = self._simulation.method
+        if not isinstance(law, TorqueProfile):
+            self._feedback = StateFeedback(_checked(law), self._simulation.dynamics)
         self._samples: list[State] = []
         self._held: list[tuple[int, Triple]] = []
 
@@ -109,11 +145,12 @@ class SteppedMotion:
         """Torques of the step from begin to end [ns]: numbers, or a function of time."""
         law, start = self._law, begin / NANOSECONDS
         if self._period is None:
-            assert isinstance(law, TorqueProfile)
+            if not isinstance(law, TorqueProfile):
+                return self._feedback
             piece = law.between(start, end / NANOSECONDS)
             return getattr(piece, "torque", piece)
-        value = law(start) if isinstance(law, TorqueProfile) else law(start, self._simulation.state)
-        torque = three(value, f"torque({start:g})")
+        state = self._simulation.state
+        torque = law(start) if isinstance(law, TorqueProfile) else _checked(law)(start, state)
         self._held.append((begin, torque))
         return torque
 
@@ -139,6 +176,7 @@ class SteppedMotion:
             method=", then ".join([self._method, *changes]) + self._reason,
             error_estimate=simulation.error_estimate,
             energy_residual=simulation.energy_residual,
+            evaluations=simulation.evaluations,
             law=law,
         )
 
@@ -148,4 +186,10 @@ class SteppedMotion:
         if scene is not None and scene.time_constant is not None:
             return (lag,) * 3
         limit = math.inf if scene is None or scene.torque_limit is None else scene.torque_limit
-        return np.clip(law(0.0), -limit, limit)
+        known = isinstance(law, TorqueProfile)
+        return np.clip(law(0.0) if known else law(0.0, self._samples[0]), -limit, limit)
+
+
+def _checked(function: FeedbackFunction) -> Callable[[float, State], Triple]:
+    """Refuse anything but three finite torques by the time of the call."""
+    return lambda t, state: three(function(t, state), f"torque({t:g})")

@@ -178,6 +178,11 @@ class Simulation:
         return self._propagator.accepted_steps
 
     @property
+    def evaluations(self) -> int:
+        """Evaluations of the derivative so far, rejected steps too; a Jacobian counts as 30."""
+        return self._propagator.evaluations
+
+    @property
     def error_estimate(self) -> float:
         """Estimated global error of the orientation so far [rad].
 
@@ -303,7 +308,7 @@ class Simulation:
         if len(self.dynamics.state) > 7:
             torque = (y[7], y[8], y[9])
         else:
-            torque = self._propagator.torque_at(asked, at.time_ns / NANOSECONDS)
+            torque = self._propagator.torque_at(asked, at.time_ns / NANOSECONDS, y)
         joints = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])  # type: ignore[arg-type]
         return State(at.time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), joints, torque)
 
