@@ -59,20 +59,27 @@ class AppliedTorque:
     Args:
         ode: equations whose torques are part of the drive.
         limit: largest torque of an actuator [N m], or None.
+        rhs: derivative of the state in place of that of `ode`, with its inputs.
 
     """
 
-    def __init__(self, ode: ODE, limit: float | None) -> None:
+    def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
         self._ode = ode
         self._limit = limit
-        self._rhs: Function | None = None
+        self._rhs = rhs
+        self._untraced = rhs is not None
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
 
     def traced(self, torque: Torque) -> Torque:
-        """Return a sine torque that the limit clamps as a function; all others as they are."""
+        """Return a sine torque that cannot be traced as a function; all others as they are.
+
+        The limit of the actuators clamps it, or the derivative was given.
+        """
         if not isinstance(torque, SineTorque):
             return torque
+        if self._untraced:
+            return sine_function(torque)
         clamped = self._limit is not None and max(map(abs, torque.amplitude)) > self._limit
         return sine_function(torque) if clamped else torque
 

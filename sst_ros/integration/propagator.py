@@ -8,7 +8,7 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import Dynamics, Function
 from sst_ros.integration import coarse_solution, step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
@@ -59,6 +59,8 @@ class Propagator:
         tolerance: largest local error estimate of a step.
         compiled: by numba.
         budget: evaluations that a period may take.
+        derivative: derivative of the state in plain Python, in place of the traced one and with
+            its inputs; for explicit methods.
 
     """
 
@@ -72,6 +74,7 @@ class Propagator:
         *,
         compiled: bool,
         budget: EvaluationBudget,
+        derivative: Function | None = None,
     ) -> None:
         self._dynamics = dynamics
         self._ode = ode_with_work(dynamics)
@@ -79,7 +82,7 @@ class Propagator:
         self._contacts = tuple(contact_events_of(scene, geometry))
         self._ranges = ranges_of([*self._limits, *free_range(self._contacts)])
         limit = scene.actuators.torque_limit if scene.actuators else None
-        self._torque = AppliedTorque(self._ode, limit)
+        self._torque = AppliedTorque(self._ode, limit, derivative)
         self._budget = budget
         self._new_stepper = partial(
             AdaptiveStepper,
@@ -89,7 +92,7 @@ class Propagator:
             ranges=self._ranges,
             budget=budget,
         )
-        self._constant = self._stepper = self._new_stepper(self._ode)
+        self._constant = self._stepper = self._new_stepper(self._ode, derivative=derivative)
         self._sines: dict[SineTorque, AdaptiveStepper] = {}
         # Torque functions are evaluated in Python, and have no Jacobian.
         self._function = AdaptiveStepper(

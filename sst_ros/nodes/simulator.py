@@ -49,7 +49,10 @@ class Simulator:
         self._topics = SimulatorTopics(self.node, simulated, given)
         self._input = TorqueInput(self, simulated.actuators, *self._readers(simulated))
         self._pacer = self._create_pacer()
-        self._code = CodeCompiler(self.node, simulated, given) if given.compiled else None
+        traced = given.equations == "quaternion"
+        self._code = (
+            CodeCompiler(self.node, simulated, given) if given.compiled and traced else None
+        )
         self._loop = RunLoop(simulated, self._build, self, self._input, self._pacer, self._topics)
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
@@ -98,7 +101,13 @@ class Simulator:
     def _build(self, simulated: Scene) -> Simulation:
         given = self.parameters
         compiled = self._code is not None and self._code.available
-        return Simulation(simulated, given.integrator, tolerance=given.tolerance, compiled=compiled)
+        return Simulation(
+            simulated,
+            given.integrator,
+            tolerance=given.tolerance,
+            compiled=compiled,
+            equations=given.equations,
+        )
 
     def _create_pacer(self) -> Pacer:
         given = self.parameters

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.dynamics import kernel
+from sst_ros.dynamics.virtual_work_derivative import body_acceleration
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism import virtual_work
 from sst_ros.recording.recording import Recording
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
@@ -55,7 +54,7 @@ def check(recording: Recording, count: int = STATES) -> Formulation:
         state = tuple(row[:7].tolist())
         torque = recording.effort[sample]  # the torque that acts, lagged or not
         try:
-            paper = of_the_paper(mechanism, state, torque)
+            paper, _ = body_acceleration(mechanism, state, torque)
         except SingularConfiguration:
             continue
         first, second, third = torque.tolist()
@@ -66,20 +65,3 @@ def check(recording: Recording, count: int = STATES) -> Formulation:
         return Formulation(None, 0)
     scale = max(sizes)
     return Formulation(max(differences) / scale if scale > 0.0 else max(differences), len(sizes))
-
-
-def of_the_paper(mechanism: virtual_work.Mechanism, state: states.Vector, torque: Array) -> Array:
-    """W_dot in {E} [rad/s^2] of a state (quaternion, W) under torques [N m], by Eqs. 1 to 92.
-
-    Raises:
-        SingularConfiguration: the posture is singular.
-
-    """
-    rotation = rotation_matrix(state[:4])
-    gamma = kinematics.inverse(mechanism.geometry, rotation)[0]
-    posture = virtual_work.posture(mechanism.geometry, gamma, rotation)
-    gamma_dot = np.linalg.solve(posture.j, rotation @ np.array(state[4:]))
-    gamma_ddot = virtual_work.direct_dynamics(mechanism, posture, gamma_dot, torque)
-    # R W_dot = omega_dot, because W x W = 0.
-    omega_dot = posture.j @ gamma_ddot + virtual_work.bias(posture, gamma_dot).omega_dot
-    return np.asarray(rotation.T @ omega_dot)

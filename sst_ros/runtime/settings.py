@@ -10,7 +10,7 @@ from typing import ClassVar
 from sst_ros.errors import Problem
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
-from sst_ros.simulation.simulation import INTEGRATORS, NANOSECONDS
+from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS, NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,12 @@ class SimulatorParameters(Section):
         default=1e-10,
         above=0.0,
         most=1.0,
+    )
+    equations: str = choice(
+        "equations of motion: those in the quaternion and the body rate, or the paper's Eqs. 1 to "
+        "92, which give the same motion by explicit methods in plain Python, about 20 times slower",
+        EQUATIONS,
+        default="quaternion",
     )
     compiled: bool = flag(
         "run machine code where numba is installed; the first run of a scene is plain Python, with "

@@ -13,6 +13,7 @@ import numpy as np
 
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.virtual_work_derivative import VirtualWorkDerivative
 from sst_ros.errors import Diverged, InputError, Problem, StepBudgetExceeded
 from sst_ros.integration.adaptive_stepper import (
     BudgetSpent,
@@ -22,7 +23,7 @@ from sst_ros.integration.adaptive_stepper import (
 )
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.methods import METHODS
+from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.integration.ode import ode_with_work
 from sst_ros.integration.propagator import Point, Propagator
 from sst_ros.mechanism.geometry import Geometry
@@ -32,6 +33,7 @@ from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.state import NANOSECONDS, Joints, State, Vector3
 
 __all__ = [
+    "EQUATIONS",
     "INTEGRATORS",
     "NANOSECONDS",
     "WHOLE_MOTION_BUDGET",
@@ -50,6 +52,12 @@ STAGE_OPERATIONS = 100
 """Operations of a stage beside the scene's equations, which have 140 to 450."""
 COMPILED_BUDGET = 120_000
 """Evaluations a compiled step may take: 0.12 s, for an accepted step of 36 takes 36 us in all."""
+
+VIRTUAL_WORK_BUDGET = 1000
+"""Evaluations of the paper's equations that a step may take: 0.3 s, at 0.3 ms each."""
+
+EQUATIONS = ("quaternion", "virtual_work")
+"""Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
 
 WHOLE_MOTION_BUDGET = 10_000_000
 """`step_budget` where a step may be a whole motion, offline: minutes in plain Python."""
@@ -78,6 +86,9 @@ class Simulation:
             seconds. Without numba a RuntimeWarning is raised and plain Python runs. Torque
             functions, and sines that the actuators clamp, run in plain Python, with one
             RuntimeWarning.
+        equations: "quaternion", the equations of motion in the quaternion and the body rate, or
+            "virtual_work", the paper's Eqs. 1 to 92: the same motion, about 20 times slower, by
+            explicit methods in plain Python, without the terms that the paper does not have.
         step_budget: evaluations of the right-hand side that one `step` may take. The default keeps
             a step below about 0.2 s: `PLAIN_BUDGET` operations in plain Python (5,000 to 12,000
             evaluations), `COMPILED_BUDGET` evaluations under numba. Long steps of a stiff or fast
@@ -92,7 +103,8 @@ class Simulation:
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
         SingularConfiguration: it moves from a parallel singularity.
-        InputError: the initial gamma lies outside the stroke, or an argument is not allowed.
+        InputError: the initial gamma lies outside the stroke, an argument is not allowed, or the
+            scene has a term that the equations do not have.
 
     """
 
@@ -103,6 +115,7 @@ class Simulation:
         *,
         tolerance: float = 1e-10,
         compiled: bool = False,
+        equations: str = "quaternion",
         step_budget: int | None = None,
     ) -> None:
         if integrator not in INTEGRATORS:
@@ -112,7 +125,17 @@ class Simulation:
             raise InputError("simulation", [Problem("tolerance", tolerance, "must be > 0")])
         if step_budget is not None and not step_budget > 0:
             raise InputError("simulation", [Problem("step_budget", step_budget, "must be > 0")])
+        if equations not in EQUATIONS:
+            allowed = "must be one of " + ", ".join(EQUATIONS)
+            raise InputError("simulation", [Problem("equations", equations, allowed)])
         self.scene = scene = scene_of(scene)
+        derivative = None
+        if equations == "virtual_work":
+            if compiled or isinstance(METHODS.get(integrator), Rosenbrock):
+                allowed = "needs an explicit integrator and compiled = False"
+                raise InputError("simulation", [Problem("equations", equations, allowed)])
+            derivative = VirtualWorkDerivative(scene)
+            step_budget = step_budget or VIRTUAL_WORK_BUDGET
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
         self.compiled = compiled and numba_version() is not None
@@ -135,6 +158,7 @@ class Simulation:
             tolerance,
             compiled=self.compiled,
             budget=EvaluationBudget(step_budget),
+            derivative=derivative,
         )
         self._warned = not self.compiled
         self._start = self._initial()
