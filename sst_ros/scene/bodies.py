@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bodies of a scene: base triangle, star, links, payload.
 
-Bodies rotate about the fixed centre O, so every inertia here is about O but the payload's.
+Bodies rotate about the fixed centre O, so every inertia here is about O but the payload's; one that
+a document gives about the centre of mass is shifted when it is read (parallel axes).
 Letters and frames are the paper's: base directions v_k, angles alpha_k between the arcs of the
 moving spherical star (MSS), {E} fixed in the star, {1k} in actuated link k, {2k} in intermediate
 link k.
@@ -16,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
-from sst_ros.scene.schema import Section, number, section
+from sst_ros.scene.schema import Section, choice, number, section
 
 Vector = tuple[float, float, float]
 
 RELATIVE_ROUNDING = 1e-9
+
+ABOUT_O, ABOUT_CENTRE = "O", "centre_of_mass"
 
 SMALLEST_MOMENT = 1e-18
 """Moment of inertia [kg m^2] of a microgram at a millimetre; its inverse must not overflow."""
@@ -103,13 +106,23 @@ class Star(Section):
     inertia: Inertia = section("inertia of the star in {E}", Inertia)
     mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
     centre: Vector = number("centre of mass in {E}", "m", shape=(3,), default=(0.0, 0.0, 0.0))
+    inertia_about: str = choice(
+        "point of the inertia; the scene that is read has it about O",
+        (ABOUT_O, ABOUT_CENTRE),
+        default=ABOUT_O,
+    )
+
+    def __post_init__(self) -> None:
+        """Check, and shift the inertia to O."""
+        super().__post_init__()
+        _shift_to_o(self)
 
     def check(self) -> Iterator[Problem]:
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
         total = sum(self.alpha_deg)
         if abs(total - 360.0) > 360.0 * RELATIVE_ROUNDING:
             yield Problem("alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}")
-        yield from _mass_problems(self.mass, self.centre, self.inertia)
+        yield from _mass_problems(self)
 
 
 @dataclass(frozen=True)
@@ -121,10 +134,20 @@ class Link(Section):
     centre: Vector = number(
         "centre of mass in the link's own frame", "m", shape=(3,), default=(0.0, 0.0, 0.0)
     )
+    inertia_about: str = choice(
+        "point of the inertia; the scene that is read has it about O",
+        (ABOUT_O, ABOUT_CENTRE),
+        default=ABOUT_O,
+    )
+
+    def __post_init__(self) -> None:
+        """Check, and shift the inertia to O."""
+        super().__post_init__()
+        _shift_to_o(self)
 
     def check(self) -> Iterator[Problem]:
         """Refuse centres and inertias that contradict the mass."""
-        yield from _mass_problems(self.mass, self.centre, self.inertia)
+        yield from _mass_problems(self)
 
 
 @dataclass(frozen=True)
@@ -151,13 +174,29 @@ def _of_point(mass: float, centre: Vector) -> NDArray[np.float64]:
     return np.asarray(mass * (c @ c * np.eye(3) - np.outer(c, c)))
 
 
-def _mass_problems(mass: float, centre: Vector, inertia: Inertia | None) -> Iterator[Problem]:
-    if mass == 0.0 and any(centre):
+def _shift_to_o(body: Star | Link) -> None:
+    """Replace an inertia about the centre of mass by that about O (parallel axes)."""
+    if body.inertia_about == ABOUT_CENTRE and body.inertia is not None:
+        about_o = body.inertia.matrix + _of_point(body.mass, body.centre)
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_o.tolist()
+        object.__setattr__(body, "inertia", Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz))
+        object.__setattr__(body, "inertia_about", ABOUT_O)
+
+
+def _mass_problems(body: Star | Link) -> Iterator[Problem]:
+    mass, centre, inertia = body.mass, body.centre, body.inertia
+    if body.inertia_about == ABOUT_CENTRE:
+        if mass == 0.0 or inertia is None:
+            yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
+    elif mass == 0.0 and any(centre):
         yield Problem("centre", centre, "needs mass > 0 [kg]")
     elif mass > 0.0:
         about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
         own = np.linalg.eigvalsh(about_o - _of_point(mass, centre))
         scale = max(float(np.abs(about_o).max()), mass * float(np.dot(centre, centre)))
         if own[0] < -1e-6 * scale or own[2] > own[0] + own[1] + 1e-6 * scale:
-            allowed = f"must fit the inertia about O, which leaves {own} about this centre"
+            allowed = (
+                f"must fit the inertia about O, which leaves {own} about this centre "
+                f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
+            )
             yield Problem("centre", centre, allowed)
