@@ -131,7 +131,9 @@ def printable(text: str) -> str:
 def shortened(value: object, limit: int = 80) -> str:
     """Return `repr(value)`, cut to `limit` characters."""
     text = repr(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    # The end of a path names the file.
+    half = limit // 2 - 2
+    return text if len(text) <= limit else f"{text[:half]}...{text[-half:]}"
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

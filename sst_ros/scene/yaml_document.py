@@ -17,8 +17,8 @@ from sst_ros.scene.values import plain
 
 S = TypeVar("S", bound=Section)
 
-LONGEST, MOST_NODES, DEEPEST = 1_000_000, 50_000, 20
-"""Characters, values and levels of nesting of a document: PyYAML reads 50,000 values in a second,
+LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
+"""Characters, values and levels of nesting of a document: PyYAML reads 20,000 values in 0.5 s,
 and its time grows with the square of the levels."""
 
 
