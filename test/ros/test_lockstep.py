@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
+from sst_ros import Simulation, simulate
 from sst_ros.recording import recording
+from sst_ros.state import Joints
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_simulator"
+JOINTS = Joints._fields
+
+
+def pd_torque(gamma, gamma_dot):
+    goal = np.array([0.9, 0.7, 0.8])
+    return (60.0 * (goal - np.array(gamma)) - 6.0 * np.array(gamma_dot)).tolist()
 
 
 class Controller:
@@ -21,7 +29,6 @@ class Controller:
 
     def __init__(self, observer):
         self.publisher = observer.node.create_publisher(JointState, f"{NODE}/commands_stamped", 10)
-        self.goal = np.array([0.9, 0.7, 0.8])
         self.node = observer.node
         self.states = self.node.create_subscription(JointState, "/joint_states", self.answer, 10)
 
@@ -30,17 +37,21 @@ class Controller:
         self.node.destroy_publisher(self.publisher)
 
     def answer(self, state):
-        gamma, gamma_dot = np.array(state.position[:3]), np.array(state.velocity[:3])
-        effort = 60.0 * (self.goal - gamma) - 6.0 * gamma_dot
-        answer = JointState(name=state.name[:3], effort=effort.tolist())
+        effort = pd_torque(state.position[:3], state.velocity[:3])
+        answer = JointState(name=state.name[:3], effort=effort)
         answer.header.stamp = state.header.stamp
         self.publisher.publish(answer)
 
 
-def closed_loop(nodes, observer, bag, disturb=lambda: None):
+def closed_loop(nodes, observer, bag, disturb=lambda: None, **options):
     recorder = nodes.run("recorder", output=bag)
     simulator = nodes.run(
-        "simulator", sync="lockstep", duration=0.3, real_time_factor=0.0, publish_rate=500
+        "simulator",
+        sync="lockstep",
+        duration=0.3,
+        real_time_factor=0.0,
+        publish_rate=500,
+        **options,
     )
     assert nodes.line(recorder).startswith("ready")
     disturb()
@@ -75,6 +86,40 @@ def test_a_closed_loop_is_the_same_on_a_loaded_machine(nodes, observer, tmp_path
         assert np.array_equal(getattr(idle, name), getattr(loaded, name)), name
     assert np.array_equal(idle.ticks.torque, loaded.ticks.torque)
     assert np.array_equal(idle.ticks.end_ns, loaded.ticks.end_ns)
+
+
+def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_path):
+    """One closed loop three times: in one call, step by step, and as nodes in lockstep."""
+    bag = closed_loop(nodes, observer, tmp_path / "bag", rate=500).trajectory
+    tolerance, period = 1e-10, 0.002
+    whole = simulate(
+        bag.scene,
+        lambda t, state: pd_torque(state.joints.gamma, state.joints.gamma_dot),
+        0.3,
+        control_period=period,
+        tolerance=tolerance,
+    )
+    simulation = Simulation(bag.scene, tolerance=tolerance)
+    states = [simulation.state]
+    for _ in range(150):
+        joints = simulation.state.joints
+        torque = tuple(pd_torque(joints.gamma, joints.gamma_dot))
+        states.append(simulation.step(torque, round(period * 1e9)))
+    assert len(bag) == len(whole) == len(states) == 151
+    assert np.ptp(bag.gamma, axis=0).min() > 1e-3
+    single = {
+        **{name: [getattr(state.joints, name) for state in states] for name in JOINTS},
+        "t": [state.time_ns / 1e9 for state in states],
+        "quaternion": [state.quaternion for state in states],
+        "torque": [state.torque for state in states],
+    }
+    for name, values in single.items():
+        assert np.array_equal(getattr(whole, name), values), name
+        assert np.array_equal(getattr(bag, name), values), name
+    assert whole.body_rate.tolist() == [list(state.body_rate) for state in states]
+    # The bag has no body rate: it is computed from the rates of the joints.
+    np.testing.assert_allclose(bag.body_rate, whole.body_rate, atol=1e-12)
+    assert bag.error_estimate == pytest.approx(whole.error_estimate, rel=1e-2)
 
 
 def test_without_an_answer_it_stops_with_a_fault(nodes, observer):
