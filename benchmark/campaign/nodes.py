@@ -128,7 +128,7 @@ class Client:
 def running(**given: object) -> Iterator[tuple[subprocess.Popen[str], Client]]:
     """Give a running simulator and a client of it."""
     with domain() as number:
-        process = start("simulator", scene="swing", **given)
+        process = start("simulator", scene="swing", duration=0.0, **given)
         client = Client(number)
         try:
             yield process, client

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
@@ -140,6 +141,17 @@ class AdaptiveStepper:
         stages = len(self.method.a)
         return 3 * (stages + (JACOBIAN_COST if isinstance(self.method, Rosenbrock) else 0))
 
+    def load(self, h: float, at: StepPoint, d: Vector) -> None:
+        """Have the code of all methods that a run may turn to loaded; nothing else changes."""
+        methods = (DORMAND_PRINCE, DOP853, RODAS4) if self._auto else (self.method,)
+        for method in methods:
+            loaded = self._method_of(method)
+            loaded.step_pair(0.0, h, at[0], at[1], d)
+            loaded.step_many(h, 1, self.tolerance, at, d)
+        if self._auto:
+            with contextlib.suppress(ArithmeticError, ValueError):  # no finite Jacobian here
+                np.linalg.eigvals(self._jacobian(0.0, at[0], d))
+
     def checkpoint(self) -> StepperCheckpoint:
         """Return what the next steps depend on, to go back to."""
         return self._current, self._h, self._since_look, len(self.history)
@@ -270,9 +282,12 @@ class AdaptiveStepper:
     def spectrum(self, t: float, y: Vector, d: Vector) -> np.ndarray:
         """Eigenvalues of the exact Jacobian [1/s]."""
         self.budget.charge(JACOBIAN_COST)
+        return np.asarray(np.linalg.eigvals(self._jacobian(t, y, d)))
+
+    def _jacobian(self, t: float, y: Vector, d: Vector) -> np.ndarray:
         size = len(self._ode.state)
-        flat = self._linearised(t, *y, *d)[2 * size :]
-        return np.asarray(np.linalg.eigvals(np.array(flat).reshape(size, size).T))
+        flat = np.array(self._linearised(t, *y, *d)[2 * size :])
+        return np.asarray(flat.reshape(size, size).T)
 
     @cached_property
     def _linearised(self) -> Function:

@@ -112,6 +112,10 @@ class Propagator:
         self._restore(self._first)
         self._before = self._first
 
+    def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
+        """Have the code loaded that periods of h [s] under constant torques may need."""
+        self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
+
     def _checkpoint(self) -> Checkpoint:
         """All that the next steps depend on beside the point at which they begin."""
         steppers = {

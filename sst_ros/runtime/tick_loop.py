@@ -58,8 +58,12 @@ class TickLoop:
         self._awaited_since = time.monotonic()
 
     def warm_up(self) -> None:
-        """Take the first step, which loads code, and go back: later steps take no longer."""
+        """Load the code of every method, take the first step and go back.
+
+        Later steps take no longer, also where they change the method.
+        """
         self.step_since = time.perf_counter()
+        self.simulation.load_code(self._period_ns)
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)
         self.step_since = 0.0

@@ -12,6 +12,7 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.errors import RunStopped
+from sst_ros.integration import codegen
 from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
@@ -95,6 +96,20 @@ def test_a_run_ends_after_its_duration_with_every_sample():
     assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
     assert len(bench.output.acted) == bench.loop.counters.ticks == 11
     assert bench.output.phases == ["waiting", "running", "finished"]
+
+
+def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
+    begun, load = [], codegen.load
+
+    def loading(*args, **named):
+        begun.append(bench.loop.begun)
+        return load(*args, **named)
+
+    bench = Bench(scene="stiff", duration=0.1)
+    monkeypatch.setattr(codegen, "load", loading)
+    bench.loop.run()
+    assert bench.loop.phase is Phase.FINISHED and bench.loop.simulation.changes
+    assert begun and not any(begun)
 
 
 def test_pause_is_idempotent_and_a_step_is_one_sample():
