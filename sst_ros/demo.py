@@ -37,7 +37,7 @@ def demo(out: Path) -> int:
     """
     for name in EXAMPLES:
         folder = out if name == "example2" else out / name
-        bag = _room(folder)
+        bag = empty_bag(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
         print(text(report(bag, folder), str(folder)), flush=True)
@@ -56,7 +56,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
     """
     seconds = reference_motion(scene.load(name)).duration + HOLD_S
     for mode in modes:
-        bag = _room(out / mode)
+        bag = empty_bag(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
         follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
         print(tracking_report.report(bag, out / mode), flush=True)
@@ -108,7 +108,7 @@ def _recorded(bag: Path, **run: object) -> Iterator[None]:
         _wait_for_end("recorder", recorder, _END_S)
 
 
-def _room(folder: Path) -> Path:
+def empty_bag(folder: Path) -> Path:
     """Return the folder of a bag, without that of an earlier demo."""
     bag = folder / "bag"
     if bag.exists():

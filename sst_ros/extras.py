@@ -15,6 +15,7 @@ EXTRAS = {
     "mcap": "record",
     "mpmath": "all",
     "numba": "fast",
+    "pinocchio": "engines",
     "pandas": "record",
     "pyarrow": "record",
     "rosbags": "record",

@@ -27,7 +27,7 @@ FLOORS = (
     {"studies"},
     {"runtime"},
     {"nodes"},
-    {"demo", "launch_parts"},
+    {"demo", "launch_parts", "paper"},
     {"cli"},
     {"__main__"},
 )

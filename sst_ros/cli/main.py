@@ -21,6 +21,7 @@ COMMANDS = (
     "describe",
     "compile",
     "demo",
+    "paper",
     "view",
     "report",
     "plot",

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, lines, positive, span
+from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, lines, positive, span, widen
 from sst_ros.scene.scene import Scene
 
 NUMBERS = {
@@ -110,6 +110,7 @@ def _over_time(
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for solution, columns, style in zip(solutions, values, LINES, strict=False):
         above.plot(solution.seconds, columns, label=solution.name, **style)
+    widen(above, values[0], least_span)
     _name_columns(above, first.seconds, values[0], letters)
     handles, names = above.get_legend_handles_labels()
     unique = dict(zip(names, handles, strict=True))

@@ -108,6 +108,14 @@ def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes
     return figure, list(grid)
 
 
+def widen(axes: Axes, values: Array, least_span: float) -> None:
+    """Show no less than `least_span` of the values, so that rounding is a flat line."""
+    known = values[np.isfinite(values)]
+    if len(known) and np.ptp(known) < least_span:
+        middle = 0.5 * float(known.min() + known.max())
+        axes.set_ylim(middle - 0.5 * least_span, middle + 0.5 * least_span)
+
+
 def lines(
     axes: Axes, seconds: Array, values: Array, names: Sequence[str], *, least_span: float = 0.0
 ) -> None:
@@ -117,10 +125,7 @@ def lines(
     """
     for column, name, style in zip(values.T, names, LINES, strict=False):
         axes.plot(seconds, column, label=name, **style)
-    known = values[np.isfinite(values)]
-    if len(known) and np.ptp(known) < least_span:
-        middle = 0.5 * float(known.min() + known.max())
-        axes.set_ylim(middle - 0.5 * least_span, middle + 0.5 * least_span)
+    widen(axes, values, least_span)
     if len(names) > 1:
         legend(axes)
     span([axes], seconds)

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figs. 8 to 14 of the paper from scratch: nodes, continuous solution, independent engine."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sst_ros import demo
+from sst_ros.extras import MissingDependency
+from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.frames import angle_between, rotation_matrix
+from sst_ros.mechanism.geometry import Array
+from sst_ros.output_folder import writing
+from sst_ros.plot import paper_figures
+from sst_ros.plot.paper_figures import NUMBERS, Solution
+from sst_ros.plot.pictures import PICTURES, save
+from sst_ros.plot.style import BLUE, VERMILION, positive, styled
+from sst_ros.recording import recording
+from sst_ros.scene.scene import Scene, load
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.studies.pinocchio_motion import PinocchioMotion
+
+NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
+"""Largest differences that are expected: of angles [rad], and of torques [N m]."""
+
+STEP = 1e-3
+"""Spacing of the central differences of the inverse-dynamics check [s]."""
+DIFFERENCES = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+"""First derivative of order 8 at the middle of nine values, times the spacing."""
+
+INDEX = "index.html"
+
+
+class LargestDifference(NamedTuple):
+    """A largest difference over a run, and what it may be."""
+
+    scene: str
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def within(self) -> bool:
+        """Whether it is as small as expected."""
+        return self.value <= self.limit
+
+    def __str__(self) -> str:
+        relation = "within" if self.within else "ABOVE"
+        return (
+            f"{self.scene}: {self.what}: {self.value:.1e} {self.unit}, "
+            f"{relation} {self.limit:.0e} {self.unit}"
+        )
+
+
+@styled
+def paper(out: Path) -> list[LargestDifference]:
+    """Run both examples, draw the figures into `out` and write an index page.
+
+    Returns:
+        The largest differences between the solutions; `within` of each is true if all is well.
+
+    Raises:
+        SstError: a node failed; names it.
+        InputError: `out` cannot be written.
+
+    """
+    found: list[LargestDifference] = []
+    paths: list[Path] = []
+    notes: list[str] = []
+    with writing(out, "paper"):
+        for name in demo.EXAMPLES:
+            scene = load(name)
+            print(f"{name}: {scene.description}", flush=True)
+            bag = demo.empty_bag(out / name)
+            demo.record(name, bag)
+            solutions, differences, note = _solutions(scene, bag)
+            found += differences
+            notes += note
+            paths += _draw(scene, solutions, out)
+        path, difference = _inverse_dynamics(load("example1"), out)
+        found.append(difference)
+        paths.insert(2, path)
+        lines = [*map(str, found), *dict.fromkeys(notes)]
+        (out / INDEX).write_text(_page(paths, lines), encoding="utf-8")
+    print("\n".join([*lines, f"Files: {out}: {INDEX}, {len(paths)} pictures"]), flush=True)
+    return found
+
+
+def _solutions(
+    scene: Scene, bag: Path
+) -> tuple[list[Solution], list[LargestDifference], list[str]]:
+    """Return the solutions of an example at the samples of its run, and how far apart they are."""
+    run = recording.read(bag)
+    times = run.seconds
+    motion = simulate(scene, duration=float(times[-1]), t_eval=times, tolerance=1e-12)
+    solutions = [
+        Solution("continuous", times, motion.quaternion),
+        Solution("nodes, 500 Hz", times, run.quaternion, run.euler),
+    ]
+    differences = [_difference(scene, "nodes", motion, run.quaternion, run.gamma, NODES_LIMIT)]
+    try:
+        quaternion, gamma = PinocchioMotion(scene).at(times)
+    except MissingDependency as error:
+        return solutions, differences, [f"no independent engine: {error}"]
+    solutions.append(Solution("Pinocchio", times, quaternion))
+    differences.append(_difference(scene, "Pinocchio", motion, quaternion, gamma, ENGINE_LIMIT))
+    return solutions, differences, []
+
+
+def _difference(
+    scene: Scene, who: str, motion: Trajectory, quaternion: Array, gamma: Array, limit: float
+) -> LargestDifference:
+    """Return the largest difference of the actuator angles and of the orientation."""
+    apart = float(np.abs(gamma - motion.gamma).max())
+    turned = float(angle_between(quaternion, motion.quaternion).max())
+    what = f"{who} against the continuous solution"
+    return LargestDifference(scene.name, what, max(apart, turned), limit, "rad")
+
+
+def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
+    """Draw the paper's figures of a scene."""
+    drawn = {
+        "path_of_E": lambda: paper_figures.path(scene, solutions),
+        "position_of_E": lambda: paper_figures.position_of_e(scene, solutions),
+        "theta": lambda: paper_figures.angle(solutions, 0),
+        "phi": lambda: paper_figures.angle(solutions, 1),
+        "psi": lambda: paper_figures.angle(solutions, 2),
+    }
+    paths: list[Path] = []
+    for name in NUMBERS[scene.name]:
+        stem, title = paper_figures.caption(name, PICTURES[name].title, scene.name)
+        paths += save(drawn[name](), title, out, stem, ["png"])
+    return paths
+
+
+def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]:
+    """Check Example 1 as the paper does: inverse dynamics of the motion gives the torques back.
+
+    Accelerations are central differences of the rates, so that no direct dynamics enters.
+    """
+    assert scene.torque is not None and scene.duration is not None
+    count = int(scene.duration / STEP)
+    motion = simulate(scene, t_eval=np.arange(count + 1) * STEP, tolerance=1e-12)
+    reach = len(DIFFERENCES) // 2
+    middle = slice(reach, count + 1 - reach)
+    acceleration = np.stack(
+        [np.correlate(column, DIFFERENCES, "valid") / STEP for column in motion.gamma_dot.T], 1
+    )
+    mechanism = virtual_work.Mechanism.of(scene)
+    rows = zip(motion.gamma[middle], motion.gamma_dot[middle], acceleration,
+               rotation_matrix(motion.quaternion[middle]), strict=True)  # fmt: skip
+    torque = np.array([
+        virtual_work.inverse_dynamics(
+            mechanism, virtual_work.posture(mechanism.geometry, gamma, rotation), rate, change
+        )
+        for gamma, rate, change, rotation in rows
+    ])  # fmt: skip
+    times = motion.t[middle]
+    given = scene.torque.amplitude[0] * np.sin(scene.torque.frequency[0] * times)
+    apart = np.abs(torque - given[:, None]).max(axis=1)
+    figure = Figure(figsize=(7.0, 6.4))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    above.plot(times, given, color=BLUE, linewidth=2.6, label="1.13 sin 12t")
+    above.plot(times, torque[:, 0], "--", color=VERMILION, linewidth=1.8,
+               label="inverse dynamics of the simulated motion, actuator 1")  # fmt: skip
+    above.set_ylabel("torque [N m]")
+    above.legend(fontsize=9)
+    below.plot(times, positive(apart), color=VERMILION)
+    below.set_yscale("log")
+    below.set_ylabel("largest difference\nof three actuators [N m]")
+    below.set_xlabel("time t [s]")
+    title = (
+        "Inverse dynamics of Example 1, the check that the paper's text describes\n"
+        f"{paper_figures.ASSUMPTION}"
+    )
+    path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
+    what = "torques by inverse dynamics against 1.13 sin 12t"
+    return path, LargestDifference(scene.name, what, float(apart.max()), TORQUE_LIMIT, "N m")
+
+
+def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
+    """Format the index page."""
+    text = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    pictures = "".join(
+        f"<figure><img alt='{path.stem}' src='{path.name}'></figure>" for path in paths
+    )
+    return (
+        "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>Figs. 8 to 14</title>"
+        "<style>body{font-family:sans-serif;max-width:60em;margin:2em auto}img{max-width:100%}"
+        "</style></head><body><h1>Figs. 8 to 14 of the paper</h1>"
+        f"<p>{html.escape(paper_figures.ASSUMPTION.capitalize())}. The paper's own figures are not "
+        "known to us, only their captions.</p>"
+        f"<h2>Largest differences</h2><ul>{text}</ul>{pictures}</body></html>\n"
+    )
