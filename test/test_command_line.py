@@ -104,6 +104,7 @@ def error_of(words, capsys):
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'"),
         (["workspace", "example2", "--out", "picture"], "must end in .png or .pdf or .svg"),
         (["simulate", "example2", "--out", "table.txt"], "must end in .parquet or .csv"),
+        (["simulate", "example2", "--samples", "0"], "--samples = 0: must be a whole number"),
         (["compile", "--integrator", "nope"], "must be one of auto, rk4"),
         (["scene", "show", "{here}/latin.yaml"], "latin.yaml"),
     ],
@@ -267,6 +268,8 @@ def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsy
     assert trajectory.t[-1] == 0.05
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert "exists already" in error_of(words, capsys)
+    assert main([*words[:4], "--samples", "20", "--out", "even.csv"]) == 0
+    assert len((tmp_path / "even.csv").read_text().splitlines()) == 22
     assert main(["simulate", "example2_heavy", "--duration", "5"]) == 1
     said = capsys.readouterr()
     assert "stopped at t = 1.2853" in said.out

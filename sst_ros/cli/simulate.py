@@ -11,6 +11,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.output_folder import require_free
 
 FORMATS = (".parquet", ".csv")
+MOST_SAMPLES = 10_000_000
 
 
 def add(commands: Commands) -> None:
@@ -27,6 +28,9 @@ def add(commands: Commands) -> None:
     simulate.add_argument(
         "--tolerance", type=float, default=1e-9, help="allowed error [rad]; default: 1e-9"
     )
+    simulate.add_argument(
+        "--samples", type=int, metavar="N", help="even intervals in time; default: ends of steps"
+    )
     simulate.add_argument("--out", type=Path, metavar="FILE", help="trajectory, .parquet or .csv")
     simulate.add_argument(
         "--plot", action="store_true", help="draw it; beside FILE, or as SCENE.png"
@@ -36,6 +40,8 @@ def add(commands: Commands) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
+    import numpy as np
+
     from sst_ros.extras import require
     from sst_ros.simulation.simulate import simulate
 
@@ -46,6 +52,9 @@ def _simulate(options: argparse.Namespace) -> int:
             raise InputError("simulate", [Problem("--out", str(out), allowed)])
         require_free(out, "simulate", force=options.force)
         require("pyarrow" if out.suffix == ".parquet" else "pandas")
+    if options.samples is not None and not 1 <= options.samples <= MOST_SAMPLES:
+        allowed = f"must be a whole number from 1 to {MOST_SAMPLES}"
+        raise InputError("simulate", [Problem("--samples", options.samples, allowed)])
     if options.plot:
         picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
         require_free(picture, "simulate", force=options.force)
@@ -57,6 +66,9 @@ def _simulate(options: argparse.Namespace) -> int:
         tolerance=options.tolerance,
         progress=True,
     )
+    if options.samples is not None:
+        begin, end = trajectory.t[0], trajectory.t[-1]
+        trajectory = trajectory.at(np.linspace(begin, end, options.samples + 1))
     gamma = ", ".join(f"{angle:.9f}" for angle in trajectory.gamma[-1])
     print(f"{trajectory.scene.name}: {trajectory.message}")
     print(f"simulated        {trajectory.t[-1]:.9g} s, {len(trajectory)} samples")

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.integration import codegen
 from sst_ros.integration.batch_result import BatchResult, BatchStates
 from sst_ros.integration.batch_source import LANES, NOT_FINITE, batch_source
@@ -46,8 +47,9 @@ class Batch:
         progress: draw a bar on a terminal while scenarios are prepared.
 
     Raises:
-        InputError: numba is not installed, the scene has no torque to apply, or the
-            numbers of a scenario make no scene; says which, and what is allowed.
+        InputError: the scene has no torque to apply, or the numbers of a scenario make no scene;
+            says which, and what is allowed.
+        MissingDependency: numba is not installed.
 
     """
 
@@ -60,9 +62,10 @@ class Batch:
         parameters: Mapping[str, ArrayLike] | None = None,
         progress: bool = False,
     ) -> None:
-        problems = []
         if codegen.numba_version() is None:
-            problems.append(Problem("numba", None, "must be installed: pip install sst_ros[fast]"))
+            require("numba")
+            raise InputError(scene.name, [Problem("SST_ROS_NUMBA", "0", "must not be set to 0")])
+        problems = []
         if profile and scene.torque is None:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}

@@ -7,13 +7,13 @@ Times are whole nanoseconds, all else doubles; what was lost is empty. Columns b
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.output_folder import require_free, writing
 from sst_ros.recording import signals
 from sst_ros.recording.signals import Signals
@@ -37,7 +37,8 @@ def frame(bag: str | Path, table: str = "samples") -> pd.DataFrame:
         their units, and `attrs` describes each.
 
     Raises:
-        InputError: the recording cannot be read, it has no such table, or pandas is missing.
+        InputError: the recording cannot be read, or it has no such table.
+        MissingDependency: pandas is not installed.
 
     """
     return table_of(signals.read(Path(bag)), table)
@@ -47,10 +48,11 @@ def table_of(run: Signals, table: str = "samples") -> pd.DataFrame:
     """Return a table of a recording that was read, as `frame` does.
 
     Raises:
-        InputError: it has no such table, or pandas is missing.
+        InputError: it has no such table.
+        MissingDependency: pandas is not installed.
 
     """
-    pandas = _library("pandas")
+    pandas = require("pandas")
     if table not in run.tables:
         allowed = "must be one of those in the bag: " + ", ".join(run.tables)
         raise InputError(str(run.path), [Problem("table", table, allowed)])
@@ -74,8 +76,8 @@ def export(bag: Path, out: Path, form: str = FORMATS[0], *, force: bool = False)
         force: replace earlier files.
 
     Raises:
-        InputError: the recording cannot be read, `out` cannot be written or is not empty, or a
-            library is missing.
+        InputError: the recording cannot be read, `out` cannot be written or is not empty.
+        MissingDependency: pandas or pyarrow is not installed.
 
     """
     require_free(out, "export", force=force)
@@ -98,7 +100,7 @@ def _columns(run: Signals, table: str) -> tuple[Column, ...]:
 
 
 def _write_parquet(path: Path, table: pd.DataFrame, columns: tuple[Column, ...]) -> None:
-    pyarrow, parquet = _library("pyarrow"), _library("pyarrow.parquet")
+    pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
     arrow = pyarrow.Table.from_pandas(table.reset_index(), preserve_index=False)
     fields = [
         arrow.schema.field(column.name).with_metadata(
@@ -107,11 +109,3 @@ def _write_parquet(path: Path, table: pd.DataFrame, columns: tuple[Column, ...])
         for column in columns
     ]
     parquet.write_table(arrow.cast(pyarrow.schema(fields)), path)
-
-
-def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        allowed = "is not installed; pip install 'sst_ros[record]'"
-        raise InputError("export", [Problem(name.partition(".")[0], None, allowed)]) from None

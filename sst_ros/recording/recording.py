@@ -198,7 +198,8 @@ class Recording:
         """Return a table as pandas: samples, ticks, commands, commands_stamped, external_moment.
 
         Raises:
-            InputError: the recording has no such table, or pandas is missing.
+            InputError: the recording has no such table.
+            MissingDependency: pandas is not installed.
 
         """
         return table_of(self.signals, name)

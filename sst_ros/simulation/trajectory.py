@@ -101,7 +101,8 @@ class Trajectory(SampledMotion):
         """Write a Parquet file that `load` reads back to the bit, units and scene included.
 
         Raises:
-            InputError: the file exists, unless `overwrite`; or pyarrow is not installed.
+            InputError: the file exists, unless `overwrite`.
+            MissingDependency: pyarrow is not installed.
 
         """
         trajectory_file.save(self, Path(path), overwrite=overwrite)

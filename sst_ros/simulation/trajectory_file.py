@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import html as html_text
 import json
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import MissingDependency, require
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.sampled_motion import SampledMotion, T
@@ -51,7 +51,7 @@ _FIGURES = ("status", "message", "method", "error_estimate", "energy_residual", 
 
 def frame(trajectory: SampledMotion) -> pd.DataFrame:
     """See `Trajectory.to_pandas`."""
-    pd = _needed("pandas", "record")
+    pd = require("pandas")
     table = pd.DataFrame(_columns(trajectory))
     table.attrs = {"units": UNITS, "scene": trajectory.scene.name}
     return table
@@ -59,7 +59,7 @@ def frame(trajectory: SampledMotion) -> pd.DataFrame:
 
 def dataset(trajectory: SampledMotion) -> xr.Dataset:
     """See `Trajectory.to_xarray`."""
-    package = _needed("xarray", "all")
+    package = require("xarray")
     second = {4: "part", 3: "leg"}
     arrays: dict[str, Any] = {}
     for name, (unit, parts) in QUANTITIES.items():
@@ -83,7 +83,7 @@ def dataset(trajectory: SampledMotion) -> xr.Dataset:
 
 def save(trajectory: SampledMotion, path: Path, *, overwrite: bool) -> None:
     """See `Trajectory.save`."""
-    pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
+    pa, parquet = require("pyarrow"), require("pyarrow.parquet")
 
     if path.exists() and not overwrite:
         raise InputError("save", [Problem("path", str(path), "exists; overwrite=True replaces it")])
@@ -108,7 +108,7 @@ def save(trajectory: SampledMotion, path: Path, *, overwrite: bool) -> None:
 
 def load(cls: type[T], path: Path) -> T:
     """See `Trajectory.load`."""
-    pa, parquet = _needed("pyarrow", "record"), _needed("pyarrow.parquet", "record")
+    pa, parquet = require("pyarrow"), require("pyarrow.parquet")
 
     allowed = "must be a trajectory that `Trajectory.save` has written"
     try:
@@ -138,7 +138,7 @@ def load(cls: type[T], path: Path) -> T:
 
 def draw(trajectory: SampledMotion) -> Figure:
     """See `Trajectory.plot`."""
-    _needed("matplotlib", "plot")
+    require("matplotlib")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 9.0), layout="constrained")
@@ -178,7 +178,7 @@ def _picture(trajectory: SampledMotion) -> str:
 
     try:
         figure = draw(trajectory)
-    except InputError:
+    except MissingDependency:
         return ""
     text = io.StringIO()
     figure.savefig(text, format="svg")
@@ -191,20 +191,3 @@ def _columns(trajectory: SampledMotion) -> dict[str, Any]:
         array = getattr(trajectory, name)
         columns |= {f"{name}_{part}": array[:, i] for i, part in enumerate(parts)}
     return columns | {"energy": trajectory.energy}
-
-
-@cache
-def _needed(module: str, extra: str) -> Any:
-    """Import a package that an extra brings.
-
-    Raises:
-        InputError: it is not installed; says how to install it.
-
-    """
-    from importlib import import_module
-
-    try:
-        return import_module(module)
-    except ImportError:
-        allowed = f"must be installed: pip install 'sst_ros[{extra}]'"
-        raise InputError("installation", [Problem(module, None, allowed)]) from None

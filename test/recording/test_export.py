@@ -11,6 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
+from sst_ros.extras import MissingDependency
 from sst_ros.recording.export import export, frame
 from sst_ros.recording.topic_tables import TABLES, TIMES
 
@@ -196,5 +197,5 @@ def test_every_column_is_documented():
 
 def test_without_a_library_its_name_is_told(lossy, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"pyarrow .*pip install 'sst_ros\[record\]'"):
+    with pytest.raises(MissingDependency, match=r"pyarrow is not installed.*sst_ros\[record\]"):
         export(lossy, tmp_path / "out", "parquet")
