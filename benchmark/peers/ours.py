@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sst_ros: fixed steps of the explicit methods and of collocation, compiled and plain Python."""
+"""sst_ros: the public call, and fixed steps of each method, compiled and plain Python."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import numpy as np
 
 from benchmark.peers.series import Run, Series, Setting, ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
+from sst_ros import Trajectory, simulate
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, Tableau
 
 ENGINE, PACKAGE = "sst_ros", "numba"
+PUBLIC = "simulate()"
+"""Name of the series of the public call, from which all ratios to other engines are."""
 
 # Ladders end where rounding begins: below 2e-14 rad the doubles of the reference are seen.
 METHODS = {
@@ -22,14 +25,43 @@ METHODS = {
 
 
 def series(task: Task, quick: bool) -> list[Series]:
-    """Three methods under numba, and DOP853 without."""
+    """`simulate` itself, the methods inside of it under numba, and DOP853 without."""
     factor = 1.6 if quick else 1.15
-    found = []
+    found = [_public(task)]
     for name, (tableau, first, last) in METHODS.items():
         found.append(_series(task, f"{name}, numba", tableau, True, ladder(first, last, factor)))
     found += [_collocation(task, nodes) for nodes in (8, 12)]
     plain = ladder(5, 80, 2.0 if quick else 1.3)
     return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
+
+
+def _public(task: Task) -> Series:
+    """The call of a user, arguments checked and a `Trajectory` returned, from the second call on.
+
+    The first call prepares the motion, as other engines have their data laid out before.
+    """
+
+    def acceleration(at: Moving) -> np.ndarray:
+        return task.kernel_answer(at.y, at.torque)
+
+    def setting(tolerance: float) -> Setting:
+        def prepare() -> Run:
+            def whole() -> Trajectory:
+                return simulate(task.scene, duration=DURATION, method="gauss", tolerance=tolerance)
+
+            def poses(pieces: int) -> list[Pose]:
+                motion = whole()
+                return [task.pose_of([*motion.quaternion[-1], *motion.body_rate[-1]])]
+
+            whole()
+            return Run(whole, poses)
+
+        return Setting(f"tolerance {tolerance:.1e} rad", 0, prepare, samples=False)
+
+    # At most the number of motions that `simulate` remembers.
+    settings = [setting(10.0**-power) for power in np.arange(3.0, 13.1, 0.5)]
+    name = f"{PUBLIC}, Gauss collocation of order 16, numba"
+    return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)
 
 
 def _collocation(task: Task, nodes: int) -> Series:

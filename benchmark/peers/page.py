@@ -24,7 +24,8 @@ second, in seconds of the processor.
 ## How soon an error is reached
 
 Time in ms, and how many times ours that is. The time is that of the fastest setting tried
-whose error is as small or smaller, not interpolated. "-" means that no setting tried gets there:
+whose error is as small or smaller, not interpolated. Ours is a call of `sst_ros.simulate`, its
+checks and the `Trajectory` that it returns included. "-" means that no setting tried gets there:
 the steps end at 16000 a second for MuJoCo (3200 with Python torques, 6400 for rollout), at 20000
 for Drake and at 8000 for Exudyn.
 
@@ -86,8 +87,7 @@ is not timed.
   (γ, γ̇) it solves the direct kinematics for all eight assemblies at every evaluation, as the paper
   says; with (q, γ̇) it need not.
 - **What is laid out before.** Every engine has its data ready, and its clock begins at the start:
-  MuJoCo's `mjData`, Pinocchio's arrays and views, the `Course` of our collocation (its coefficients
-  times the step; `fly()` is what is clocked, one call from Python, some 0.1 us of its time).
+  MuJoCo's `mjData`, Pinocchio's arrays and views, the prepared motion that `simulate` remembers.
   Torques are evaluated while the clock runs, on all engines but for MuJoCo's rollout.
 - **Rounding.** Collocation alone is compiled with fused multiply-adds and shared reciprocals, so
   its last digits are not those of plain Python. Its sines are arithmetic (`integration.sines`):

@@ -84,3 +84,16 @@ def test_extrapolation_reference_has_its_order(peers, task):
         half = reference._extrapolated(slope, mp.mpf(0), h / 2, start)
         two = reference._extrapolated(slope, h / 2, h / 2, half)
         assert max(abs(a - b) for a, b in zip(one, two, strict=True)) < mp.mpf(10) ** -24
+
+
+def test_our_headline_is_the_public_call(peers, task):
+    """Every setting ends within its tolerance of the finest one, and no other series counts."""
+    pytest.importorskip("numba")
+    ours = peers("ours")
+    first, *others = ours.series(task, quick=True)
+    assert first.name.startswith(ours.PUBLIC)
+    assert not any(series.name.startswith(ours.PUBLIC) for series in others)
+    ends = [setting.prepare().poses(1)[0].rotation for setting in first.settings]
+    for setting, end in zip(first.settings, ends, strict=True):
+        tolerance = float(setting.label.split()[1])
+        assert peers("task").apart(end, ends[-1]) <= tolerance + 1e-13
