@@ -24,7 +24,8 @@ class Services:
             (topics.STEP, self._step),
             (topics.RESET, self._reset),
         ):
-            node.create_service(endpoint.kind, endpoint.name, answer)
+            qos = topics.SERVICE_QOS
+            node.create_service(endpoint.kind, endpoint.name, answer, qos_profile=qos)
         topic = topics.SET_STATE
         node.create_subscription(topic.kind, topic.name, self._set_state, topic.depth)
 

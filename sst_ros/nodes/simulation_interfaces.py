@@ -13,6 +13,7 @@ from typing import Any
 
 from rclpy.node import Node
 
+from sst_ros.nodes import topics
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 
@@ -107,5 +108,6 @@ def offer(node: Node, loop: RunLoop) -> bool:
         "step_simulation": ("StepSimulation", answers.step),
     }
     for name, (kind, answer) in table.items():
-        node.create_service(getattr(srv, kind), f"~/{name}", answer)
+        qos = topics.SERVICE_QOS
+        node.create_service(getattr(srv, kind), f"~/{name}", answer, qos_profile=qos)
     return True

@@ -22,6 +22,10 @@ from trajectory_msgs.msg import JointTrajectory
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 
+SERVICE_QOS = QoSProfile(depth=1000)
+"""Of services and of our clients: with ten, the default, the eleventh request that waits displaces
+the first, and so does the eleventh reply. All clients of a service receive all of its replies."""
+
 
 @dataclass(frozen=True)
 class Endpoint:

@@ -56,7 +56,7 @@ class Viewer:
         self._controller, self._driving = "", False
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[topics.Endpoint, Client[Any, Any]] = {
-            one: self.node.create_client(one.kind, self._name(one))
+            one: self.node.create_client(one.kind, self._name(one), qos_profile=topics.SERVICE_QOS)
             for one in (topics.PAUSE, topics.STEP, topics.RESET)
         }
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import WrenchStamped
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
@@ -20,6 +22,7 @@ from sst_ros.scene.yaml_document import dump
 pytestmark = pytest.mark.ros
 NODE = "/sst_simulator"
 NAMES = ["gamma_1", "gamma_2", "gamma_3"]
+CALLS = 200
 
 
 @pytest.fixture
@@ -149,6 +152,17 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
     status, _, err = nodes.stop(process)
     told = err.count("command dropped")
     assert status == 0 and 1 <= told <= time.monotonic() - start + 1.0
+
+
+def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
+    nodes.run("simulator")
+    observer.told("phase", "running")
+    qos = QoSProfile(depth=CALLS)  # of the replies: a client of rclpy keeps ten by default
+    client = observer.node.create_client(SetBool, f"{NODE}/pause", qos_profile=qos)
+    observer.until(client.service_is_ready, "the service")
+    calls = [client.call_async(SetBool.Request(data=True)) for _ in range(CALLS)]
+    observer.until(lambda: all(call.done() for call in calls), f"replies to {CALLS} calls", 10.0)
+    assert all(call.result().success for call in calls)
 
 
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
