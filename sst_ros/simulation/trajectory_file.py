@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sst_ros import state
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import MissingDependency, require
 from sst_ros.scene.scene import Scene
@@ -25,17 +26,9 @@ if TYPE_CHECKING:
 _KEY = b"sst_ros"
 _FORMAT = 1
 
-QUANTITIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "quaternion": ("1", ("x", "y", "z", "w")),
-    "body_rate": ("rad/s", ("x", "y", "z")),
-    "torque": ("N m", ("1", "2", "3")),
-    "gamma": ("rad", ("1", "2", "3")),
-    "mu": ("rad", ("1", "2", "3")),
-    "beta": ("rad", ("1", "2", "3")),
-    "gamma_dot": ("rad/s", ("1", "2", "3")),
-    "mu_dot": ("rad/s", ("1", "2", "3")),
-    "beta_dot": ("rad/s", ("1", "2", "3")),
-    "euler_zyz": ("rad", ("theta", "phi", "psi")),
+QUANTITIES = {
+    name: (unit, tuple(map(str, state.DIMENSIONS[dimension])))
+    for name, (unit, dimension) in state.QUANTITIES.items()
 }
 """Unit and names of the parts of each array with more than one column."""
 
@@ -60,20 +53,12 @@ def frame(trajectory: SampledMotion) -> pd.DataFrame:
 def dataset(trajectory: SampledMotion) -> xr.Dataset:
     """See `Trajectory.to_xarray`."""
     package = require("xarray")
-    second = {4: "part", 3: "leg"}
-    arrays: dict[str, Any] = {}
-    for name, (unit, parts) in QUANTITIES.items():
-        over = "axis" if name == "body_rate" else "angle" if name == "euler_zyz" else None
-        dims = ("time", over or second[len(parts)])
-        arrays[name] = (dims, getattr(trajectory, name), {"units": unit})
-    arrays["energy"] = (("time",), trajectory.energy, {"units": "J"})
-    coordinates = {
-        "time": ("time", trajectory.t, {"units": "s"}),
-        "leg": [1, 2, 3],
-        "axis": ["x", "y", "z"],
-        "part": ["x", "y", "z", "w"],
-        "angle": ["theta", "phi", "psi"],
+    arrays: dict[str, Any] = {
+        name: (("time", dimension), getattr(trajectory, name), {"units": unit})
+        for name, (unit, dimension) in state.QUANTITIES.items()
     }
+    arrays["energy"] = (("time",), trajectory.energy, {"units": "J"})
+    coordinates = {"time": ("time", trajectory.t, {"units": "s"}), **state.DIMENSIONS}
     more = {name: getattr(trajectory, name) for name in _FIGURES}
     found: xr.Dataset = package.Dataset(
         arrays, coordinates, {"scene": trajectory.scene.name, **more}
