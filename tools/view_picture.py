@@ -2,7 +2,7 @@
 """The mechanism as built, with its frames: `python -m tools.view_picture docs/mechanism.png`.
 
 The frames of the paper have their origins at O; {1k}, {2k} and {E} are drawn on their links,
-where they can be told apart; their axes are x red, y green, z blue.
+where they can be distinguished; their axes are x red, y green, z blue.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ for Drake and at 8000 for Exudyn.
 
 ## What can exist at all
 
-A method that is told values of the acceleration, and not its derivatives, cannot do with fewer than
+A method that evaluates the acceleration, and not its derivatives, cannot do with fewer than
 a polynomial through them needs to tell the orientation at the end to the error, at the true motion
 and at Gauss's nodes. In C, one after the other on one core, these take so long; and so many times
 longer take the engines:
@@ -68,7 +68,7 @@ is not timed.
   plain Python" is sst_ros without any compiler.
 - **The method counts.** A method of order 8 needs far fewer evaluations at 1e-9 rad than RK4 does,
   on any engine. Where an engine leaves the integrator to its user (Pinocchio) it gets our DOP853
-  too, in Python; RK4 is what its users write, so both are told. sst_ros has collocation besides,
+  too, in Python; RK4 is what its users write, so both are listed. sst_ros has collocation besides,
   whose SIMD needs a right-hand side that is one straight line of operations;
   MuJoCo, Drake and Exudyn have no method of order above 4 for mechanisms with loops. Compare equal
   methods by the rows above.

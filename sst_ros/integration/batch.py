@@ -69,8 +69,8 @@ class Batch:
         if profile and scene.torque is None:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
-        told = [(key, unused.get(key.partition(".")[0])) for key in parameters or ()]
-        problems += [Problem(key, "given", said) for key, said in told if said]
+        unused_keys = [(key, unused.get(key.partition(".")[0])) for key in parameters or ()]
+        problems += [Problem(key, "given", said) for key, said in unused_keys if said]
         if problems:
             raise InputError(scene.name, problems)
         self.scene = scene

@@ -105,7 +105,7 @@ def numbers_in(value: Any) -> Iterator[Any]:
         yield np.nan
     elif isinstance(value, (float, np.ndarray)):
         yield value
-    else:
+    elif not isinstance(value, str):
         for entry in value if isinstance(value, tuple) else vars(value).values():
             yield from numbers_in(entry)
 

@@ -99,8 +99,10 @@ class Variants:
         try:
             built = _with(self.document, self._tree, values, "")
         except InputError as error:
-            told = [replace(fault, key=f"scenario {row}: {fault.key}") for fault in error.problems]
-            raise InputError(self.document.name, told) from None
+            problems_of_row = [
+                replace(fault, key=f"scenario {row}: {fault.key}") for fault in error.problems
+            ]
+            raise InputError(self.document.name, problems_of_row) from None
         assert isinstance(built, Scene)
         return built
 
@@ -209,15 +211,15 @@ def _with(section: Section, tree: Tree, values: dict[str, Any], path: str) -> Se
             return None
         return cls(**given)
     except InputError as error:
-        told = [
+        problems_of_row = [
             replace(fault, key=".".join(filter(None, [path, fault.key])))
             for fault in error.problems
         ]
-        raise InputError("", told) from None
+        raise InputError("", problems_of_row) from None
 
 
 def _faults(spec: Spec, name: str, value: Any) -> Iterator[Problem]:
-    """Refuse what a field may not hold; zero is for the section to judge, or leaves it out."""
+    """Refuse what a field may not hold; zero is checked by the section, or leaves it out."""
     try:
         if _is_some(value):
             accept(spec, value)

@@ -114,7 +114,7 @@ def draw_overview(run: Overview, title: str, footnote: str) -> Figure:
     _losses(grid[2, 0], run)
     _latency(grid[2, 1], run)
     _curve(grid[3, 0], run.seconds, run.late_ms, "Delay of samples",
-           "delay over the promptest sample [ms]")  # fmt: skip
+           "reception delay relative to the fastest sample [ms]")  # fmt: skip
     _curve(grid[3, 1], run.seconds, run.effort, "Effort of joint_states against applied torque",
            "largest difference [N m]", zero="none")  # fmt: skip
     for axes in (*grid[:, 0], *grid[[0, 2, 3], 1]):

@@ -30,7 +30,7 @@ class Timing:
         lost_s: times of lost samples [s], shape (l,).
         gaps_s: times at which a tick does not begin where the one before ended [s].
         pace_s, pace: times [s] and simulated time per time on the recorder's clock.
-        late_us: how much later each sample was received than the promptest one, by its stamp
+        late_us: reception delay of each sample relative to the fastest one, by its stamp
             [us], shape (n,): it grows where the simulator falls behind.
         missed_s, missed: times at which the simulator reported its dropped ticks
             [s], and how many.

@@ -127,7 +127,7 @@ class Session:
 
     def _wait_recorded(self, words, process, log):
         if "recorder" in words:
-            (name,) = (w.partition(":=")[2] for w in words if w.startswith("output:="))
+            name = _value(words, "output")
 
             def size():
                 return sum(path.stat().st_size for path in (self.folder / name).glob("*.mcap"))
@@ -140,6 +140,14 @@ class Session:
         except subprocess.TimeoutExpired:
             status = "no end"
         assert status == 0, f"{shlex.join(words)}: {status}\n{log.read_text()}"
+
+
+def _value(words, parameter):
+    """Value of a node's parameter, as a plain option or as --ros-args has it."""
+    if f"--{parameter}" in words:
+        return words[words.index(f"--{parameter}") + 1]
+    (value,) = (w.partition(":=")[2] for w in words if w.startswith(f"{parameter}:="))
+    return value
 
 
 def _until(condition, words, log):
