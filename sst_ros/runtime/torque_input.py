@@ -101,7 +101,7 @@ class TorqueInput:
         self._idle_ns = [self._idle_ns[0] or stamp_ns, stamp_ns]
 
     def starts_run(self) -> bool:
-        """Take what has come before the run; return whether a command starts it."""
+        """Take the messages that arrived before the run; return whether a command starts it."""
         if self._lockstep:
             self.answer(None)
         else:
