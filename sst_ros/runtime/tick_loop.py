@@ -62,8 +62,8 @@ class TickLoop:
 
         Later steps take no longer, also where they change the method.
         """
+        self.simulation.load_code(self._period_ns)  # may take a second, and is no step
         self.step_since = time.perf_counter()
-        self.simulation.load_code(self._period_ns)
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)
         self.step_since = 0.0

@@ -114,7 +114,7 @@ def test_without_a_command_the_torque_is_zero(nodes, observer):
 def test_a_fault_is_told_and_the_last_valid_state_kept(nodes, observer):
     told = observer.listen(DiagnosticArray, "/diagnostics")
     states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", wait_for_command=True)
+    process = nodes.run("simulator", scene="example2_stroke", wait_for_command=True)
     commands = observer.publisher(Float64MultiArray, COMMANDS)
     commands.publish(Float64MultiArray(data=[50.0, 0.0, 0.0]))
     observer.until(lambda: told and values(told[-1])["phase"] == "fault", "fault")

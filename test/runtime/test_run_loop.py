@@ -112,6 +112,21 @@ def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
     assert begun and not any(begun)
 
 
+def test_code_that_takes_long_to_load_is_no_fault():
+    class Slow(Simulation):
+        def load_code(self, dt_ns):
+            end = time.thread_time() + 0.6
+            while time.thread_time() < end:
+                pass
+
+    bench = Bench(build=Slow, duration=0.01)
+    bench.thread.start()
+    while bench.thread.is_alive():
+        bench.loop.watch()
+        time.sleep(0.05)
+    assert bench.loop.phase is Phase.FINISHED and not bench.loop.fault
+
+
 def test_pause_is_idempotent_and_a_step_is_one_sample():
     bench = Bench()
     with bench.running() as loop:
