@@ -65,6 +65,7 @@ def start(command: str, **given: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "sst_ros", command, *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        pipesize=1 << 20,  # nobody reads before the end, and a full pipe stops the node
     )  # fmt: skip
 
 
