@@ -149,7 +149,7 @@ def _name_columns(axes: Axes, seconds: Array, columns: Array, letters: str) -> N
 
 def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
-    figure = Figure(figsize=(6.4, 5.8))
+    figure = Figure(figsize=(6.4, 6.4))
     axes = figure.add_subplot(projection="3d")
     geometry = Geometry.of(scene)
     base, star = scene.base.radius, scene.star.radius
@@ -158,7 +158,7 @@ def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     if star != base:
         axes.plot(*(star * outline).T, color=GREY, linewidth=0.9, linestyle=":",
                   label="its image on the sphere of E")  # fmt: skip
-    for index, point in enumerate(1.08 * max(base, star) * geometry.v):
+    for index, point in enumerate(1.14 * max(base, star) * geometry.v):
         axes.text(*point, f"P{'₁₂₃'[index]}", ha="center", va="center")
     several = len(solutions) > 1
     for solution, style in zip(solutions, LINES, strict=False):
@@ -182,7 +182,7 @@ def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     axes.view_init(elev=height - 8.0, azim=azimuth + 8.0)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=3, fontsize=9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=3, fontsize=9)
     return figure
 
 
