@@ -53,6 +53,7 @@ class Posture:
         j: J = -J2^-1 J1, omega = J gamma_dot, Eq. 15.
         a: mu_dot = a gamma_dot, Eq. 20, rows by leg.
         b: beta_dot = b gamma_dot, Eq. 23, rows by leg.
+        u: beta_ddot = u gamma_ddot + u_k with the scalars u_k of Eq. 49, Eq. 48, rows by leg.
 
     """
 
@@ -66,6 +67,7 @@ class Posture:
     j: Array
     a: Array
     b: Array
+    u: Array
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None)
     a = -r @ j
     wr = cross(w, r)
     b = -(wr @ j) / np.sum(wr * t, axis=1)[:, None]
-    return Posture(angles, rotation, r, t, w, c, j2, j, a, b)
+    u = np.diag(np.sum(t * w, axis=1)) - t @ j
+    return Posture(angles, rotation, r, t, w, c, j2, j, a, b, u)
 
 
 def bias(at: Posture, gamma_dot: ArrayLike) -> Bias:

@@ -192,3 +192,13 @@ def test_a_serial_singularity_is_refused():
     rotation = np.stack([np.cross(axis, s), axis, s], axis=1)
     with pytest.raises(SingularConfiguration, match="serial"):
         rates.of_star(ISOTROPIC, rotation, [1.0, 0.0, 0.0])
+
+
+def test_the_acceleration_of_the_sliders_is_that_of_eqs_47_to_49():
+    rng = np.random.default_rng(47)
+    geometry = random_geometry(rng)
+    at = virtual_work.posture(geometry, *random_pose(rng, geometry))
+    rate, acceleration = rng.normal(size=(2, 3))
+    expected = rates.of_actuators(at, rate, acceleration).beta_ddot
+    bias = virtual_work.bias(at, rate).beta_ddot
+    assert at.u @ acceleration + bias == pytest.approx(expected, rel=1e-12, abs=1e-12)
