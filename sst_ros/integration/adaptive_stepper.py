@@ -143,6 +143,8 @@ class AdaptiveStepper:
 
     def load(self, h: float, at: StepPoint, d: Vector) -> None:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
+        if self._derivative is not None:
+            return  # plain Python, and an explicit method to the end
         methods = (DORMAND_PRINCE, DOP853, RODAS4) if self._auto else (self.method,)
         for method in methods:
             loaded = self._method_of(method)

@@ -80,7 +80,7 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
 def test_a_fault_is_held_still_until_a_reset(nodes, observer):
     states = observer.listen(JointState, "/joint_states")
     phases = observer.listen(String, f"{NODE}/phase", latched=True)
-    process = nodes.run("simulator")
+    process = nodes.run("simulator", scene="example2_heavy")
     commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
     commands.publish(Float64MultiArray(data=[50.0, 0.0, 0.0]))
     observer.until(lambda: phases and phases[-1].data.startswith("fault: "), "fault")

@@ -102,7 +102,7 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, 
 
 
 def test_the_diagnostics_say_what_the_docs_say(nodes, observer):
-    nodes.run("simulator")
+    nodes.run("simulator", scene="example2_heavy")  # which has limits, and so distances to them
     said = observer.told("phase", "running")
     said = observer.told("error_estimate", lambda value: True)
     assert list(said)[:-2] == list(diagnostics.KEYS)

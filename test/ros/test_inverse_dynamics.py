@@ -24,7 +24,7 @@ HOME = scene.load("example2").initial.gamma
 MOVE = DesiredMotion(spiral=Spiral(phi=0.25, theta=3.0, psi=0.4, duration=0.3))
 
 
-def written(folder, name="example2", **changed):
+def written(folder, name="example2_heavy", **changed):
     """A scene with another motion, as a file."""
     changed = {"motion": MOVE, "torque": None, "provenance": (), **changed}
     path = folder / "scene.yaml"
