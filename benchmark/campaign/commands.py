@@ -39,12 +39,12 @@ def sst_ros(
             capture_output=True,
             text=True,
             errors="backslashreplace",
-            timeout=bound,
+            timeout=bound * ledger.patience,
             user=user,
             stdin=subprocess.DEVNULL,
         )
     except subprocess.TimeoutExpired:
-        ledger.found("hangs", f"{name}: no end within {bound:g} s")
+        ledger.found("hangs", f"{name}: no end within its bound")
         return None
     except (ValueError, OSError) as error:  # words that no process can be given
         ledger.tried -= 1
@@ -105,7 +105,7 @@ WRONG = (
 
 def command_lines(budget: Budget, seed: int) -> Ledger:
     """Give wrong words to every verb: one line and a status other than 0, or usage."""
-    ledger, rng = Ledger("command lines"), random.Random(seed)
+    ledger, rng = budget.ledger("command lines"), random.Random(seed)
     env = {"ROS_DOMAIN_ID": "97", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -127,7 +127,7 @@ def command_lines(budget: Budget, seed: int) -> Ledger:
 
 def surroundings(budget: Budget, seed: int) -> Ledger:
     """Run commands without a home, with a full disk, in plain ASCII, as another user."""
-    ledger = Ledger("surroundings: home, disk, locale, user")
+    ledger = budget.ledger("surroundings: home, disk, locale, user")
     nobody = 65534 if os.geteuid() == 0 else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -151,7 +151,9 @@ def _alive(ledger: Ledger, process: subprocess.Popen[str], client: Client, after
     reply, took = client.call(SetBool, f"{NODE}/pause", data=False)
     if reply is None:
         ledger.found("lost", f"no reply after {after}")
-    elif took > REPLY_S + 0.5:  # two processes and discovery share two cores with the campaign
+    elif (
+        took > (REPLY_S + 0.5) * ledger.patience
+    ):  # two processes and discovery share two cores with the campaign
         ledger.found("hangs", f"a reply took {took:.2f} s after {after}")
     ledger.longest_s = max(ledger.longest_s, took if math.isfinite(took) else 0.0)
     return True
@@ -165,7 +167,7 @@ def _stopped(ledger: Ledger, process: subprocess.Popen[str], number: int = signa
         ledger.found("tracebacks", f"exit status {status}")
     if "Traceback" in text:
         ledger.found("tracebacks", text[-300:])
-    if took > 2 * CLOSE_S:
+    if took > 2 * CLOSE_S * ledger.patience:
         ledger.found("hangs", f"it took {took:.1f} s to close")
 
 
@@ -175,7 +177,7 @@ def messages(budget: Budget, seed: int) -> Ledger:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
-    ledger, rng = Ledger("hostile messages"), random.Random(seed)
+    ledger, rng = budget.ledger("hostile messages"), random.Random(seed)
     odd = (0.0, -0.0, 1e308, -1e308, 5e-324, math.nan, math.inf, -math.inf, 1.0, 1e9)
     names = ["gamma_1", "gamma_2", "gamma_3", "", "mu_1", "x" * 1000, "é"]
     with running(command_timeout=0.0) as (process, client):
@@ -219,7 +221,7 @@ def floods(budget: Budget, seed: int) -> Ledger:
     """Publish as fast as three threads can, for seconds: the node keeps answering."""
     from std_msgs.msg import Float64MultiArray
 
-    ledger, sent = Ledger("messages of three floods"), [0, 0, 0]
+    ledger, sent = budget.ledger("messages of three floods"), [0, 0, 0]
     with running() as (process, client):
         stop = threading.Event()
         publishers = [
@@ -254,7 +256,7 @@ def services(budget: Budget, seed: int) -> Ledger:
     """Call services from four clients at once, in any order: every call is answered."""
     from std_srvs.srv import SetBool, Trigger
 
-    ledger = Ledger("service calls of four clients")
+    ledger = budget.ledger("service calls of four clients")
     lock = threading.Lock()
     with running() as (process, client):
         _alive(ledger, process, client, "the start")
@@ -280,7 +282,7 @@ def services(budget: Budget, seed: int) -> Ledger:
                     ledger.longest_s = max(ledger.longest_s, took)
                     if not done:
                         ledger.found("lost", f"no reply of {name} within 10 s")
-                    elif took > REPLY_S + 0.5:
+                    elif took > (REPLY_S + 0.5) * ledger.patience:
                         ledger.found("hangs", f"{name} took {took:.2f} s")
             caller.close()
 
@@ -298,7 +300,7 @@ def parameters(budget: Budget, seed: int) -> Ledger:
     from rcl_interfaces.srv import ListParameters, SetParameters
     from rclpy.parameter import Parameter
 
-    ledger, rng = Ledger("parameters set at run time"), random.Random(seed)
+    ledger, rng = budget.ledger("parameters set at run time"), random.Random(seed)
     values = (True, 0, -1, 2**62, 0.0, -0.0, 5e-324, 1e308, math.nan, math.inf, "", "x", [1.0],
               ["a"], [])  # fmt: skip
     with running() as (process, client):
@@ -326,7 +328,7 @@ def parameters(budget: Budget, seed: int) -> Ledger:
 
 def kills(budget: Budget, seed: int) -> Ledger:
     """Kill the player and the controller beside a simulator: it goes on and ends when asked."""
-    ledger, rng = Ledger("players and controllers killed with -9"), random.Random(seed)
+    ledger, rng = budget.ledger("players and controllers killed with -9"), random.Random(seed)
     for number in budget.cases(66, least=1):
         ledger.tried += 1
         with running(wait_for_command=True) as (process, client):
@@ -346,7 +348,7 @@ def clock(budget: Budget, seed: int) -> Ledger:
     """Give a clock that jumps, stops and runs back: the node goes on or waits, and ends."""
     from rosgraph_msgs.msg import Clock
 
-    ledger, rng = Ledger("jumps of /clock under use_sim_time"), random.Random(seed)
+    ledger, rng = budget.ledger("jumps of /clock under use_sim_time"), random.Random(seed)
     with running(use_sim_time=True) as (process, client):
         publisher = client.node.create_publisher(Clock, "/clock", 1)
         now = 1.0
@@ -364,7 +366,7 @@ def clock(budget: Budget, seed: int) -> Ledger:
 
 def starts(budget: Budget, seed: int) -> Ledger:
     """Start and stop nodes at random moments: one line or none, nothing left in /dev/shm."""
-    ledger, rng = Ledger("starts and stops"), random.Random(seed)
+    ledger, rng = budget.ledger("starts and stops"), random.Random(seed)
     before = _shared_memory()
     for number in budget.cases(200, least=4):
         ledger.tried += 1
@@ -374,7 +376,9 @@ def starts(budget: Budget, seed: int) -> Ledger:
                                      if kind == "recorder" else {}))  # fmt: skip
             # The wait is the experiment: the moment of the signal is random.
             time.sleep(rng.uniform(0.0, 2.0))
-            status, text = ended(process, rng.choice((signal.SIGINT, signal.SIGTERM)), 10.0)
+            status, text = ended(
+                process, rng.choice((signal.SIGINT, signal.SIGTERM)), 10.0 * ledger.patience
+            )
             if status == 255:
                 ledger.found("hangs", f"{kind} did not end within 10 s")
             if "Traceback" in text:

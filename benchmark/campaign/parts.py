@@ -18,12 +18,12 @@ PARTS = {
 FUNCTIONS = {"recorder_kills": "kills", "node_kills": "kills"}
 
 
-def run(part: str, share: float, seed: int) -> Ledger:
+def run(part: str, share: float, seed: int, patience: float = 1.0) -> Ledger:
     """Run one part in this process."""
     module = importlib.import_module(f"benchmark.campaign.{PARTS[part]}")
     began = time.monotonic()
     try:
-        ledger: Ledger = getattr(module, FUNCTIONS.get(part, part))(Budget(share), seed)
+        ledger: Ledger = getattr(module, FUNCTIONS.get(part, part))(Budget(share, patience), seed)
     except Exception as error:
         ledger = Ledger(part)
         ledger.found("tracebacks", f"the part itself ended: {type(error).__name__}: {error}")

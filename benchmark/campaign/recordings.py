@@ -32,7 +32,11 @@ def _recorded(seconds: float) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as name, domain():
         bag = Path(name) / "bag"
         recorder = start("recorder", output=bag)
-        simulator = start("simulator", scene="swing", duration=seconds)
+        heard = ["joint_states", "~/orientation", "~/applied_torques", "~/scene"]
+        simulator = start(
+            "simulator", scene="swing", duration=seconds, wait_for_subscribers=heard,
+            subscriber_timeout=30.0,
+        )  # fmt: skip
         try:
             simulator.wait(timeout=60)
             ended(recorder, signal.SIGINT)
@@ -51,7 +55,7 @@ def _same(one: Recording, other: Recording) -> bool:
 
 def damages(budget: Budget, seed: int) -> Ledger:
     """Flip single bytes of a recording and cut it: no number may change without a word."""
-    ledger, rng = Ledger("recordings: flipped bytes and cuts"), random.Random(seed)
+    ledger, rng = budget.ledger("recordings: flipped bytes and cuts"), random.Random(seed)
     with _recorded(2.0) as bag:
         whole = read(bag)
         (file,) = bag.glob("*.mcap")
@@ -90,7 +94,7 @@ def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: R
 
 def kills(budget: Budget, seed: int) -> Ledger:
     """Kill the recorder at random moments: all but the last chunk comes back."""
-    ledger, rng = Ledger("recorders killed with -9"), random.Random(seed)
+    ledger, rng = budget.ledger("recorders killed with -9"), random.Random(seed)
     for number in budget.cases(34, least=1):
         ledger.tried += 1
         with tempfile.TemporaryDirectory() as name, domain():

@@ -55,7 +55,7 @@ def _text(tree: Any) -> str:
 
 def documents(budget: Budget, seed: int) -> Ledger:
     """Read documents with wrong values, wrong structure and hostile sizes."""
-    ledger, rng, known = Ledger("scene documents"), random.Random(seed), trees()
+    ledger, rng, known = budget.ledger("scene documents"), random.Random(seed), trees()
     large = {
         "200,000 base directions": _text({"base": {"v": [[1, 0, 0]] * 200_000}}),
         "20,000 unknown keys": _text({f"key_{n}": n for n in range(20_000)}),
@@ -132,7 +132,7 @@ def _extremes() -> dict[str, dict[tuple[Any, ...], object]]:
 
 def extremes(budget: Budget, seed: int) -> Ledger:
     """Step extreme scenes: each step bounded, each state finite, each error one of ours."""
-    ledger, rng = Ledger("extreme scenes, 20 steps each"), random.Random(seed)
+    ledger, rng = budget.ledger("extreme scenes, 20 steps each"), random.Random(seed)
     cases = list(_extremes().items())
     for number in budget.cases(2 * len(cases), least=6):
         name, changes = cases[number % len(cases)] if budget.share >= 1 else rng.choice(cases)
@@ -158,7 +158,7 @@ def _bounded(ledger: Ledger, name: str, simulation: Simulation, torque: Any) -> 
     finally:
         took = time.process_time() - began
         ledger.longest_s = max(ledger.longest_s, took)
-        if took > STEP_BOUND_S:
+        if took > STEP_BOUND_S * ledger.patience:
             ledger.found("hangs", f"{name}: a step took {took:.2f} s of processor time")
     _finite(ledger, name, state)
 
@@ -200,7 +200,7 @@ def random_scene(rng: random.Random) -> Scene:
 
 def invariants(budget: Budget, seed: int) -> Ledger:
     """Simulate random scenes: finite, closed, energy balanced, error estimated."""
-    ledger, rng = Ledger("random scenes: invariants over 0.1 s"), random.Random(seed)
+    ledger, rng = budget.ledger("random scenes: invariants over 0.1 s"), random.Random(seed)
     for number in budget.cases(434, least=8):
         name = f"scene {number} (seed {seed})"
         with ledger.case(name, (SstError,), bound=20.0):
@@ -234,7 +234,10 @@ def _apart(one: Simulation, other: Simulation) -> float:
 
 def bits(budget: Budget, seed: int) -> Ledger:
     """Simulate random scenes interpreted and compiled: not one bit may differ."""
-    ledger, rng = Ledger("random scenes: compiled against interpreted"), random.Random(seed + 1)
+    ledger, rng = (
+        budget.ledger("random scenes: compiled against interpreted"),
+        random.Random(seed + 1),
+    )
     for number in budget.cases(200, least=1):
         name = f"scene {number} (seed {seed + 1})"
         method = rng.choice(("rk4", "dopri5", "dop853", "rodas4", "auto"))
