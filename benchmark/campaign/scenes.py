@@ -27,6 +27,8 @@ PERIOD_NS = 1_000_000
 CALIBRATION_STEPS = 50
 STEP_BOUND_S = 0.4
 """A step may take 0.2 s on an idle core of this machine; twice that beside other work."""
+FIRST_STEP_BOUND_S = 2.0
+"""The first step also traces the equations, and the Jacobian where the motion is stiff."""
 
 
 def trees() -> dict[str, Any]:
@@ -67,7 +69,8 @@ def documents(budget: Budget, seed: int) -> Ledger:
         "bytes": "\x00\x01",
     }
     for name, source in large.items():
-        with ledger.case(name, (SstError,)):
+        # PyYAML alone takes a second for the 300 kB of 20,000 keys.
+        with ledger.case(name, (SstError,), bound=2.0):
             _read(ledger, name, source)
     for number in budget.cases(256):
         name = rng.choice(sorted(known))
@@ -146,19 +149,20 @@ def extremes(budget: Budget, seed: int) -> Ledger:
         with ledger.case(name, (SstError,), bound=60.0):
             simulation = Simulation(read(Scene, _text(tree), "scene"))
             torque = (1.0, 2.0, -1.0) if number % 2 else (0.01, 0.0, 0.0)
-            for _ in range(20):
-                _bounded(ledger, name, simulation, torque)
+            for step in range(20):
+                bound = STEP_BOUND_S if step else FIRST_STEP_BOUND_S
+                _bounded(ledger, name, simulation, torque, bound)
     return ledger
 
 
-def _bounded(ledger: Ledger, name: str, simulation: Simulation, torque: Any) -> None:
+def _bounded(ledger: Ledger, name: str, simulation: Simulation, torque: Any, bound: float) -> None:
     began = time.process_time()
     try:
         state = simulation.step(torque, PERIOD_NS)
     finally:
         took = time.process_time() - began
         ledger.longest_s = max(ledger.longest_s, took)
-        if took > STEP_BOUND_S * ledger.patience:
+        if took > bound * ledger.patience:
             ledger.found("hangs", f"{name}: a step took {took:.2f} s of processor time")
     _finite(ledger, name, state)
 

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small share of the campaign that tries to break the program; the whole is run by hand."""
+
+import pytest
+
+from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.parts import PARTS, run
+
+ROS = {"damages", "recorder_kills", *(part for part, room in PARTS.items() if room == "nodes")}
+
+
+@pytest.mark.parametrize("part", sorted(PARTS))
+def test_nothing_is_found_in_a_share_of(part):
+    if part in ROS:
+        pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+    # Other tests run at the same time: only what takes ten times its bound is a hang here.
+    ledger = run(part, 0.02, seed=7, patience=10.0)
+    assert ledger.tried > 0
+    assert ledger.sound, "\n".join(ledger.notes)
+
+
+def test_a_finding_is_counted_and_named():
+    ledger = Ledger("nothing")
+    with ledger.case("a wrong error", (ValueError,)):
+        raise KeyError("x")
+    with ledger.case("an answer", (ValueError,)):
+        raise ValueError
+    assert (ledger.tried, ledger.tracebacks, ledger.sound) == (2, 1, False)
+    assert "a wrong error" in ledger.notes[0]
