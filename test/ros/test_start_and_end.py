@@ -64,7 +64,7 @@ def test_an_unknown_parameter_of_a_file_is_refused(nodes, tmp_path):
 
 def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(nodes, observer):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
-    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.2")
+    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.02")
     observer.until(lambda: scene, "the scene")
     assert "name: fast_spin" in scene[0].data
     assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
