@@ -12,6 +12,7 @@ ALLOWED = (
     # Engines of the extra `peers`, a gigabyte: `python -m benchmark.peers` runs them.
     "No module named 'pydrake'",
     "No module named 'exudyn'",
+    "with the rclpy of Jazzy",
 )
 
 

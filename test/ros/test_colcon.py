@@ -61,7 +61,7 @@ def test_ros2_run_finds_the_executables(prefix, name):
 def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes, observer):
     states = observer.listen(JointState, "/joint_states")
     executable = [str(prefix / "lib" / "sst_ros" / "simulator")]
-    words = ["--ros-args", "-p", "scene:=example1"]
+    words = ["--ros-args", "-p", "scene:=example1", "-p", "duration:=0.0"]
     process = nodes.start("", *words, executable=executable, env=overlay)
     observer.until(lambda: states, "states")
     status, _, err = nodes.stop(process)

@@ -2,6 +2,7 @@
 import re
 import signal
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,8 @@ def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, t
 
 
 def test_lost_messages_are_counted(nodes, observer, tmp_path):
+    if version("ros-rclpy").startswith("7."):
+        pytest.skip("sequence numbers do not reach the recorder with the rclpy of Jazzy")
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
     states = observer.node.create_publisher(JointState, "/joint_states", 1)
     observer.until(states.get_subscription_count, "the recorder")
