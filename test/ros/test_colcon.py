@@ -35,7 +35,9 @@ def prefix(tmp_path_factory):
 @pytest.fixture
 def overlay(prefix):
     packages = next(prefix.glob("lib/python*/site-packages"))
-    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages)}
+    # Their first line is `env python3`: a user starts them with his environment active.
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages), "PATH": path}
 
 
 def test_the_ament_index_names_the_package(prefix):
