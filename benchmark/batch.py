@@ -25,7 +25,7 @@ from sst_ros import scene as scenes
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_source import LANES
+from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.methods import DOP853, RK4, Tableau
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     if with_c:
         told["gcc"] = c_floor.version()
     rows = _rows(seconds, options.scenarios)
-    print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {LANES} lanes.")
+    print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {SIMD_WIDTH} lanes.")
     print("Time per evaluation and scenario: a step with limits and error, over its stages.")
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
     print("\n".join(work.said), "\n")
@@ -146,8 +146,8 @@ class _Work:
     def _add_c(
         self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any], folder: Path
     ) -> None:
-        text, loops = c_batch.source(batch.program, batch.margins, method, len(batch.state))
-        blocks = -(-self._number // LANES)
+        text, loops = c_batch.source(batch.program, batch.limit_distances, method, len(batch.state))
+        blocks = -(-self._number // SIMD_WIDTH)
         expected = start()
         batch.advance(0, STEPS, STEP, *expected, threads=1)
         for index, (who, flags) in enumerate(FLAGS.items()):

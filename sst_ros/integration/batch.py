@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -19,18 +20,18 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration import codegen
 from sst_ros.integration.batch_result import BatchResult, BatchStates
-from sst_ros.integration.batch_source import LANES, NOT_FINITE, batch_source
-from sst_ros.integration.initial_states import REASONS, initial_states
+from sst_ros.integration.batch_source import SIMD_WIDTH, batch_source
+from sst_ros.integration.initial_states import initial_states
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.integration.parametric_model import Family
-from sst_ros.integration.scenarios import Variants
+from sst_ros.integration.parametric_model import ParametricModel
+from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
-    **dict.fromkeys(("motion", "duration"), "is nothing that a batch uses"),
+    **dict.fromkeys(("motion", "duration"), "has no effect on a batch"),
 }
 
 
@@ -47,8 +48,7 @@ class Batch:
         progress: draw a bar on a terminal while scenarios are prepared.
 
     Raises:
-        InputError: the scene has no torque to apply, or the numbers of a scenario make no scene;
-            says which, and what is allowed.
+        InputError: the scene has no torque to apply, or the numbers of a scenario make no scene.
         MissingDependency: numba is not installed.
 
     """
@@ -70,17 +70,29 @@ class Batch:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
         unused_keys = [(key, unused.get(key.partition(".")[0])) for key in parameters or ()]
-        problems += [Problem(key, "given", said) for key, said in unused_keys if said]
+        problems += [Problem(key, "given", reason) for key, reason in unused_keys if reason]
         if problems:
             raise InputError(scene.name, problems)
-        self.scene = scene
-        self._variants = Variants(scene, parameters or {})
-        self._family = Family(self._variants, profile=profile, progress=progress)
-        self._method = method
+        self.scene, self._method = scene, method
+        self._scenarios = Scenarios(scene, parameters or {})
+        self._scenarios.check(progress=progress)
+        self.model = ParametricModel(self._scenarios, profile=profile)
+        self._columns = self.model.columns(self._scenarios)
+
+    def with_parameters(self, scenarios: Scenarios) -> Batch:
+        """Return a batch of other scenarios, already checked, that shares this one's compiled code.
+
+        Raises:
+            InputError: numbers differ that do not differ in this batch.
+
+        """
+        other = copy.copy(self)
+        other._scenarios, other._columns = scenarios, self.model.columns(scenarios)
+        return other
 
     def scenario(self, row: int) -> Scene:
         """Return the scene of a scenario: a document that runs by itself."""
-        return self._variants.scene(row)
+        return self._scenarios.scene(row)
 
     def run(
         self,
@@ -108,53 +120,42 @@ class Batch:
             progress: draw a bar on a terminal.
 
         Raises:
-            InputError: an argument is not allowed; says which and what is.
+            InputError: an argument is not allowed; names it and what is.
 
         """
         _refuse_bad_steps(step, count, keep_every, threads)
         y, code = self.start(gamma, gamma_dot, progress=progress)
         number = y.shape[1]
         given = self.drives(torque, number)
-        when, error = np.full(number, np.nan), np.zeros(number)
+        time, error = np.full(number, np.nan), np.zeros(number)
         kept, ends = [y.copy()], [0]
         for part in slices(count, keep_every, self.scene.name, progress):
             span = part.stop - part.start
-            self.advance(part.start, span, step, y, given, code, when, error, threads=threads)
+            self.advance(part.start, span, step, y, given, code, time, error, threads=threads)
             if keep_every and span == keep_every:
                 kept.append(y.copy())
                 ends.append(part.stop)
-        when[code < 0] = 0.0
-        # A step that a limit ended is left out: its beginning is the last valid state.
-        last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(when / step) - 1, count)) * step
-        torques = given[:3].T if self._family.system.drive[:3] == TORQUE else np.zeros((number, 3))
-        valid = code >= 0
+        time[code < 0] = 0.0
+        # A step in which a limit was passed is left out: its beginning is the last valid state.
+        last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(time / step) - 1, count)) * step
+        torques = given[:3].T if self.model.ode.drive[:3] == TORQUE else np.zeros((number, 3))
+        common = self.model, self._columns, torques, code >= 0
         samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
+        trajectories = BatchStates(*common, samples, np.stack(kept)) if keep_every else None
         return BatchResult(
-            self._family,
-            last,
-            y.copy(),
-            torques,
-            valid,
-            status=np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code)),
-            message=tuple(self._message(row, int(number)) for row, number in enumerate(code)),
-            fault_time=when,
-            local_error=error,
-            kept=BatchStates(self._family, samples, np.stack(kept), torques, valid)
-            if keep_every
-            else None,
+            *common, last, y, code=code, fault_time=time, local_error=error, kept=trajectories
         )
 
     def start(
         self, gamma: ArrayLike, gamma_dot: ArrayLike, *, progress: bool = False
     ) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
-        angles = _rows("gamma", gamma, self._variants.count)
+        angles = _rows("gamma", gamma, self._scenarios.count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
-        family, number = self._family, len(angles)
-        which = np.broadcast_to(family.geometry, number)
+        which = np.broadcast_to(self._columns.geometry, len(angles))
         label = f"{self.scene.name}, starting"
         quaternion, rate, code = initial_states(
-            family.geometries,
+            self._columns.geometries,
             which,
             angles,
             rates,
@@ -162,16 +163,16 @@ class Batch:
             label=label,
             progress=progress,
         )
-        y = np.zeros((len(self.state), number))
+        y = np.zeros((len(self.state), len(angles)))
         y[:4], y[4:7] = quaternion.T, rate.T
         return y, code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""
-        drive, columns = self._family.system.drive, self._family.columns
+        drive, columns = self.model.ode.drive, self._columns.inputs
         given = np.zeros((max(len(drive) + len(columns), 1), number))
         if drive[:3] == TORQUE:
-            limit = self._family.torque_limit
+            limit = self._columns.torque_limit
             given[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
         given[len(drive) : len(drive) + len(columns)] = columns
         return given
@@ -179,42 +180,39 @@ class Batch:
     def advance(
         self, first: int, count: int, step: float, *columns: NDArray[Any], threads: int = 0
     ) -> None:
-        """Go on by `count` steps from step `first`: columns y, given, code, when, error change.
+        """Advance by `count` steps from step `first`; y, given, code, time and error change.
 
-        Threads take whole blocks in turn, without the interpreter's lock.
+        Threads take whole blocks in turn; the compiled code releases the interpreter's lock.
         """
         threads = threads or len(os.sched_getaffinity(0))
-        shares = _shares(-(-columns[0].shape[1] // LANES), threads)
-        run = self._module.batch
+        shares = _shares(-(-columns[0].shape[1] // SIMD_WIDTH), threads)
+        run = self.module.batch
+        if threads == 1:
+            run(step, first, count, 0, shares[-1][1] if shares else 0, *columns)
+            return
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda share: run(step, first, count, *share, *columns), shares))
 
     @property
     def state(self) -> tuple[str, ...]:
         """Names of the state's numbers."""
-        return self._family.system.state
+        return self.model.ode.state
 
     @property
     def program(self) -> Program:
         """Derivative of the state; inputs t, state, drive, and the numbers that differ."""
-        return self._family.program
+        return self.model.program
 
     @property
-    def margins(self) -> Program:
+    def limit_distances(self) -> Program:
         """Distances to the limits; inputs are quaternion, body rate and the numbers that differ."""
-        return self._family.margins
+        return self.model.limit_distances
 
     @cached_property
-    def _module(self) -> ModuleType:
-        text = batch_source(self.program, self.margins, self._method, len(self.state))
+    def module(self) -> ModuleType:
+        """The compiled function `batch`, see `batch_source`."""
+        text = batch_source(self.program, self.limit_distances, self._method, len(self.state))
         return codegen.load([text], {"NODES": self._method.c}, numba=True, nogil=True)
-
-    def _message(self, row: int, code: int) -> str:
-        if code == 0:
-            return "reached the end"
-        if code < 0:
-            return REASONS[code]
-        return "not finite" if code == NOT_FINITE else self._family.limits(row)[code - 1].reason
 
 
 def _shares(blocks: int, threads: int) -> list[tuple[int, int]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a batch returns: states of many scenarios as arrays, in the names of `simulate`."""
+"""Result of a batch: states of many scenarios as arrays, with the names of `simulate`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.traced_dynamics import compiled_for_arrays
 from sst_ros.extras import require
-from sst_ros.integration.parametric_model import Family
+from sst_ros.integration.batch_source import NOT_FINITE
+from sst_ros.integration.initial_states import REASONS
+from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
 from sst_ros.state import DIMENSIONS, QUANTITIES
@@ -30,12 +32,13 @@ class BatchStates:
     """States of N scenarios, at one time or at several. Treat the arrays as read-only.
 
     Args:
-        family: scenes of the scenarios.
+        model: the programs.
+        columns: the numbers of the scenarios.
+        torque: commanded torques [N m], shape (N, 3); not used under a profile.
+        valid: whether a scenario has started, shape (N,).
         t: times [s] of the states, shape (N,) or (samples, N).
         y: state of the integration (quaternion, body rate, with lag three torques), shape
             (state, N) or (samples, state, N).
-        torque: commanded torques [N m], shape (N, 3); not used under a profile.
-        valid: whether a scenario has started, shape (N,).
 
     Attributes:
         t: times of the states [s], shape (N,) or (samples, N): those of the last valid state in a
@@ -46,9 +49,15 @@ class BatchStates:
     """
 
     def __init__(
-        self, family: Family, t: Array, y: Array, torque: Array, valid: NDArray[np.bool_]
+        self,
+        model: ParametricModel,
+        columns: ParameterColumns,
+        torque: Array,
+        valid: NDArray[np.bool_],
+        t: Array,
+        y: Array,
     ) -> None:
-        self._family, self._torque, self._valid = family, torque, valid
+        self._model, self._columns, self._torque, self._valid = model, columns, torque, valid
         self._state = np.moveaxis(y, -2, -1)
         self.t = t
         self.quaternion: Array = self._state[..., :4]
@@ -99,7 +108,7 @@ class BatchStates:
         """Torques that act at the actuators [N m], shape (..., N, 3)."""
         if self._state.shape[-1] > 7:
             return self._state[..., 7:10]
-        profile = self._family.torque_columns
+        profile = self._model.constants(list(self._columns.inputs)).torque
         if profile is None:
             return np.broadcast_to(self._torque, self.body_rate.shape)
         rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
@@ -108,14 +117,14 @@ class BatchStates:
     @cached_property
     def _outputs(self) -> Array:
         """Angles and rates of the joints and the energy, shape (..., N, 19)."""
-        program = self._family.outputs
+        program = self._model.outputs
         function = compiled_for_arrays(program)
         found = np.full((*self.t.shape, len(program.outputs)), np.nan)
         flat = found.reshape(-1, *found.shape[-2:])
         states = self._state.reshape(-1, *self._state.shape[-2:])
         started = np.flatnonzero(self._valid)
         blocks = [started[i : i + _BLOCK] for i in range(0, len(started), _BLOCK)]
-        columns = self._family.columns
+        columns = self._columns.inputs
         for sample, of_sample in enumerate(states):
             for rows in blocks:
                 own = columns[:, rows] if columns.shape[1] > 1 else columns
@@ -136,17 +145,17 @@ class BatchStates:
         arrays["t"] = (first, self.t, {"units": "s"})
         coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
         found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS)
-        found.attrs["scene"] = self._family.scene.name
+        found.attrs["scene"] = self._model.scene.name
         return found
 
 
 class BatchResult(BatchStates):
-    """What became of N scenarios: their states at the end, or the last valid ones.
+    """Results of N scenarios: their states at the end, or the last valid ones.
 
     Attributes:
         status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
             start or its numbers ceased to be finite, shape (N,).
-        message: the same in words, N texts.
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
         fault_time: end of the step in which a scenario ended [s], nan where it reached its end,
             shape (N,).
         local_error: largest local error estimate of a quaternion in a step, shape (N,).
@@ -158,15 +167,44 @@ class BatchResult(BatchStates):
     def __init__(
         self,
         *states: Any,
-        status: NDArray[np.int64],
-        message: tuple[str, ...],
+        code: NDArray[np.int64],
         fault_time: Array,
         local_error: Array,
         kept: BatchStates | None,
     ) -> None:
         super().__init__(*states)
-        self.status, self.message = status, message
+        self.code = code
+        self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
         self.fault_time, self.local_error, self.kept = fault_time, local_error, kept
+
+    @cached_property
+    def message(self) -> tuple[str, ...]:
+        """How each scenario ended, N texts."""
+        texts, index = self.reasons
+        return tuple(texts[index].tolist())
+
+    @cached_property
+    def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
+        """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
+        geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
+        if len(self._columns.geometries) == 1:
+            codes, index = np.unique(self.code, return_inverse=True)
+            pairs = [(0, code) for code in codes.tolist()]
+        else:
+            both = np.stack([geometry, self.code], axis=1)
+            found, index = np.unique(both, axis=0, return_inverse=True)
+            pairs = found.tolist()
+        texts = np.array([self._reason(*pair) for pair in pairs], dtype=object)
+        return texts, index.ravel()
+
+    def _reason(self, geometry: int, code: int) -> str:
+        if code == 0:
+            return "reached the end"
+        if code < 0:
+            return REASONS[code]
+        if code == NOT_FINITE:
+            return "not finite"
+        return self._model.limits(self._columns.geometries[geometry])[code - 1].reason
 
     def __len__(self) -> int:
         return len(self.status)
@@ -196,9 +234,9 @@ class BatchResult(BatchStates):
                 units[f"{name}_{part}"] = unit
         table: pd.DataFrame = require("pandas").DataFrame(columns | {"energy": self.energy})
         table.index.name = "scenario"
-        table.attrs = {"units": units, "scene": self._family.scene.name}
+        table.attrs = {"units": units, "scene": self._model.scene.name}
         return table
 
     def __repr__(self) -> str:
-        name, ended = self._family.scene.name, np.count_nonzero(self.status)
+        name, ended = self._model.scene.name, np.count_nonzero(self.status)
         return f"<BatchResult of {name}: {len(self)} scenarios, {ended} ended early>"

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Source of many scenarios at once: blocks of lanes that a compiler turns into SIMD.
 
-The operations of a lane are those of a run of its own in the same order. A lane that leaves what
-its scene allows, or finite numbers, keeps its last valid state and a code; the others go on. Lanes
-do not touch each other, so threads change no bit.
+The operations of a lane are those of a run of its own in the same order. A lane that leaves a limit
+of its scene, or whose numbers are not finite, keeps its last valid state and a code; the others
+continue. Lanes do not depend on each other, so threads change no bit.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ from sst_ros.integration.methods import Tableau
 from sst_ros.integration.runge_kutta_source import combination
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
 
-LANES = 32
+SIMD_WIDTH = 32
+"""Scenarios of a block; a multiple of what a vector unit takes, and all fit the cache."""
+
 NOT_FINITE = 1000
+"""Code of a scenario whose numbers are no longer finite; others are 1 + the limit's index."""
 
 
-def batch_source(program: Program, margins: Program, tableau: Tableau, size: int) -> str:
+def batch_source(program: Program, distances: Program, tableau: Tableau, size: int) -> str:
     """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
 
     Args:
         program: derivative; inputs t, state, drive, of which the last may be parameters.
-        margins: numbers that are positive as long as the state is valid; inputs are the state's
+        distances: numbers that are positive as long as the state is valid; inputs are the state's
             first seven, and the parameters.
         tableau: explicit method.
         size: numbers in the state.
@@ -31,20 +34,20 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
     drive = len(program.inputs) - 1 - size
     stages = len(tableau.b)
     at = Layout(
-        LANES, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
-        far=len(margins.outputs), code=1, when=1, error=1,
+        SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
+        far=len(distances.outputs), code=1, when=1, error=1,
     )  # fmt: skip
     outside = at.rows("d", drive)
     given = ["time", *at.rows("s", size), *outside]
-    valid = [*at.rows("new", 7), *outside[drive - (len(margins.inputs) - 7) :]]
+    valid = [*at.rows("new", 7), *outside[drive - (len(distances.inputs) - 7) :]]
     lines = [
         "def batch(h, first, count, begin, end, y, d, code, when, error):",
         f"    block = vector({at.numbers})",
         "    for b in range(begin, end):",
-        f"        lo = b * {LANES}",
-        f"        last = min({LANES}, y.shape[1] - lo) - 1",
+        f"        lo = b * {SIMD_WIDTH}",
+        f"        last = min({SIMD_WIDTH}, y.shape[1] - lo) - 1",
         # Lanes beyond the last repeat it, for all blocks to have the same length.
-        f"        for i in range({LANES}):",
+        f"        for i in range({SIMD_WIDTH}):",
         "            n = lo + min(i, last)",
         *(f"            {at.lane('y', j)} = y[{j}, n]" for j in range(size)),
         *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
@@ -56,8 +59,8 @@ def batch_source(program: Program, margins: Program, tableau: Tableau, size: int
         *indented(16, evaluated(program, given, at, "f")),
         *indented(16, _kept(tableau, size, at)),
         *indented(12, _results(tableau, size, at)),
-        *indented(12, evaluated(margins, valid, at, "far")),
-        *indented(12, _judged(size, len(margins.outputs), at)),
+        *indented(12, evaluated(distances, valid, at, "far")),
+        *indented(12, _accepted(size, len(distances.outputs), at)),
         "        for i in range(last + 1):",
         *(f"            y[{j}, lo + i] = {at.lane('y', j)}" for j in range(size)),
         f"            code[lo + i] = int({at.lane('code')})",
@@ -75,7 +78,7 @@ def _arguments(tableau: Tableau, size: int, at: Layout) -> list[str]:
         value = f"{at.lane('y', 0, 'x')} + h * ({total})" if stage else at.lane("y", 0, "x")
         lines += [
             f"{'elif' if stage else 'if'} stage == {stage}:",
-            f"    for x in range({size * LANES}):",
+            f"    for x in range({size * SIMD_WIDTH}):",
             f"        {at.lane('s', 0, 'x')} = {value}",
         ]
     return lines
@@ -86,7 +89,7 @@ def _kept(tableau: Tableau, size: int, at: Layout) -> list[str]:
     for stage in range(len(tableau.b)):
         lines += [
             f"{'elif' if stage else 'if'} stage == {stage}:",
-            f"    for x in range({size * LANES}):",
+            f"    for x in range({size * SIMD_WIDTH}):",
             f"        {at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}",
         ]
     return lines
@@ -99,9 +102,9 @@ def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
         return combination(weights, lambda m: at.lane("k", m * size, "x"))
 
     lines = [
-        f"for x in range({size * LANES}):",
+        f"for x in range({size * SIMD_WIDTH}):",
         f"    {at.lane('new', 0, 'x')} = {at.lane('y', 0, 'x')} + h * ({total(tableau.b)})",
-        f"for x in range({4 * LANES}):",
+        f"for x in range({4 * SIMD_WIDTH}):",
     ]
     if tableau.damping:
         lines += [
@@ -118,10 +121,10 @@ def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
     return [*lines, *loop(at, [f"factor = 1.0 / sqrt({squares})", *scaled])]
 
 
-def _judged(size: int, margins: int, at: Layout) -> list[str]:
-    """Take over the new state where it is valid; otherwise note why and when not."""
+def _accepted(size: int, distances: int, at: Layout) -> list[str]:
+    """Accept the new state where it is valid; otherwise record why not, and when."""
     inside = ["found = 0.0"]
-    for j in reversed(range(margins)):
+    for j in reversed(range(distances)):
         inside += [f"far = {at.lane('far', j)}", f"found = {j + 1}.0 if far < 0.0 else found"]
     inside += [
         f"total = {' + '.join(at.lane('new', j) for j in range(size))}",

@@ -57,15 +57,15 @@ def initial_states(
     ]
     for part in slices(len(blocks), 0, label, progress):
         for geometry, rows in blocks[part]:
-            different, same = np.unique(gamma[rows], axis=0, return_inverse=True)
+            different, same = _distinct(gamma[rows])
             found = kinematics.direct_many(geometry, different)
             valid = np.flatnonzero(found.admissible)
             owner = found.configuration[valid]
             counts = np.bincount(owner, minlength=len(different))
             one = np.zeros(len(different), dtype=np.intp)
             one[owner] = valid
-            starting = counts[same.ravel()] == 1
-            here, chosen = rows[starting], one[same.ravel()[starting]]
+            starting = counts[same] == 1
+            here, chosen = rows[starting], one[same[starting]]
             rotation = found.rotation[chosen]
             moving = gamma_dot[here].any(axis=1)
             singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
@@ -81,6 +81,14 @@ def initial_states(
 
 
 _BLOCK = 20_000
+
+
+def _distinct(rows: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Distinct rows of (N, 3), and for each row the index of its own."""
+    if np.array_equal(rows, np.broadcast_to(rows[:1], rows.shape)):
+        return rows[:1], np.zeros(len(rows), dtype=np.intp)
+    different, same = np.unique(rows, axis=0, return_inverse=True)
+    return different, same.ravel()
 
 
 def _body_rates(geometry: Geometry, rotation: Array, gamma_dot: Array) -> Array:

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many scenes as one program: a number that differs between them becomes an input.
+"""Many scenarios as one program: a number that differs between them becomes an input.
 
-What is the same in all scenes stays a constant that `trace` folds, so a family pays for what varies
-and for nothing else. A term that only some of the scenes have is there for all: the others have
-coefficients of zero, which change no bit.
+What is the same in all scenarios stays a constant that `trace` folds, so a batch pays for what
+varies and for nothing else. A term whose coefficients are zero in some scenarios changes no bit
+there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property, reduce
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,25 +22,15 @@ from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_source import margins
 from sst_ros.integration.ode import ODE
-from sst_ros.integration.scenario_columns import numbers_of
-from sst_ros.integration.scenario_constants import (
-    Constants,
-    Member,
-    Places,
-    alike,
-    constants_of,
-    joined,
-    member_of,
-    rebuilt,
-    table,
-)
-from sst_ros.integration.scenarios import Variants
+from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
+from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import Scene
+
+_OF_GEOMETRY = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 
 
-class Present(Expression):
-    """A number that differs between scenes: not all have zero there, so all have its term."""
+class VariedNumber(Expression):
+    """A number that differs between scenarios: it counts as nonzero, so its term is present."""
 
     __slots__ = ()
 
@@ -48,167 +38,185 @@ class Present(Expression):
         return True
 
 
-class Family:
-    """Scenes as one program, and a column of its inputs for each.
-
-    Args:
-        variants: the scenes.
-        profile: whether the scenes' own torques act.
-        progress: draw a bar on a terminal.
+class ParameterColumns(NamedTuple):
+    """Numbers of the scenarios of a batch.
 
     Attributes:
-        scene: one of them, for what all have in common.
-        system: what is integrated, for the names of its state and drive.
-        columns: the numbers that differ, shape (numbers, N).
+        inputs: the program's varied numbers, shape (numbers, N).
         geometries: the distinct ones.
-        geometry: number of the geometry of each row, shape (N,).
+        geometry: index of the geometry of each row, shape (N,).
         torque_limit: largest torque of an actuator [N m], infinite without one, shape (N,).
-
-    Raises:
-        InputError: rows make no scene, or actuators cannot give the torques of the profile.
 
     """
 
-    def __init__(self, variants: Variants, *, profile: bool, progress: bool = False) -> None:
-        self.geometries: list[Geometry] = []
-        self._limits: dict[int, tuple[Limit, ...]] = {}
-        kinds: dict[bytes, tuple[Constants, list[tuple[int, Array]]]] = {}
-        known: dict[bytes, int] = {}
-        count = variants.count or 1
-        self.geometry: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
-        self.torque_limit: Array = np.empty(count)
-        regular, together = _together(variants, profile)
-        single = np.ones(count, dtype=bool)
-        single[regular[1:]] = False
-        alone = np.flatnonzero(single).tolist()
-        for row, scene in variants.scenes(alone, progress):
-            member = member_of(scene, profile=profile)
-            _refuse_clamped(scene, member, f"scenario {row}: " if variants.keys else "")
-            here = self.geometry[row] = known.setdefault(member.shape, len(known))
-            if here == len(self.geometries):
-                self.geometries.append(member.geometry)
-            if row in regular[:1]:
-                self.geometry[regular] = here
-            terms = np.isnan(member.numbers).tobytes()
-            if row not in regular[:1]:
-                kinds.setdefault(terms, (member.constants, []))[1].append((row, member.numbers))
-            self.torque_limit[row] = member.torque_limit
-            self.scene = scene
-        members = [
-            (constants, np.array([row for row, _ in rows]), np.stack([n for _, n in rows], axis=1))
-            for constants, rows in kinds.values()
-        ]
-        if together is not None:
-            constants, columns, limit = together
-            self.torque_limit[regular] = limit
-            if members:
-                members.append((constants, regular, numbers_of(columns, len(regular))))
-        torque = self.scene.torque if profile else None
-        dynamics = Dynamics.of(self.scene)
-        self.system, self._moved = ODE(dynamics, torque), dynamics.moved
-        everywhere: Places
-        numbers: Sequence[Any] | Array
-        if members:
-            self._tree: Constants = reduce(joined, [constants for constants, _, _ in members])
-            everywhere, numbers = table(members)
-        else:
-            assert together is not None
-            self._tree = constants
-            everywhere, numbers = alike(constants, columns)
-        differ = [i for i, row in enumerate(numbers) if np.max(row) != np.min(row)]
-        self.columns: Array = np.array([numbers[i] for i in differ]).reshape(len(differ), count)
-        self._fixed = {
-            place: float(np.ravel(row)[0]) for place, row in zip(everywhere, numbers, strict=True)
-        }
-        self._varied = [everywhere[i] for i in differ]
-        self._names = tuple(f"p{i}" for i in range(len(differ)))
+    inputs: Array
+    geometries: list[Geometry]
+    geometry: NDArray[np.intp]
+    torque_limit: Array
 
-    def limits(self, row: int) -> tuple[Limit, ...]:
-        """Return the limits of a row; only their ends differ between rows."""
-        number = int(self.geometry[row % len(self.geometry)])
-        if number not in self._limits:
-            self._limits[number] = tuple(limits_of(self.scene, self.geometries[number]))
-        return self._limits[number]
+
+class ParametricModel:
+    """The programs of a scene, with the numbers that differ between scenarios as inputs.
+
+    Args:
+        scenarios: what differs between them becomes an input.
+        profile: whether the scene's own torques act.
+
+    Attributes:
+        scene: the document.
+        ode: what is integrated, for the names of its state and drive.
+
+    """
+
+    def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
+        self.scene, self._profile = scenarios.document, profile
+        self._count = scenarios.count or 1
+        geometries, geometry = _geometries(scenarios)
+        self._tree, numbers = self._numbers(scenarios, geometries, geometry)
+        varied = [place for place, value in numbers.items() if _varies(value)]
+        self._varied = dict(zip(varied, (f"p{i}" for i in range(len(varied))), strict=True))
+        self._fixed = {place: float(np.ravel(value)[0]) for place, value in numbers.items()}
+        dynamics = Dynamics.of(self.scene)
+        self._moved = dynamics.moved
+        self.ode = ODE(dynamics, self.scene.torque if profile else None)
+        self._limits = tuple(limits_of(self.scene, geometries[0]))
+
+    def columns(self, scenarios: Scenarios) -> ParameterColumns:
+        """Return the numbers of scenarios.
+
+        Raises:
+            InputError: actuators cannot give the torques of the profile, or a number differs that
+                does not in the scenarios that this model was made from.
+
+        """
+        geometries, geometry = _geometries(scenarios)
+        _, numbers = self._numbers(scenarios, geometries, geometry)
+        count = scenarios.count or 1
+        inputs = np.empty((len(self._varied), count))
+        for row, place in zip(inputs, self._varied, strict=True):
+            row[:] = numbers[place]
+            if place[-1] == "static":
+                # static = 0 is no breakaway torque, which is as if it were the Coulomb torque.
+                level: Place = (*place[:-1], "coulomb")
+                row[:] = np.where(row == 0.0, numbers[level], row)
+            elif place[-1] == "rest":
+                np.nan_to_num(row, copy=False)  # of a spring without stiffness any will do
+        for place in numbers.keys() - self._varied.keys():
+            value = numbers[place]
+            if isinstance(value, np.ndarray) and not np.all(value == self._fixed[place]):
+                allowed = f"must be {self._fixed[place]} in all scenarios of this model"
+                raise InputError(self.scene.name, [Problem(str(place), value, allowed)])
+        self._refuse_no_lag(numbers)
+        limit = self._torque_limit(scenarios, numbers)
+        return ParameterColumns(inputs, geometries, geometry, limit)
+
+    def limits(self, geometry: Geometry) -> tuple[Limit, ...]:
+        """Return the limits of scenarios with this geometry."""
+        return tuple(limits_of(self.scene, geometry))
 
     @cached_property
     def program(self) -> Program:
-        """Derivative of the state; inputs t, state, drive, and the numbers that differ."""
-        known = ("t", *self.system.state, *self.system.drive)
+        """Derivative of the state; inputs t, state, drive, and the varied numbers."""
+        known = ("t", *self.ode.state, *self.ode.drive)
 
         def slope(*inputs: Expression) -> tuple[Any, ...]:
-            at = self._constants(inputs[len(known) :])
-            system = ODE(Dynamics(at.model, moved=self._moved), at.torque)
-            return system.derivative(*inputs[: len(known)])
+            at = self.constants(inputs[len(known) :])
+            ode = ODE(Dynamics(at.model, moved=self._moved), at.torque)
+            return ode.derivative(*inputs[: len(known)])
 
-        return trace(slope, (*known, *self._names))
+        return trace(slope, (*known, *self.names))
 
     @cached_property
-    def margins(self) -> Program:
-        """Distances to the limits; inputs are quaternion, body rate and the numbers that differ."""
-        limits = self.limits(0)
+    def limit_distances(self) -> Program:
+        """Distances to the limits; inputs are quaternion, body rate and the varied numbers."""
 
-        def signs(*inputs: Expression) -> tuple[Any, ...]:
-            at = self._constants(inputs[7:])
-            return margins(limits, at.ends, at.model, inputs[:7])
+        def distances(*inputs: Expression) -> tuple[Any, ...]:
+            at = self.constants(inputs[7:])
+            return margins(self._limits, at.ends, at.model, inputs[:7])
 
-        return trace(signs, (*QUATERNION, *RATE, *self._names))
+        return trace(distances, (*QUATERNION, *RATE, *self.names))
 
     @cached_property
     def outputs(self) -> Program:
-        """Angles and rates of the joints (18 numbers) and the energy [J]; inputs as `margins`."""
+        """Angles and rates of joints (18 numbers) and energy [J]; inputs as `limit_distances`."""
 
         def values(*inputs: Expression) -> tuple[Any, ...]:
-            model, state = self._constants(inputs[7:]).model, inputs[:7]
+            model, state = self.constants(inputs[7:]).model, inputs[:7]
             joints = [number for triple in kernel.joints(model, state) for number in triple]
             return (*joints, energy.kinetic(model, state) + energy.potential(model, state))
 
-        return trace(values, (*QUATERNION, *RATE, *self._names))
+        return trace(values, (*QUATERNION, *RATE, *self.names))
 
     @property
-    def torque_columns(self) -> Any:
-        """Torques of the profile, numbers or a column where they differ; None without a profile."""
-        numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, self.columns, strict=True))
-        return rebuilt(self._tree, numbers).torque
+    def names(self) -> tuple[str, ...]:
+        """Names of the varied numbers."""
+        return tuple(self._varied.values())
 
-    def _constants(self, inputs: Sequence[Expression]) -> Constants:
-        """Return the constants, with expressions where they differ."""
-        present = (Present(entry.graph, entry.index) for entry in inputs)
-        numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, present, strict=True))
+    def constants(self, inputs: Sequence[Any]) -> Constants:
+        """Return the constants, with expressions or columns where they differ."""
+        given = [
+            VariedNumber(entry.graph, entry.index) if isinstance(entry, Expression) else entry
+            for entry in inputs
+        ]
+        numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, given, strict=True))
         tree: Constants = rebuilt(self._tree, numbers)
         return tree
 
+    def _numbers(
+        self, scenarios: Scenarios, geometries: list[Geometry], geometry: NDArray[np.intp]
+    ) -> tuple[Constants, dict[Place, Any]]:
+        """Constants of scenarios as a tree, and its numbers or columns by place."""
+        if len(geometries) == 1:
+            columns = scenarios.columns()
+            tree = constants_of(self.scene, columns, geometries[0], profile=self._profile)
+            return tree, dict(leaves(tree))
+        numbers: dict[Place, Any] = {}
+        for index, one in enumerate(geometries):
+            rows = np.flatnonzero(geometry == index)
+            columns = scenarios.columns(rows)
+            tree = constants_of(self.scene, columns, one, profile=self._profile)
+            for place, value in leaves(tree):
+                numbers.setdefault(place, np.empty(len(geometry)))[rows] = value
+        return tree, numbers
 
-def _together(
-    variants: Variants, profile: bool
-) -> tuple[NDArray[np.intp], tuple[Constants, Constants, Any] | None]:
-    """Rows that are prepared as arrays: constants of the first, columns and torque limits of all.
+    def _refuse_no_lag(self, numbers: dict[Place, Any]) -> None:
+        lag = numbers.get(("model", "time_constant"), 1.0)
+        if np.any(lag == 0.0):
+            allowed = "must be > 0 [s] in every scenario, or in none"
+            raise InputError(self.scene.name, [Problem("actuators.time_constant", 0.0, allowed)])
 
-    The first of them is made a scene as well, for what all have in common.
-    """
-    rows, columns = variants.regular()
-    if len(rows) < 2:
-        return rows[:0], None
-    scene = variants.scene(int(rows[0]))
-    actuators = columns.actuators
-    limit = None if actuators is None else actuators.torque_limit
-    limit = np.inf if limit is None else limit
-    if profile and np.any(np.max(np.abs(_stacked(columns.torque.amplitude)), axis=0) > limit):
-        return rows[:0], None
-    own = member_of(scene, profile=profile)
-    return rows, (
-        own.constants,
-        constants_of(scene, columns, own.geometry, profile=profile),
-        limit,
-    )
+    def _torque_limit(self, scenarios: Scenarios, numbers: dict[Place, Any]) -> Array:
+        """Torque limits of scenarios; refuses those that would clamp a profile.
+
+        A fixed step does not resolve the kinks of a clamped torque.
+        """
+        actuators = scenarios.columns().actuators
+        given = None if actuators is None else actuators.torque_limit
+        limit = np.full(scenarios.count or 1, np.inf if given is None else given, dtype=float)
+        limit[limit == 0.0] = np.inf  # of actuators that are left out
+        if self._profile:
+            amplitudes = [numbers["torque", "amplitude", k] for k in range(3)]
+            largest = np.max(np.abs(np.array(np.broadcast_arrays(*amplitudes, limit)[:3])), axis=0)
+            if len(clamped := np.flatnonzero(largest > limit)):
+                row = int(clamped[0])
+                where = f"scenario {row}: " if scenarios.count else ""
+                allowed = f"must not be less than the amplitude {largest[row]} of the profile"
+                problem = Problem(f"{where}actuators.torque_limit", float(limit[row]), allowed)
+                raise InputError(self.scene.name, [problem])
+        return limit
 
 
-def _stacked(triple: Any) -> Array:
-    return np.array(np.broadcast_arrays(*triple))
+def _varies(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and bool(np.max(value) != np.min(value))
 
 
-def _refuse_clamped(scene: Scene, member: Member, where: str) -> None:
-    """Refuse a profile that actuators would clamp: a fixed step knows nothing of the kinks."""
-    torque, limit = member.constants.torque, member.torque_limit
-    if torque is not None and max(map(abs, torque.amplitude)) > limit:
-        allowed = f"must not be less than the amplitudes {torque.amplitude} of a batch's profile"
-        raise InputError(scene.name, [Problem(f"{where}actuators.torque_limit", limit, allowed)])
+def _geometries(scenarios: Scenarios) -> tuple[list[Geometry], NDArray[np.intp]]:
+    """Return the distinct geometries, and the index of that of each row."""
+    count = scenarios.count or 1
+    varied = [
+        scenarios.rows[key].reshape(count, -1) for key in _OF_GEOMETRY if key in scenarios.rows
+    ]
+    if not varied:
+        return [Geometry.of(scenarios.document)], np.zeros(count, dtype=np.intp)
+    _, first, index = np.unique(np.hstack(varied), axis=0, return_index=True, return_inverse=True)
+    return [Geometry.of(scenarios.scene(int(row))) for row in first], index.ravel()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios in columns: the scene with an array in place of each number that varies.
+"""Scenarios as columns: the scene with an array in place of each number that varies.
 
-Rows in which every such number is allowed and not zero have the terms of the scene itself; they are
-checked and prepared as arrays. All others (a friction of zero, an inertia that no body has,
-another geometry) are left to the scenes of `scenarios`, one by one, which refuse or simplify them.
+`valid_rows` checks the columns with array operations. It is sufficient, not necessary: a row that
+it does not accept is built as a `Scene`, which accepts it or names the fault.
 """
 
 from __future__ import annotations
@@ -17,59 +16,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.bodies import RELATIVE_ROUNDING
-from sst_ros.scene.scene import LARGEST, Scene
+from sst_ros.scene.bodies import RELATIVE_ROUNDING, SMALLEST_MOMENT
+from sst_ros.scene.scene import LARGEST, SMALLEST, Scene
 from sst_ros.scene.schema import Section, Spec
 
 Mask = NDArray[np.bool_]
 
 _INERTIA = r"inertia\.(xx|yy|zz|xy|xz|yz)"
-_KNOWN = re.compile(
+_CHECKED = re.compile(
     rf"(star|(actuated|intermediate)_links(\[\d\])?)\.({_INERTIA}|mass|centre)"
     rf"|payload\.(mass|centre|{_INERTIA})"
     r"|gravity\.acceleration|moment\.value|torque\.(amplitude|frequency|phase)"
-    r"|friction\.(gamma|mu|beta)\.(viscous|coulomb|static)"
-    r"|springs(\[\d+\])?\.(stiffness|rest)"
-    r"|actuators\.(rotor_inertia|time_constant|torque_limit)"
+    r"|friction\.(gamma|mu|beta)\.(viscous|coulomb|static|smoothing|stribeck)"
+    r"|springs(\[\d+\])?\.(stiffness|rest)|stroke\.(stiffness|damping)"
+    r"|actuators\.(rotor_inertia|gear_ratio|time_constant|torque_limit|idle_damping)"
 )
-"""Keys whose checks are those of `regular_rows`."""
+"""Keys whose checks across fields are those of `valid_rows`."""
 
 
-def regular_rows(
-    scene: Scene, columns: SimpleNamespace, rows: dict[str, Array], specs: dict[str, Spec]
+def valid_rows(
+    scene: Scene, columns: Any, rows: dict[str, Array], specs: dict[str, Spec], count: int
 ) -> Mask:
-    """Rows that surely make a scene with the terms of `scene`, shape (N,).
+    """Rows that certainly make a scene, shape (count,).
 
     Args:
         scene: the document.
         columns: the same with arrays, see `with_columns`.
         rows: the numbers by key, a row a scenario.
         specs: what is allowed for each key.
+        count: number of rows.
 
     """
-    count = len(next(iter(rows.values())))
-    if not all(_KNOWN.fullmatch(key) for key in rows):
+    restituted = scene.stroke.restitution is not None
+    if not all(_CHECKED.fullmatch(key) for key in rows) or (
+        restituted and "stroke.damping" in rows
+    ):
         return np.zeros(count, dtype=bool)
-    fits = np.ones(count, dtype=bool)
+    valid = np.ones(count, dtype=bool)
     for key, values in rows.items():
         spec, flat = specs[key], values.reshape(count, -1)
-        allowed = (np.abs(flat) <= LARGEST) & (flat > spec.above)
-        allowed &= (flat >= spec.least) & (flat <= spec.most)
-        fits &= allowed.all(axis=1) & flat.any(axis=1)
+        least = SMALLEST if spec.above == 0.0 else spec.least
+        valid &= ((flat >= least) & (flat <= min(spec.most, LARGEST))).all(axis=1)
+        valid &= (flat >= -LARGEST).all(axis=1)
     reach = max(scene.base.radius, scene.star.radius) * (1.0 - RELATIVE_ROUNDING)
+    mass: Any = 0.0
     for body in (columns.star, *columns.actuated_links, *columns.intermediate_links):
-        varied = any(isinstance(value, np.ndarray) for value in numbers_in(body))
-        some = count if varied else 1  # what does not vary is the same in all rows
-        tensor, centre = _tensor(body.inertia, some), _vector(body.centre, some)
-        fits &= _is_body(tensor, body.mass, centre, reach)
-    if columns.payload is not None and columns.payload.inertia is not None:
-        fits &= _is_inertia(_tensor(columns.payload.inertia, count))
+        mass = mass + body.mass
+        if any(isinstance(value, np.ndarray) for value in _numbers(body)):
+            valid &= _is_body(body, reach)
+    if columns.payload is not None:
+        mass = mass + columns.payload.mass
+        if columns.payload.inertia is not None:
+            valid &= _is_inertia(_tensor(columns.payload.inertia))
+    if columns.gravity is not None:
+        valid &= np.greater(mass, 0.0)
     for friction in vars(columns.friction).values() if columns.friction else ():
         if friction is not None:
-            fits &= np.equal(friction.static, 0.0) | np.greater_equal(
-                friction.static, friction.coulomb
-            )
-    return fits
+            none, enough = friction.static == 0.0, friction.static >= friction.coulomb
+            valid &= np.logical_or(none, enough)
+    return valid
 
 
 def with_columns(section: Any, tree: dict[Any, Any], rows: dict[str, Array]) -> Any:
@@ -78,8 +83,7 @@ def with_columns(section: Any, tree: dict[Any, Any], rows: dict[str, Array]) -> 
     for name, below in tree.items():
         value = given[name]
         if isinstance(below, str):
-            values = rows[below]
-            given[name] = values if values.ndim == 1 else tuple(values.T)
+            given[name] = _components(rows[below])
         elif isinstance(value, Section):
             given[name] = with_columns(value, below, rows)
         else:
@@ -90,58 +94,65 @@ def with_columns(section: Any, tree: dict[Any, Any], rows: dict[str, Array]) -> 
     return SimpleNamespace(**given)
 
 
-def numbers_of(tree: Any, count: int) -> Array:
-    """Return all numbers of a tree in order, nan for what there is not, shape (numbers, count)."""
-    found = list(numbers_in(tree))
-    numbers = np.empty((len(found), count))
-    for row, value in zip(numbers, found, strict=True):
-        row[:] = value
-    return numbers
+def _components(values: Array) -> Any:
+    """Contiguous columns (N,) of an array (N, ...), nested tuples where it has more dimensions."""
+    if values.ndim == 1:
+        return values
+    return tuple(_components(np.ascontiguousarray(values[:, i])) for i in range(values.shape[1]))
 
 
-def numbers_in(value: Any) -> Iterator[Any]:
-    """Yield the numbers and columns of a tree, nan for None."""
-    if value is None:
-        yield np.nan
-    elif isinstance(value, (float, np.ndarray)):
+def _numbers(value: Any) -> Iterator[Any]:
+    if isinstance(value, (float, np.ndarray)):
         yield value
-    elif not isinstance(value, str):
+    elif value is not None and not isinstance(value, str):
         for entry in value if isinstance(value, tuple) else vars(value).values():
-            yield from numbers_in(entry)
+            yield from _numbers(entry)
 
 
-def _is_body(inertia: Array, mass: Any, centre: Array, reach: float) -> Mask:
-    """Whether inertia about O, mass and centre fit each other, well inside what a body is held to.
+def _is_body(body: Any, reach: float) -> Mask:
+    """Whether inertia about O, mass and centre fit each other.
 
-    Where none of them varies the document has been checked already; one row then stands for all.
+    A tensor is that of a body if its second moments tr(I)/2 - I are positive semidefinite; about
+    the centre of mass c they are less by m c c^T. Without mass a centre is of no effect.
     """
-    fits: Mask = _is_inertia(inertia) | ~inertia.any(axis=(1, 2))
-    fits &= np.linalg.norm(centre, axis=1) <= reach
-    mass = np.broadcast_to(mass, len(inertia))
-    fits &= (mass > 0.0) | ~centre.any(axis=1)
-    squares = np.sum(centre * centre, axis=1)
-    point = squares[:, None, None] * np.eye(3) - centre[:, :, None] * centre[:, None, :]
-    own = np.linalg.eigvalsh(np.nan_to_num(inertia - mass[:, None, None] * point))
-    scale = 0.5e-6 * np.maximum(np.abs(inertia).max(axis=(1, 2)), mass * squares)
-    fits &= (own[:, 0] >= -scale) & (own[:, 2] <= own[:, 0] + own[:, 1] + scale)
-    return fits
+    x, y, z = body.centre
+    mass = body.mass
+    valid: Mask = np.asarray((x * x + y * y + z * z <= reach * reach) | np.equal(mass, 0.0))
+    if body.inertia is None:
+        # A point mass is what `_mass_problems` refuses; without mass there is nothing to check.
+        return np.asarray(valid & np.equal(mass, 0.0))
+    xx, yy, zz, xy, xz, yz = _tensor(body.inertia)
+    trace = xx + yy + zz
+    scale = 0.1e-6 * trace
+    moments = (
+        0.5 * trace - xx - mass * x * x + scale,
+        0.5 * trace - yy - mass * y * y + scale,
+        0.5 * trace - zz - mass * z * z + scale,
+        -xy - mass * x * y, -xz - mass * x * z, -yz - mass * y * z,
+    )  # fmt: skip
+    massless = np.equal(mass, 0.0)
+    about_o = _is_inertia((xx, yy, zz, xy, xz, yz))
+    return np.asarray(valid & about_o & (massless | _is_positive(*moments)))
 
 
-def _is_inertia(tensor: Array) -> Mask:
-    finite: Mask = np.asarray(np.isfinite(tensor).all(axis=(1, 2)))
-    low, middle, high = np.linalg.eigvalsh(np.where(finite[:, None, None], tensor, 0.0)).T
-    most = (low + middle) * (1.0 + 0.5 * RELATIVE_ROUNDING)
-    return np.asarray(finite & (low > 1e-12 * high) & (high <= most))
+def _is_inertia(tensor: tuple[Any, ...]) -> Mask:
+    """Whether a tensor is positive definite with principal moments that a body can have."""
+    xx, yy, zz, xy, xz, yz = tensor
+    trace = xx + yy + zz
+    least = SMALLEST_MOMENT + 1e-12 * trace
+    half = (0.5 + 0.1 * RELATIVE_ROUNDING) * trace
+    definite = _is_positive(xx - least, yy - least, zz - least, xy, xz, yz)
+    other = _is_positive(half - xx, half - yy, half - zz, -xy, -xz, -yz)
+    return np.asarray(definite & other)
 
 
-def _tensor(inertia: Any, count: int) -> Array:
-    """Tensors, shape (N, 3, 3), or (1, 3, 3) where nothing varies."""
-    if inertia is None:
-        return np.zeros((count, 3, 3))
-    rows = ("xx", "xy", "xz"), ("xy", "yy", "yz"), ("xz", "yz", "zz")
-    parts = [np.broadcast_to(getattr(inertia, name), count) for row in rows for name in row]
-    return np.stack(parts, axis=1).reshape(count, 3, 3)
+def _is_positive(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Mask:
+    """Whether a symmetric matrix is positive definite: the pivots of its L D L^T are positive."""
+    second = yy - xy * xy / xx
+    off = yz - xy * xz / xx
+    third = zz - xz * xz / xx - off * off / second
+    return np.asarray((xx > 0.0) & (second > 0.0) & (third > 0.0))
 
 
-def _vector(vector: Any, count: int) -> Array:
-    return np.stack([np.broadcast_to(part, count) for part in vector], axis=1)
+def _tensor(inertia: Any) -> tuple[Any, ...]:
+    return inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes that are one document but for some numbers: a row of each array makes a scene.
 
-The scene of a row is held to all that documents are held to. What does nothing in a row is left out
-of it, as documents demand: a friction whose coefficients are zero there, the gear of a rotor
-without inertia.
+The scene of a row meets all requirements of a document. What has no effect in a row is left out of
+it, as documents demand: a friction whose coefficients are zero there, the gear of a rotor without
+inertia.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.scenario_columns import regular_rows, with_columns
+from sst_ros.integration.scenario_columns import valid_rows, with_columns
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.scene.bodies import Link, Payload, Star
 from sst_ros.scene.scene import Actuators, Friction, Gravity, JointFriction, Scene, Spring
 from sst_ros.scene.schema import Section, Spec, accept, specs
 
-_NOTHING_WITHOUT: dict[type[Section], tuple[str, ...]] = {
+_NEEDS: dict[type[Section], tuple[str, ...]] = {
     Gravity: ("acceleration",),
     Friction: ("viscous", "coulomb", "static"),
     JointFriction: ("gamma", "mu", "beta"),
@@ -35,7 +35,7 @@ _NOTHING_WITHOUT: dict[type[Section], tuple[str, ...]] = {
         "acceleration_limit",
     ),
 }  # fmt: skip
-"""A section does nothing where all of these are zero or not given."""
+"""A section has no effect where all of these are zero or not given."""
 
 _ACTS_ON: dict[type[Section], dict[str, tuple[str, ...]]] = {
     Friction: {"smoothing": ("coulomb", "static"), "stribeck": ("static",)},
@@ -43,7 +43,7 @@ _ACTS_ON: dict[type[Section], dict[str, tuple[str, ...]]] = {
     Star: {"centre": ("mass",)},
     Link: {"centre": ("mass",)},
 }
-"""A number does nothing where all of these are zero or not given."""
+"""A number has no effect where all of these are zero or not given."""
 
 _MOST_PROBLEMS = 10
 
@@ -51,8 +51,8 @@ Tree = dict[Any, Any]
 """Names and indices down to the keys of the numbers."""
 
 
-class Variants:
-    """Scenes by row.
+class Scenarios:
+    """Scenarios of a scene by row.
 
     Args:
         scene: the document.
@@ -62,7 +62,7 @@ class Variants:
 
     Attributes:
         document: the scene.
-        keys: the keys.
+        rows: the arrays by key.
         count: number of rows N; None where nothing varies.
 
     Raises:
@@ -72,16 +72,15 @@ class Variants:
 
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
         self.document = scene
-        self.keys = tuple(parameters)
         self.count: int | None = None
-        self._rows: dict[str, Array] = {}
+        self.rows: dict[str, Array] = {}
         self._specs: dict[str, Spec] = {}
         self._tree: Tree = {}
         problems = []
         for key, value in parameters.items():
             try:
                 spec = self._specs[key] = _entered(self._tree, scene, key.split("."), key)
-                self._rows[key] = rows = _rows(value, spec, self.count)
+                self.rows[key] = rows = _rows(value, spec, self.count)
                 self.count = len(rows)
             except ValueError as error:
                 problems.append(Problem(key, value, str(error)))
@@ -92,10 +91,10 @@ class Variants:
         """Build the scene of a row.
 
         Raises:
-            InputError: the numbers of this row make no scene; says which and what is allowed.
+            InputError: the numbers of this row make no scene; names each and what is allowed.
 
         """
-        values = {key: rows[row].tolist() for key, rows in self._rows.items()}
+        values = {key: rows[row].tolist() for key, rows in self.rows.items()}
         try:
             built = _with(self.document, self._tree, values, "")
         except InputError as error:
@@ -106,40 +105,37 @@ class Variants:
         assert isinstance(built, Scene)
         return built
 
-    def regular(self) -> tuple[NDArray[np.intp], Any]:
-        """Rows with the terms of the document that need no scene of their own, and their columns.
+    def columns(self, chosen: slice | NDArray[np.intp] = slice(None)) -> Any:
+        """Return the document with arrays of the chosen rows for the numbers that vary."""
+        rows = {key: values[chosen] for key, values in self.rows.items()}
+        return with_columns(self.document, self._tree, rows)
 
-        The columns are the document with an array for each number that varies, see
-        `scenario_columns`; they are those of all rows.
-        """
-        if not self._rows:
-            return np.empty(0, dtype=np.intp), self.document
+    def faults(
+        self, *, progress: bool = False, most: int = _MOST_PROBLEMS
+    ) -> dict[int, InputError]:
+        """Rows that make no scene, and why; no more than `most` rows are looked for."""
+        if self.count is None:
+            return {}
         with np.errstate(all="ignore"):
-            columns = with_columns(self.document, self._tree, self._rows)
-            mask = regular_rows(self.document, columns, self._rows, self._specs)
-        rows = np.flatnonzero(mask)
-        chosen = {key: values[rows] for key, values in self._rows.items()}
-        return rows, with_columns(self.document, self._tree, chosen)
-
-    def scenes(self, rows: Sequence[int], progress: bool) -> Iterator[tuple[int, Scene]]:
-        """Yield the scenes of some rows, with a bar on a terminal if `progress`.
-
-        Raises:
-            InputError: rows make no scene; lists the first ten problems.
-
-        """
-        problems: list[Problem] = []
-        label = f"{self.document.name}, preparing"
-        for part in slices(len(rows), 0, label, progress and bool(self.keys)):
-            for row in rows[part]:
+            valid = valid_rows(self.document, self.columns(), self.rows, self._specs, self.count)
+        unknown, faults = np.flatnonzero(~valid).tolist(), {}
+        for part in slices(len(unknown), 0, f"{self.document.name}, preparing", progress):
+            for row in unknown[part]:
                 try:
-                    scene = self.scene(row)
+                    self.scene(row)
                 except InputError as error:
-                    problems += error.problems
-                else:
-                    yield row, scene
-            if len(problems) >= _MOST_PROBLEMS:
-                break
+                    faults[row] = error
+                if len(faults) == most:
+                    return faults
+        return faults
+
+    def check(self, *, progress: bool = False) -> None:
+        """Raise InputError with the first ten problems if rows make no scene."""
+        problems = [
+            problem
+            for error in self.faults(progress=progress).values()
+            for problem in error.problems
+        ]
         if problems:
             raise InputError(self.document.name, problems[:_MOST_PROBLEMS])
 
@@ -185,7 +181,7 @@ def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Array:
 
 
 def _with(section: Section, tree: Tree, values: dict[str, Any], path: str) -> Section | None:
-    """Return a section with other numbers, None where it then does nothing."""
+    """Return a section with other numbers, None where it then has no effect."""
     cls, given = type(section), dict(vars(section))
     problems: list[Problem] = []
     for name, below in tree.items():
@@ -203,7 +199,7 @@ def _with(section: Section, tree: Tree, values: dict[str, Any], path: str) -> Se
     for name, causes in _ACTS_ON.get(cls, {}).items():
         if not any(_is_some(given[cause]) for cause in causes):
             given[name] = cls.__dataclass_fields__[name].default
-    needed = _NOTHING_WITHOUT.get(cls)
+    needed = _NEEDS.get(cls)
     try:
         if problems:
             raise InputError("", problems)

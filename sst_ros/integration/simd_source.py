@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text of loops over lanes: many evaluations of one program at once, for a compiler's SIMD.
+"""Text of loops over SIMD lanes: many evaluations of one program at once.
 
 All numbers live in one flat array, a row of lanes each, at offsets that are constants in the text,
 and loops have a fixed length and no branches: so a compiler need not ask at run time what overlaps

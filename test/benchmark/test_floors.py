@@ -9,7 +9,7 @@ import pytest
 from benchmark import c_batch, c_floor
 from benchmark.batch import FLAGS, METHODS
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_source import LANES
+from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.scene.scene import load
 
 needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
@@ -19,13 +19,13 @@ needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
 def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monkeypatch):
     pytest.importorskip("numba", reason="a batch needs numba")
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
-    number = LANES + 3
+    number = SIMD_WIDTH + 3
     scene, method = load("example2_heavy"), METHODS["rk4"]
     batch = Batch(scene, method, profile=True)
     gamma = np.array(scene.initial.gamma) + np.linspace(-0.05, 0.05, number)[:, None]
     y, code = batch.start(gamma, (0.0, 0.0, 0.0))
     given = batch.drives((0.0, 0.0, 0.0), number)
-    text, _ = c_batch.source(batch.program, batch.margins, method, len(batch.state))
+    text, _ = c_batch.source(batch.program, batch.limit_distances, method, len(batch.state))
     library, vectorised = c_batch.built(text, tmp_path, "batch", *FLAGS["C SIMD, no fma"])
     assert vectorised > 0
     sets = [

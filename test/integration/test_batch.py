@@ -9,7 +9,7 @@ from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_source import LANES
+from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.ode import ODE
@@ -84,10 +84,10 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
     """SIMD, blocks and slices of time change none: the same operations in the same order."""
     if method is not DOP853:
         batch = Batch(EXAMPLE2, method, profile=True)
-    inside = gamma[8 : 8 + LANES + 5]
+    inside = gamma[8 : 8 + SIMD_WIDTH + 5]
     found = batch.run(inside, (0.0, 0.0, 0.0), step=2e-3, count=60)
     free = ~np.isfinite(found.fault_time)
-    assert free.sum() > LANES
+    assert free.sum() > SIMD_WIDTH
     start, _ = batch.start(inside, (0.0, 0.0, 0.0))
     machine = CompiledMethod(ODE(Dynamics.of(EXAMPLE2), EXAMPLE2.torque), method, compiled=False)
     for n in np.flatnonzero(free):
