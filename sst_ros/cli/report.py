@@ -31,6 +31,9 @@ def add(commands: Commands) -> None:
     accuracy.set_defaults(run=_accuracy)
     stability = kinds.add_parser("stability", help="stiff and extreme cases, largest steps")
     add_out(stability, "folder of the results", "stability_out")
+    stability.add_argument(
+        "--long", action="store_true", help="1e5 s of swinging and a thousand contacts too, minutes"
+    )
     stability.set_defaults(run=_stability)
 
 
@@ -61,4 +64,4 @@ def _stability(options: argparse.Namespace) -> int:
     out = require_free(options.out or Path("stability_out"), "report", force=options.force)
     from sst_ros.studies.stability_report import report
 
-    return 0 if report(out) else 1
+    return 0 if report(out, long=options.long) else 1

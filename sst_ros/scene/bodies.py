@@ -23,6 +23,9 @@ Vector = tuple[float, float, float]
 
 RELATIVE_ROUNDING = 1e-9
 
+SMALLEST_SIDE = 4e-5
+"""Side [rad] of an equilateral base triangle whose volume is lost in RELATIVE_ROUNDING."""
+
 ABOUT_O, ABOUT_CENTRE = "O", "centre_of_mass"
 
 SMALLEST_MOMENT = 1e-18
@@ -87,8 +90,13 @@ class Base(Section):
         if np.any(lengths < 1e-6):
             yield Problem("v", self.v, "no direction may be zero (shorter than 1e-6)")
             return
-        volume = float(np.linalg.det(v / lengths[:, None]))
-        if abs(volume) < RELATIVE_ROUNDING:
+        unit = v / lengths[:, None]
+        volume = float(np.linalg.det(unit))
+        side = float(np.linalg.norm(unit - np.roll(unit, 1, axis=0), axis=1).max())
+        if abs(volume) < RELATIVE_ROUNDING and side < SMALLEST_SIDE:
+            allowed = f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more: triangle too small"
+            yield Problem("v", self.v, allowed)
+        elif abs(volume) < RELATIVE_ROUNDING:
             yield Problem("v", self.v, "P1, P2, P3 must not lie on one great circle (degenerate)")
         elif volume < 0.0:
             allowed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"

@@ -5,9 +5,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from sst_ros.errors import RunStopped
+from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
@@ -34,20 +38,23 @@ def spun(rate: float) -> Scene:
     return replace(base(), initial=initial, **FREE)
 
 
+@lru_cache(maxsize=1)
 def reference() -> Simulation:
     """Run it by DOP853 at the tightest tolerance."""
-    return _ended(spun(2.0), PUSH, 20, 10_000_000)
+    return ended(spun(2.0), PUSH, 20, 10_000_000)
 
 
+@lru_cache(maxsize=1)
 def turned() -> Simulation:
     """Run it without torque."""
-    return _ended(spun(10.0), REST, 10, 4_000_000)
+    return ended(spun(10.0), REST, 10, 4_000_000)
 
 
+@lru_cache(maxsize=1)
 def bounced() -> Simulation:
     """Run the bounce off stops ten times as stiff."""
     scene = bouncing(Stroke(at_end="elastic", stiffness=1e9))
-    return _ended(scene, REST, 30, 10_000_000)
+    return ended(scene, REST, 30, 10_000_000)
 
 
 def bouncing(stroke: Stroke) -> Scene:
@@ -56,7 +63,8 @@ def bouncing(stroke: Stroke) -> Scene:
     return replace(base(), initial=initial, stroke=stroke, workspace=Workspace(at_edge="ignore"))
 
 
-def _ended(scene: Scene, torque: Triple, steps: int, period_ns: int) -> Simulation:
+def ended(scene: Scene, torque: Triple, steps: int, period_ns: int) -> Simulation:
+    """Run a scene by DOP853 at the tightest tolerance."""
     simulation = Simulation(scene, "dop853", tolerance=1e-14, step_budget=WHOLE_MOTION_BUDGET)
     for _ in range(steps):
         simulation.step(torque, period_ns)
@@ -66,7 +74,7 @@ def _ended(scene: Scene, torque: Triple, steps: int, period_ns: int) -> Simulati
 def stop_time(scene: Scene, torque: Triple) -> float:
     """Time at which a run ends [s]."""
     try:
-        _ended(scene, torque, 10_000, 10_000_000)
+        ended(scene, torque, 10_000, 10_000_000)
     except RunStopped as error:
         return error.time
     raise ValueError("the run does not end")
@@ -84,6 +92,17 @@ def energy_drift(simulation: Simulation) -> float:
     drive = (0.0,) * len(dynamics.drive)
     kinetic, potential, _ = dynamics.energies(*state.quaternion, *state.body_rate, *drive)
     return abs(simulation.energy_residual) / (kinetic + potential)
+
+
+def mass_matrix(scene: Scene) -> Array:
+    """Mass matrix in gamma at the start of a scene at rest [kg m^2], from its accelerations."""
+    dt_ns, columns = 1000, []
+    for k in range(3):
+        torque = (float(k == 0), float(k == 1), float(k == 2))
+        simulation = Simulation(scene)
+        simulation.step(torque, dt_ns)
+        columns.append(np.array(simulation.state.joints.gamma_dot) / (1e-9 * dt_ns))
+    return np.asarray(np.linalg.inv(np.stack(columns, axis=1)))
 
 
 def times(inertia: Inertia, scale: float) -> Inertia:

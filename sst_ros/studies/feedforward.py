@@ -40,7 +40,7 @@ from sst_ros.studies.channel import Channel
 from sst_ros.studies.control_loop import ControlLoop, run_loop
 from sst_ros.studies.hold_order import HoldError, UnheldError, held_error, unheld_error
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
-from sst_ros.studies.parallel import evaluate_grid
+from sst_ros.studies.parallel import run_jobs
 from sst_ros.studies.sampled_data import slope
 
 REST_S = 0.3
@@ -178,9 +178,9 @@ def feedforward_study(
         partial(_held, scene, dataclasses.replace(basic, feedforward_at=at), plan.period_ns * n)
         for at in INSTANTS for n in plan.multiples
     ]  # fmt: skip
-    points: list[Callable[[], Any]] = [*limits, *loops, partial(_unheld, scene), *holds]
-    label = f"{scene.name:<16}"
-    found = evaluate_grid(_call, points, workers=workers, label=label, shown=shown)
+    jobs: list[Callable[[], Any]] = [*limits, *loops, partial(_unheld, scene), *holds]
+    progress = f"{scene.name:<16}" if shown else ""
+    found = run_jobs(_call, jobs, progress, workers)
     bounds, found = found[: len(limits)], found[len(limits) :]
     results, found = found[: len(loops)], found[len(loops) :]
     return FeedforwardStudy(
@@ -256,5 +256,5 @@ def _motion(scene: Scene) -> ReferenceMotion:
     return reference_motion(scene, samples)
 
 
-def _call(point: Callable[[], Any]) -> Any:
-    return point()
+def _call(job: Callable[[], Any]) -> Any:
+    return job()

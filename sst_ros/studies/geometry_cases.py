@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -81,21 +81,21 @@ def _parallel() -> Iterator[Case]:
         yield Case(
             f"crossed at {spin:g} rad/s",
             "det J2 changes its sign and the energy stays",
-            lambda a=angle, s=spin: near_singularity(a, s),  # type: ignore[misc]
+            partial(near_singularity, angle, spin),
             REST, 80, round(2e6 / abs(spin)), crossed, 1e-10,
             difficulty="J is infinite on the way; gamma does not tell how the motion goes on",
         )  # fmt: skip
     yield Case(
         "rest 0.1 rad beside one",
         "rest stays rest",
-        lambda: near_singularity(1e-1, 0.0),
+        partial(near_singularity, 1e-1, 0.0),
         REST, 10, 1_000_000, lambda simulation: math.hypot(*simulation.state.body_rate), 1e-12,
         difficulty="a second assembly mode lies close by",
     )  # fmt: skip
     yield Case(
         "rest 0.01 rad beside one",
         "refused by name: gamma has two admissible assemblies there",
-        lambda: near_singularity(1e-2, 0.0),
+        partial(near_singularity, 1e-2, 0.0),
         REST, 1, 1_000_000, refusal="AmbiguousAssembly",
         difficulty="two assembly modes meet at a parallel singularity",
     )  # fmt: skip
@@ -123,7 +123,7 @@ def _edges() -> Iterator[Case]:
         yield Case(
             f"start at beta_1 = {beta:g} rad, inside",
             "rest stays rest, at that beta_1",
-            lambda b=beta: _edge_pose(b),  # type: ignore[misc]
+            partial(_edge_pose, beta),
             REST, 5, 1_000_000,
             lambda simulation, b=beta: abs(simulation.state.joints.beta[0] / b - 1.0),  # type: ignore[misc]
             1e-5, difficulty="det J1 tends to 0 with beta",
@@ -131,7 +131,7 @@ def _edges() -> Iterator[Case]:
         yield Case(
             f"start at beta_1 = {-beta:g} rad, outside",
             "refused by name",
-            lambda b=-beta: _edge_pose(b),  # type: ignore[misc]
+            partial(_edge_pose, -beta),
             REST, 1, 1_000_000, refusal="NoAdmissibleAssembly",
             difficulty="the same pose as inside, to nine digits",
         )  # fmt: skip
@@ -142,9 +142,7 @@ def _edges() -> Iterator[Case]:
         yield Case(
             f"start {abs(off):g} rad {'inside' if inside else 'outside'} the largest beta",
             "rest stays rest" if inside else "refused by name",
-            lambda w=limit: replace(  # type: ignore[misc]
-                extremes.base(), initial=Initial(gamma=POSE), workspace=w
-            ),
+            partial(replace, extremes.base(), initial=Initial(gamma=POSE), workspace=limit),
             REST, 5, 1_000_000,
             (lambda simulation: math.hypot(*simulation.state.body_rate)) if inside else None,
             1e-12 if inside else 0.0, "" if inside else "NoAdmissibleAssembly",
@@ -179,6 +177,22 @@ def _small(spread: float) -> Scene:
     return replace(scene, initial=initial)
 
 
+def _one_short_arc(degrees: float) -> Scene:
+    """Return a base of whose three arcs one is that short; the others are a right angle."""
+    angle = math.radians(degrees)
+    v = ((1.0, 0.0, 0.0), (math.cos(angle), math.sin(angle), 0.0), (0.0, 0.0, 1.0))
+    scene = extremes.free()
+    arcs = [float(a) for a in Geometry.of(replace(scene, base=replace(scene.base, v=v))).arc]
+    a, b, c = (0.5 * arc for arc in arcs)
+    initial = Initial(gamma=(a, b, c), gamma_dot=(0.1 * a, 0.2 * b, -0.1 * c))
+    return replace(scene, base=replace(scene.base, v=v), initial=initial)
+
+
+def _with_star(inertia: Inertia) -> Scene:
+    scene = extremes.spun(2.0)
+    return replace(scene, star=replace(scene.star, inertia=inertia))
+
+
 def _shapes() -> Iterator[Case]:
     for rate in ((1.0, 1.0, 1.0), (1.0, -0.5, 0.25)):
 
@@ -194,7 +208,7 @@ def _shapes() -> Iterator[Case]:
         yield Case(
             f"{at} the Euler pole phi = 0",
             "gamma as with the base in another orientation: without gravity it does not matter",
-            lambda r=rate: _at_the_pole(r),  # type: ignore[misc]
+            partial(_at_the_pole, rate),
             REST, 20, 10_000_000, unturned, 1e-9,
             difficulty="ZYZ angles are not unique there; the state is a quaternion",
         )  # fmt: skip
@@ -202,23 +216,25 @@ def _shapes() -> Iterator[Case]:
         yield Case(
             f"base triangle of {spread:g} rad",
             "energy is constant",
-            lambda s=spread: _small(s),  # type: ignore[misc]
+            partial(_small, spread),
             REST, 20, 10_000_000, extremes.energy_drift, 1e-9,
             difficulty="the axes of the actuators are nearly parallel planes",
         )  # fmt: skip
     yield Case(
-        "base triangle of 1e-06 rad", "refused by name",
-        lambda: _small(1e-6), REST, 1, 1_000_000, refusal="InputError",
+        "base triangle of 1e-06 rad", "refused: triangle too small",
+        partial(_small, 1e-6), REST, 1, 1_000_000, refusal="InputError",
         difficulty="rounding of the corners is a part in 1e10 of it",
+    )  # fmt: skip
+    yield Case(
+        "three arcs of which one is 1 deg", "energy is constant",
+        partial(_one_short_arc, 1.0), REST, 20, 10_000_000, extremes.energy_drift, 1e-9,
+        difficulty="two actuators nearly share an axis",
     )  # fmt: skip
     for needle in (1e-3, 1e-6, 1e-9):
         yield Case(
             f"needle star, inertia ({needle:g}, 1, 1)",
             "energy is constant",
-            lambda n=needle: replace(  # type: ignore[misc]
-                extremes.spun(2.0),
-                star=replace(extremes.base().star, inertia=Inertia(xx=n, yy=1.0, zz=1.0)),
-            ),
+            partial(_with_star, Inertia(xx=needle, yy=1.0, zz=1.0)),
             REST, 20, 10_000_000, extremes.energy_drift, 1e-9,
             difficulty="one principal inertia is next to nothing",
         )  # fmt: skip

@@ -7,22 +7,19 @@ import math
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+
+import numpy as np
 
 from sst_ros.scene.bodies import Inertia, Link
-from sst_ros.scene.loads import (
-    Actuators,
-    Friction,
-    Initial,
-    JointFriction,
-    Stroke,
-    Workspace,
-)
+from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import Case, Triple
+from sst_ros.studies.extreme_cases import Case
+from sst_ros.studies.extreme_scenes import REST, Triple
+from sst_ros.studies.sampled_data import pole
 
-REST = extremes.REST
 QUARTER = math.pi / 4
 
 
@@ -57,7 +54,7 @@ def _friction() -> Iterator[Case]:
         yield Case(
             f"Stribeck friction, smoothing {smoothing:g} rad/s",
             "each joint creeps at smoothing artanh(tau / static), a part in 100 of that path",
-            lambda v=smoothing: stuck(v),  # type: ignore[misc]
+            partial(stuck, smoothing),
             push, 20, 1_000_000, crept, 1e-2,
             difficulty=f"the friction torque changes sign within {smoothing:g} rad/s: rates decay "
             f"at some {5.0 / smoothing:.0e} 1/s",
@@ -70,26 +67,35 @@ def _friction() -> Iterator[Case]:
         yield Case(
             f"actuator lag of {lag:g} s",
             "the motion without lag, its torque late by the lag",
-            lambda a=lag: replace(extremes.spun(2.0), actuators=Actuators(time_constant=a)),  # type: ignore[misc]
+            partial(replace, extremes.spun(2.0), actuators=Actuators(time_constant=lag)),
             extremes.PUSH, 20, 10_000_000, unlagged, max(lag, 1e-8),
             difficulty=f"a decay of {1.0 / lag:.0e} 1/s in the state",
         )  # fmt: skip
 
 
-def _contacts() -> Iterator[Case]:
-    def bounce(stiffness: float, rate: float) -> Scene:
-        initial = Initial(gamma=(QUARTER, QUARTER, QUARTER), gamma_dot=(rate, rate, rate))
-        stroke = Stroke(at_end="elastic", stiffness=stiffness)
-        return replace(extremes.base(), initial=initial, stroke=stroke,
-                       workspace=Workspace(at_edge="ignore"))  # fmt: skip
+SHORT_CONTACT = (
+    "a contact of 6e-5 s is a few steps at a tolerance of 1e-6: the coarse solution meets the stop "
+    "half a step apart, its distance is not yet proportional to the error"
+)
 
+
+def bounce(stiffness: float, rate: float) -> Scene:
+    """Send all three actuators against their stops at once."""
+    initial = Initial(gamma=(QUARTER, QUARTER, QUARTER), gamma_dot=(rate, rate, rate))
+    stroke = Stroke(at_end="elastic", stiffness=stiffness)
+    return replace(extremes.base(), initial=initial, stroke=stroke,
+                   workspace=Workspace(at_edge="ignore"))  # fmt: skip
+
+
+def _contacts() -> Iterator[Case]:
     for stiffness in (1e3, 1e5, 1e9):
         yield Case(
             f"stops of {stiffness:g} N m/rad",
             "energy is constant",
-            lambda k=stiffness: extremes.bouncing(Stroke(at_end="elastic", stiffness=k)),  # type: ignore[misc]
+            partial(extremes.bouncing, Stroke(at_end="elastic", stiffness=stiffness)),
             REST, 30, 10_000_000, extremes.energy_drift, 1e-8,
             difficulty="the torque has a kink; contact takes pi sqrt(m / k)",
+            estimate=SHORT_CONTACT if stiffness > 1e8 else "",
         )  # fmt: skip
 
     def symmetric(simulation: Simulation) -> float:
@@ -99,13 +105,27 @@ def _contacts() -> Iterator[Case]:
 
     yield Case(
         "three simultaneous contacts", "all legs stay alike, energy is constant",
-        lambda: bounce(1e5, 1.0), REST, 100, 10_000_000, symmetric, 1e-8,
+        partial(bounce, 1e5, 1.0), REST, 100, 10_000_000, symmetric, 1e-8,
         difficulty="rounding must not decide the order of contacts",
     )  # fmt: skip
     yield Case(
         "forty contacts in a second", "energy is constant",
-        lambda: bounce(1e4, 20.0), REST, 10, 100_000_000, extremes.energy_drift, 1e-9,
+        partial(bounce, 1e4, 20.0), REST, 10, 100_000_000, extremes.energy_drift, 1e-9,
         difficulty="each contact is located; their errors add up",
+    )  # fmt: skip
+
+    def rubbing() -> Scene:
+        rub = JointFriction(gamma=Friction(coulomb=2.0, smoothing=0.01))
+        return replace(bounce(1e5, 3.0), friction=rub)
+
+    def tight(simulation: Simulation) -> float:
+        return extremes.apart(simulation, extremes.ended(rubbing(), REST, 30, 10_000_000))
+
+    yield Case(
+        "sharp Coulomb friction and three contacts", "the motion at a tolerance of 1e-14",
+        rubbing, REST, 30, 10_000_000, tight, 1e-8,
+        difficulty="friction of 2 N m changes its sign within 0.01 rad/s, at each contact",
+        estimate="friction brings neighbouring motions together; of that the estimate sees less",
     )  # fmt: skip
 
 
@@ -121,6 +141,45 @@ def _like_tight(torque: Callable[[int], Triple], steps: int, period_ns: int) -> 
     return Case(
         "", "the motion at a tolerance of 1e-14", lambda: extremes.spun(0.5), torque, steps,
         period_ns, apart, 1e-9,
+    )  # fmt: skip
+
+
+PD_RATE = 100.0
+"""Bandwidth of the sampled PD control [rad/s]; its damping ratio is 1."""
+
+
+def _sampled_pd(product: float) -> Case:
+    """Return PD control with bandwidth x period = `product` [rad], held over each period.
+
+    Its gains are the mass matrix at the pose times bandwidth^2 and 2 x bandwidth, so that theory is
+    the sampled double integrator: errors grow by `sampled_data.pole` a period.
+    """
+    period_ns = round(product / PD_RATE * 1e9)
+    pose, steps = np.array((0.7, 0.8, 0.75)), 120
+    initial = Initial(gamma=(0.7 + 1e-7, 0.8 - 1e-7, 0.75 + 2e-7))
+    scene = replace(extremes.free(), initial=initial)
+    inertia = extremes.mass_matrix(scene)
+    sizes: list[float] = []
+
+    def torque(k: int, simulation: Simulation) -> Triple:
+        joints = simulation.state.joints
+        off, rate = joints.gamma - pose, np.array(joints.gamma_dot)
+        if k == 0:
+            sizes.clear()
+        sizes.append(math.hypot(*off, *(rate / PD_RATE)))
+        first, second, third = (-inertia @ (PD_RATE**2 * off + 2.0 * PD_RATE * rate)).tolist()
+        return (first, second, third)
+
+    def grown(_: Simulation) -> float:
+        half = len(sizes) // 2
+        found: float = (sizes[-1] / sizes[-1 - half]) ** (1.0 / half)
+        return abs(found - pole(product, 1.0, 0))
+
+    return Case(
+        f"sampled PD control at {product:g} of the limit of its bandwidth",
+        f"errors grow by {pole(product, 1.0, 0):.4f} a period, the pole of the sampled loop",
+        lambda: scene, torque, steps, period_ns, grown, 1e-3, feedback=True,
+        difficulty="a step more of delay or a gain 1 % higher turns decay into growth",
     )  # fmt: skip
 
 
@@ -143,6 +202,7 @@ def _jumps() -> Iterator[Case]:
         _like_tight(square, 60, 5_000_000), name="square wave of 2 N m",
         difficulty="jumps of twice the amplitude",
     )  # fmt: skip
+    yield from map(_sampled_pd, (0.98, 1.02))
     for period_ns in (333_333, 7_919_317):
         yield replace(
             _like_tight(lambda _: extremes.PUSH, 37, period_ns),
@@ -161,7 +221,7 @@ def _ratios() -> Iterator[Case]:
         yield Case(
             f"star x {star:g} with links x {links:g}",
             "energy is constant",
-            lambda a=star, b=links: far(a, b),  # type: ignore[misc]
+            partial(far, star, links),
             REST, 10, 10_000_000, extremes.energy_drift, 1e-8,
             difficulty="inertias 1e18 apart in one mass matrix",
         )  # fmt: skip
@@ -182,9 +242,24 @@ def _ratios() -> Iterator[Case]:
 
 
 def _long() -> Iterator[Case]:
+    def residual(simulation: Simulation) -> float:
+        return max(abs(simulation.energy_residual), simulation.closure_residual)
+
+    swing = partial(load, "swing")
     yield Case(
-        "100 s of swinging under gravity", "energy is constant",
-        lambda: load("swing"), REST, 1000, 100_000_000,
-        lambda simulation: abs(simulation.energy_residual), 1e-5,
+        "20 s of swinging under gravity", "energy is constant [J]",
+        swing, REST, 200, 100_000_000, residual, 1e-9,
         difficulty="errors grow with time; the quaternion must keep its length",
+    )  # fmt: skip
+    for method, bound in (("dop853", 1e-10), ("rk4", 1e-3)):
+        yield Case(
+            f"1e5 s of swinging, {method}, steps of 10 ms", "energy is constant [J], of 1.14 J",
+            swing, REST, 10_000_000, 10_000_000, residual, bound, integrator=method,
+            difficulty="ten million steps: rounding adds up, truncation of RK4 drifts",
+            compiled_only=True,
+        )  # fmt: skip
+    yield Case(
+        "a thousand contacts", "energy is constant", partial(bounce, 1e4, 20.0), REST, 250,
+        100_000_000, extremes.energy_drift, 1e-7, compiled_only=True,
+        difficulty="each contact is located; their errors add up",
     )  # fmt: skip

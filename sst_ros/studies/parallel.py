@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points of a grid evaluated in parallel, one process for each core, in the order given."""
+"""Independent jobs in parallel, one process for each core; results in the order of the jobs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from sst_ros.progress import slices
 
-Point = TypeVar("Point")
+Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
@@ -24,36 +24,33 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
-def evaluate_grid(
-    function: Callable[[Point], Result],
-    points: Sequence[Point],
-    *,
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    progress: str = "",
     workers: int | None = None,
-    label: str = "",
-    shown: bool = False,
 ) -> list[Result]:
-    """Call a function of a module for each point of a grid.
+    """Call a function of a module for each job.
 
-    A result may depend on its point only, never on the process that computes it: then all bits
-    are the same for any number of workers.
+    A result may depend on its job only, never on the process that computes it: then all bits are
+    the same for any number of workers.
 
     Args:
         function: what to call; each process imports it by its name.
-        points: its arguments.
+        jobs: its arguments.
+        progress: label of a progress bar on the terminal; empty for none.
         workers: processes; None for one a core, 1 for this process alone.
-        label: label of the progress bar.
-        shown: draw a progress bar on a terminal.
 
     """
-    workers = min(workers or cores(), len(points))
-    parts = slices(len(points), 1, label, shown)
+    workers = min(workers or cores(), len(jobs))
+    parts = slices(len(jobs), 1, progress, bool(progress))
     if workers <= 1:
-        return [function(points[part.start]) for part in parts]
+        return [function(jobs[part.start]) for part in parts]
     # Forked processes would share locks of threads that they do not have.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _end_with_the_parent) as executor:
         try:
-            results = executor.map(function, points)
+            results = executor.map(function, jobs)
             return [next(results) for _ in parts]
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)

@@ -10,14 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import Case
+from sst_ros.studies.extreme_scenes import REST, Triple
 
-REST = extremes.REST
+RIGHT = math.pi / 2
+MS = 1_000_000
 
 
 def scaling_cases() -> Iterator[Case]:
@@ -33,115 +36,78 @@ def scaling_cases() -> Iterator[Case]:
             yield replace(case, group=group, difficulty=case.difficulty or difficulty)
 
 
+def pushed(scale: float) -> Triple:
+    """Return the torques of the reference motion times `scale` [N m]."""
+    a, b, c = extremes.PUSH
+    return (a * scale, b * scale, c * scale)
+
+
+def from_reference(simulation: Simulation) -> float:
+    """Angle from the end of the reference motion [rad]."""
+    return extremes.apart(simulation, extremes.reference())
+
+
 def _scaled_times() -> Iterator[Case]:
     for scale in (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4):
         yield Case(
             f"time x {scale:g}",
             "the end of the same motion at its own speed, by the scaling law",
-            lambda s=scale: extremes.spun(2.0 / s),  # type: ignore[misc]
-            (extremes.PUSH[0] / scale**2, extremes.PUSH[1] / scale**2, extremes.PUSH[2] / scale**2),
-            20,
-            round(10_000_000 * scale),
-            lambda simulation: extremes.apart(simulation, extremes.reference()),
-            1e-9,
-        )
+            partial(extremes.spun, 2.0 / scale), pushed(scale**-2), 20, round(10 * MS * scale),
+            from_reference, 1e-9,
+        )  # fmt: skip
 
 
 def _scaled_inertias() -> Iterator[Case]:
     for scale in (1e-12, 1e-6, 1e6, 1e9):
         yield Case(
-            f"inertia x {scale:g}",
-            "the same motion, under torques scaled alike",
-            lambda a=scale: extremes.heavier(a),  # type: ignore[misc]
-            (extremes.PUSH[0] * scale, extremes.PUSH[1] * scale, extremes.PUSH[2] * scale),
-            20,
-            10_000_000,
-            lambda simulation: extremes.apart(simulation, extremes.reference()),
-            1e-12,
-        )
+            f"inertia x {scale:g}", "the same motion, under torques scaled alike",
+            partial(extremes.heavier, scale), pushed(scale), 20, 10 * MS, from_reference, 1e-12,
+        )  # fmt: skip
     for scale in (1e-9, 1e9):
         yield Case(
-            f"star's inertia x {scale:g} beside the same links",
-            "energy is kept",
-            lambda a=scale: extremes.odd_star(a),  # type: ignore[misc]
-            REST,
-            10,
-            10_000_000,
-            extremes.energy_drift,
-            1e-9,
-        )
+            f"star's inertia x {scale:g} beside the same links", "energy is kept",
+            partial(extremes.odd_star, scale), REST, 10, 10 * MS, extremes.energy_drift, 1e-9,
+        )  # fmt: skip
 
 
 def _violent() -> Iterator[Case]:
-    push = (1e8, 0.0, 0.0)
-    expected = "the same end, sqrt(1e8) times sooner than under 1 N m"
-    yield Case(
-        "torque of 1e8 N m against an end of the stroke",
-        expected,
-        extremes.base,
-        push,
-        10,
-        100_000,
-        refusal="StrokeExceeded",
-        stop_time=lambda: extremes.stop_time(extremes.base(), (1.0, 0.0, 0.0)) * 1e-4,
-    )
-    yield Case(
-        "torque of 1e8 N m into a serial singularity",
-        expected,
-        extremes.free,
-        push,
-        10,
-        100_000,
-        refusal="SingularityReached",
-        stop_time=lambda: (
-            extremes.stop_time(replace(extremes.base(), **extremes.FREE), (1.0, 0.0, 0.0)) * 1e-4
-        ),
-    )
+    for name, scene, refusal in (
+        ("against an end of the stroke", extremes.base, "StrokeExceeded"),
+        ("into a serial singularity", extremes.free, "SingularityReached"),
+    ):
+        yield Case(
+            f"torque of 1e8 N m {name}", "the same end, sqrt(1e8) times sooner than under 1 N m",
+            scene, (1e8, 0.0, 0.0), 10, 100_000, refusal=refusal,
+            stop_time=lambda s=scene: 1e-4 * extremes.stop_time(s(), (1.0, 0.0, 0.0)),  # type: ignore[misc]
+        )  # fmt: skip
     for rate in (1e4, 1e6):
         yield Case(
-            f"spin of {rate:g} rad/s",
-            "without torque the path does not depend on the rate",
-            lambda v=rate: extremes.spun(v),  # type: ignore[misc]
-            REST,
-            10,
-            round(0.4e8 / rate),
-            lambda simulation: extremes.apart(simulation, extremes.turned()),
-            1e-7,
-        )
+            f"spin of {rate:g} rad/s", "without torque the path does not depend on the rate",
+            partial(extremes.spun, rate), REST, 10, round(0.4e8 / rate),
+            lambda simulation: extremes.apart(simulation, extremes.turned()), 1e-7,
+        )  # fmt: skip
 
 
 def _starts() -> Iterator[Case]:
-    right = math.pi / 2
-    for gamma in (REST, (0.0, 0.5, 0.5), (right, right, right), (0.7, 0.7, 0.0)):
+    def at(gamma: Triple) -> Scene:
+        return replace(extremes.base(), initial=Initial(gamma=gamma))
+
+    for gamma in (REST, (0.0, 0.5, 0.5), (RIGHT, RIGHT, RIGHT), (0.7, 0.7, 0.0)):
         yield Case(
             f"start at a corner of the strokes, {gamma[0]:.3g} {gamma[1]:.3g} {gamma[2]:.3g}",
-            "rest stays rest",
-            lambda g=gamma: replace(extremes.base(), initial=Initial(gamma=g)),  # type: ignore[misc]
-            REST,
-            10,
-            1_000_000,
+            "rest stays rest", partial(at, gamma), REST, 10, MS,
             lambda simulation, g=gamma: math.dist(simulation.state.joints.gamma, g),  # type: ignore[misc]
             1e-12,
-        )
+        )  # fmt: skip
     yield Case(
-        "pushed outwards at an end of the stroke",
-        "the run ends where it starts",
-        lambda: replace(extremes.base(), initial=Initial(gamma=(0.0, 0.5, 0.5))),
-        (-1.0, 0.0, 0.0),
-        1,
-        1_000_000,
-        refusal="StrokeExceeded",
+        "pushed outwards at an end of the stroke", "the run ends where it starts",
+        partial(at, (0.0, 0.5, 0.5)), (-1.0, 0.0, 0.0), 1, MS, refusal="StrokeExceeded",
         stop_time=lambda: 0.0,
-    )
+    )  # fmt: skip
     yield Case(
-        "start at a corner that cannot be assembled",
-        "refused by name",
-        lambda: replace(extremes.base(), initial=Initial(gamma=(0.0, right, 0.7))),
-        REST,
-        1,
-        1_000_000,
-        refusal="NoAdmissibleAssembly",
-    )
+        "start at a corner that cannot be assembled", "refused by name",
+        partial(at, (0.0, RIGHT, 0.7)), REST, 1, MS, refusal="NoAdmissibleAssembly",
+    )  # fmt: skip
 
 
 def _stiff() -> Iterator[Case]:
@@ -164,31 +130,18 @@ def _stiff() -> Iterator[Case]:
     yield Case(
         "viscous friction of 1e5 N m s/rad",
         "springs creep: angles decay by exp(-k t / c), inertia counts by M k / c^2 = 1e-8 of it",
-        lambda: sprung(500.0, 1e5),
-        REST,
-        10,
-        100_000_000,
-        creeping,
-        1e-8,
-    )
+        partial(sprung, 500.0, 1e5), REST, 10, 100 * MS, creeping, 1e-8,
+    )  # fmt: skip
     for damping in (1e3, 1e4):
         yield Case(
             f"PD gains of 1e6 N m/rad and {damping:g} N m s/rad",
             "at its set point after more than 25 time constants",
-            lambda d=damping: sprung(1e6, d),  # type: ignore[misc]
-            REST,
-            3,
-            100_000_000,
-            lambda simulation: math.dist(simulation.state.joints.gamma, rests),
-            1e-10,
-        )
+            partial(sprung, 1e6, damping), REST, 3, 100 * MS,
+            lambda simulation: math.dist(simulation.state.joints.gamma, rests), 1e-10,
+        )  # fmt: skip
     yield Case(
         "elastic stops of 1e8 N m/rad",
         "as at 1e9 N m/rad, but for the contact of pi sqrt(m / k) = 2e-4 s; energy kept",
-        lambda: extremes.bouncing(Stroke(at_end="elastic", stiffness=1e8)),
-        REST,
-        30,
-        10_000_000,
-        extremes.from_stiffer_bounce,
-        1e-6,
-    )
+        partial(extremes.bouncing, Stroke(at_end="elastic", stiffness=1e8)), REST, 30, 10 * MS,
+        extremes.from_stiffer_bounce, 1e-6,
+    )  # fmt: skip

@@ -29,7 +29,7 @@ from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.parallel import evaluate_grid
+from sst_ros.studies.parallel import run_jobs
 from sst_ros.studies.step_advice import step_advice
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
@@ -154,20 +154,19 @@ def bisect_step(stable: Callable[[float], bool]) -> float:
     return math.exp(low)
 
 
-def largest_steps(*, workers: int | None = None, shown: bool = False) -> list[LargestStep]:
+def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:
     """Find the largest stable step of every method in both families."""
-    points = [
-        (family, name, coefficient)
+    jobs = [
+        (family, method, coefficient)
         for family, (_, coefficients) in FAMILIES.items()
         for coefficient in coefficients
-        for name in METHODS
+        for method in METHODS.values()
     ]
-    return evaluate_grid(_point, points, workers=workers, label="largest steps   ", shown=shown)
+    return run_jobs(_largest_step, jobs, progress, workers)
 
 
-def _point(point: tuple[str, str, float]) -> LargestStep:
-    family, name, coefficient = point
-    return largest_step(family, METHODS[name], coefficient)
+def _largest_step(job: tuple[str, Method, float]) -> LargestStep:
+    return largest_step(*job)
 
 
 def scene_points() -> dict[str, NDArray[np.complex128]]:

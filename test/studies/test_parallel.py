@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sst_ros.studies.parallel import evaluate_grid
+from sst_ros.studies.parallel import run_jobs
 
 ASKING = "from studies.test_parallel import waiting; waiting()"
 
@@ -21,11 +21,11 @@ def slow(number):
 
 
 def waiting():
-    evaluate_grid(slow, [1, 2], workers=2)
+    run_jobs(slow, [1, 2], workers=2)
 
 
 def test_results_come_in_the_order_of_the_points():
-    assert evaluate_grid(abs, [-3, 2, -1, 0], workers=2) == [3, 2, 1, 0]
+    assert run_jobs(abs, [-3, 2, -1, 0], workers=2) == [3, 2, 1, 0]
 
 
 def test_no_worker_outlives_a_parent_that_is_killed():

@@ -11,7 +11,6 @@ from matplotlib import image
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
 from sst_ros.plot.style import save_figure
-from sst_ros.studies import case_catalogue
 from sst_ros.studies.extreme_cases import evaluate_case
 from sst_ros.studies.results import table
 from sst_ros.studies.stability_limits import (
@@ -24,9 +23,9 @@ from sst_ros.studies.stability_limits import (
     regions,
     stability_function,
 )
-from sst_ros.studies.stability_report import limits_of_theory, lines, page
+from sst_ros.studies.stability_report import catalogue, limits_of_theory, lines, page
 
-CASES = list(case_catalogue.cases())
+CASES = catalogue()
 
 
 def test_a_bound_is_found_to_one_per_cent():
@@ -98,6 +97,8 @@ def test_right_and_wrong_results_are_distinguished():
     steps = [LargestStep(family, "rk4", 1.0, 100.0, 0.02) for family in ("decay", "oscillation")]
     text = "\n".join(lines([good, bad], steps))
     assert "2 cases, 1 failed" in text and "FAILED" in text and "20 (2.00)" in text
+    off = dataclasses.replace(good, same_bits=False)
+    assert "**differ**" in page([off], steps) and not off.passed
     assert "**FAILED**" in page([good, bad], steps)
     assert "rodas4: A-stable and L-stable" in "\n".join(limits_of_theory())
 
