@@ -19,8 +19,10 @@ demo: $(VENV)/.demo  ## run the paper's examples through the nodes; results in d
 demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results in demo_out/feedforward
 	$(RUN) -m sst_ros demo feedforward --force
 
-docs: $(VENV)/.docs  ## build the documentation into site
-	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs site
+docs: $(VENV)/.docs  ## build the documentation into site, in a folder named after the version
+	@site=site/$$($(RUN) -c 'print(__import__("sst_ros").__version__)') && \
+	  $(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs $$site && \
+	  echo "open file://$(CURDIR)/$$site/index.html"
 
 view: $(VENV)/.view  ## show a simulation in the browser
 	@$(RUN) -m sst_ros view --scene swing --open
@@ -45,6 +47,7 @@ lint: $(VENV)/.test  ## check style and types
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/codespell
 
 format: $(VENV)/.test  ## format the source
 	$(VENV)/bin/ruff check --fix .

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded run as a pandas DataFrame: angles, rates and torques by time.
+"""
+Recording to pandas
+===================
 
-python examples/bag_to_pandas.py BAG
+A recorded run (MCAP or sqlite3 bag) as a pandas DataFrame: angles, rates and torques over time::
+
+    python examples/bag_to_pandas.py BAG
 """
 
 import sys
 
-import pandas as pd
+from sst_ros import read_bag
 
-from sst_ros.recording import recording
-
-run = recording.read(sys.argv[1])
-columns = {"time": run.seconds}
-for name, values in (("gamma", run.gamma), ("gamma_dot", run.gamma_dot), ("tau", run.effort)):
-    columns |= {f"{name}_{k + 1}": values[:, k] for k in range(3)}
-table = pd.DataFrame(columns).set_index("time")
-print(table.describe().loc[["min", "max"]].T)
+table = read_bag(sys.argv[1]).trajectory.to_pandas().set_index("t")
+columns = [f"{name}_{k}" for name in ("gamma", "gamma_dot", "torque") for k in (1, 2, 3)]
+print(table[columns].describe().loc[["min", "max"]].T)

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold three actuators at angles: a controller of your own in thirty lines."""
+"""
+Own controller as a ROS 2 node, free running and in lockstep
+============================================================
+
+A PD controller that holds three angles. The tutorial *Your own controller in 30 lines* runs it.
+"""
 
 import rclpy
 from rclpy.executors import ExternalShutdownException

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo of a batch: 2000 manipulators with uncertain stars, and how many leave the stroke.
-
-python examples/monte_carlo.py [monte_carlo.png]
 """
+Monte Carlo: uncertain inertia
+==============================
 
-import sys
+2000 manipulators with uncertain stars in one batch: how many leave the stroke?
+"""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -20,7 +20,9 @@ batch = Batch(scene, profile=True, parameters=inertia)
 runs = batch.run(scene.initial.gamma, scene.initial.gamma_dot, step=1e-3, count=1000)
 left = np.char.startswith(runs.message, "gamma")
 print(f"{left.mean():.1%} leave the stroke")
-plt.hist([spread[~left], spread[left]], 40, stacked=True, label=["stay", "leave the stroke"])
-plt.xlabel("inertia of the star over its nominal value")
-plt.legend()
-plt.savefig(sys.argv[1] if len(sys.argv) > 1 else "monte_carlo.png")
+
+figure, axes = plt.subplots(figsize=(6.5, 4.0), layout="constrained")
+axes.hist([spread[~left], spread[left]], 40, stacked=True, label=["stay", "leave the stroke"])
+axes.set(xlabel="inertia of the star / nominal value", ylabel="manipulators")
+axes.legend()
+figure.savefig("monte_carlo.png")

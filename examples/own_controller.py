@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Your own controller without ROS: a function of time and state, sampled and held at 500 Hz.
-
-python examples/own_controller.py [own_controller.png]
 """
+Own controller without ROS: PD with gravity compensation
+========================================================
 
-import sys
+A function of time and state, sampled and held at 500 Hz (zero-order hold), as a digital controller.
+As a ROS 2 node, free running or in lockstep, it is ``controller.py``.
+"""
 
 import numpy as np
 
@@ -26,4 +27,6 @@ def gravity_pd(t: float, state: State) -> np.ndarray:
 
 motion = simulate(scene, gravity_pd, duration=3.0, control_period=0.002)
 print("error at the end [rad]", GOAL - motion.gamma[-1])
-motion.plot().savefig(sys.argv[1] if len(sys.argv) > 1 else "own_controller.png")
+
+figure = motion.plot()
+figure.savefig("own_controller.png")

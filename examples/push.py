@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish torques: a push on the first actuator, to and fro, ten times a second.
+"""
+Publish torques as a ROS 2 node
+===============================
+
+A square wave of torque on the first actuator, ten commands a second. A simulator must be running::
 
     python examples/push.py
 
-A simulator must be running; without a new command it lets go after half a second.
+Without a new command for half a second the simulator applies zero torque.
 """
 
 import itertools

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the workspace of the paper's manipulator and of a general one.
-
-    python examples/workspace.py [workspace.png]
+"""
+Workspace of a design
+=====================
 
 Where can E be, how far can the star turn there, how well do the actuators hold it, and how far
 is the nearest limit? Singular poses are printed, and marked in the picture.
 """
-
-import sys
 
 import numpy as np
 
@@ -22,15 +20,9 @@ MANIPULATORS = {
     ),
 }
 
+charts = [workspace(geometry, progress=True) for geometry in MANIPULATORS.values()]
+for (title, geometry), chart in zip(MANIPULATORS.items(), charts, strict=True):
+    print(f"{title}\n{singularities.report(geometry, chart)}\n")
 
-def main(path: str) -> None:
-    """Map, report, draw."""
-    charts = [workspace(geometry, progress=True) for geometry in MANIPULATORS.values()]
-    for (title, geometry), chart in zip(MANIPULATORS.items(), charts, strict=True):
-        print(f"{title}\n{singularities.report(geometry, chart)}\n")
-    plot_workspace(*charts, titles=list(MANIPULATORS)).savefig(path, dpi=110)
-    print(f"drew {path}")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "workspace.png")
+figure = plot_workspace(*charts, titles=list(MANIPULATORS))
+figure.savefig("workspace.png", dpi=110)

@@ -148,7 +148,7 @@ def compiled(program: Program) -> Function:
 def compiled_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element."""
     names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
-    names["atan2"] = np.arctan2
+    names |= {"atan2": np.arctan2, "max": np.maximum}
     exec(program.source("function"), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function

@@ -17,6 +17,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sst_ros.mechanism import singularities
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -109,15 +110,23 @@ def _panel(
     x, y = view.flat(chart.s)
     axes.tripcolor(Triangulation(x, y, faces), np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
     mesh = Triangulation(x, y, faces)
-    mesh.set_mask(np.isnan(values[faces]).any(axis=1))
-    if not np.all(mesh.mask):
+    known = np.isfinite(values)
+    if known.any():
         scale = LogNorm if limits[1] else Normalize
         norm = scale(limits[0], limits[1] or np.nanmax(values))
+        # Values go on past the edge of the workspace, and the picture is cut there.
+        nearest = cKDTree(chart.s[known]).query(chart.s)[1]
+        whole = np.where(known, values, values[known][nearest])
+        edge = axes.tricontourf(
+            mesh, chart.measures.margin.max(axis=1), levels=[0.0, np.pi], alpha=0.0
+        )
         filled = axes.tripcolor(
-            mesh, np.nan_to_num(values, nan=1.0), cmap=colours, shading="gouraud",
-            norm=norm, rasterized=True,
-        )  # fmt: skip
-        _contours(axes, mesh, values, limits)
+            mesh, whole, cmap=colours, shading="gouraud", norm=norm, rasterized=True
+        )
+        lines = _contours(axes, mesh, whole, limits)
+        if not known.all():
+            for part in (filled, *lines):
+                part.set_clip_path(edge.get_paths()[0], axes.transData)
         above = limits[1] is not None and np.nanmax(values) > limits[1]
         bar = axes.figure.colorbar(
             filled, ax=axes, shrink=0.72, pad=0.02, extend="max" if above else "neither"
@@ -143,16 +152,15 @@ def _panel(
 
 def _contours(
     axes: Axes, mesh: Triangulation, values: Array, limits: tuple[float, float | None]
-) -> None:
+) -> list[Any]:
     top = limits[1] or float(np.nanmax(values))
     step = 5 if top < 45 else 10 if top < 75 else 20
     levels = [1.1, 1.2, 1.5, 2.0, 3.0, 5.0] if limits[1] else list(range(step, 360, step))
     inside = [lv for lv in levels if np.nanmin(values) < lv < np.nanmax(values)]
-    if inside:
-        lines = axes.tricontour(
-            mesh, np.nan_to_num(values), levels=inside, colors="white", linewidths=0.8
-        )
-        axes.clabel(lines, fontsize=7.5, fmt="%g" if limits[1] else "%g°")
+    if not inside:
+        return []
+    lines = axes.tricontour(mesh, values, levels=inside, colors="white", linewidths=0.8)
+    return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if limits[1] else "%g°")]
 
 
 def frame(axes: Axes, view: View) -> None:

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The examples, run as a reader runs them; those that are nodes are in test/ros."""
 
-import subprocess
+import json
+import runpy
+import shutil
 import sys
+import warnings
+from pathlib import Path
 
 import bags
 import numpy as np
@@ -16,43 +20,78 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import read
 
 EXAMPLES = ROOT / "examples"
+NOTEBOOK = ROOT / "docs" / "tutorial" / "first_steps.ipynb"
 
 
-PICTURES = {
-    "own_scene": "largest angles [rad]",
-    "own_controller": "error at the end [rad]",
-    "monte_carlo": "% leave the stroke",
-    "workspace": "drew ",
-}
+NODES = ("controller", "push")
+PICTURES = [
+    path.stem
+    for path in sorted(EXAMPLES.glob("*.py"))
+    if path.stem not in (*NODES, "bag_to_pandas")
+]
 
 
-def run(name, *words):
-    """What an example prints."""
-    command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *map(str, words)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=110)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run a script as `__main__` in a copy of the folder, every warning an error."""
+    pyplot = pytest.importorskip("matplotlib.pyplot", reason="pictures need matplotlib")
+    pyplot.switch_backend("agg")
+    shutil.copytree(EXAMPLES, tmp_path / "examples")
+    monkeypatch.chdir(tmp_path / "examples")
+
+    def found(name, *words):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return runpy.run_path(f"{name}.py", run_name="__main__")
+
+    yield found
+    pyplot.close("all")
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_an_example_draws_its_picture(name, tmp_path):
-    if name == "monte_carlo":
+def test_an_example_draws_its_picture(name, run):
+    if "Batch" in (EXAMPLES / f"{name}.py").read_text():
         pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
-    picture = tmp_path / "picture.png"
-    printed = run(name, picture)
-    assert PICTURES[name] in printed
-    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
-    if name == "own_controller":
-        errors = printed.partition("[rad]")[2].strip(" []\n").split()
-        assert np.abs(np.array(errors, dtype=float)).max() < 1e-3
+    names = run(name)
+    drawn = Path(f"{name}.png").read_bytes()
+    assert drawn.startswith(b"\x89PNG") and len(drawn) > 10_000
+    if name in CHECKS:
+        assert CHECKS[name](names)
 
 
-def test_a_recording_as_a_table(tmp_path):
+CHECKS = {
+    "own_controller": lambda found: np.abs(found["GOAL"] - found["motion"].gamma[-1]).max() < 1e-3,
+    "monte_carlo": lambda found: 0 < found["left"].sum() < len(found["runs"]),
+    "energy": lambda found: np.ptp(found["motion"].energy) < 1e-12,
+    "inverse_dynamics": lambda found: np.abs(found["torque"].T - found["applied"]).max() < 1e-4,
+    "work_precision": lambda found: min(found["errors"]) < 1e-6,
+    "zero_order_hold": lambda found: found["order"] == pytest.approx(2.0, abs=0.1),
+}
+"""What an example shows, by its names."""
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    """Its cells one after the other in one namespace, as in a kernel."""
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
+            assert cell["outputs"] or "assert" in "".join(cell["source"]), (
+                "python -m tools.notebook"
+            )
+    assert names["stopped"].status == 1
+    assert np.abs(names["held"].gamma[-1] - names["goal"]).max() < 1e-6
+
+
+def test_a_recording_as_a_table(run, tmp_path):
     bag = bags.write(tmp_path / "bag", bags.simulated(load_scene("example2"), 0.1))
-    shown = run("bag_to_pandas", bag)
-    assert [line.split()[0] for line in shown.splitlines()[1:]] == [
-        f"{name}_{k}" for name in ("gamma", "gamma_dot", "tau") for k in (1, 2, 3)
-    ]
+    names = run("bag_to_pandas", bag)
+    assert len(names["table"]) == 51
+    assert names["table"]["gamma_1"].iloc[0] == pytest.approx(np.pi / 4)
 
 
 def test_the_examples_geometry_stays_inside_for_its_whole_run():

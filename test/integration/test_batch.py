@@ -174,7 +174,10 @@ LAGGING = {
 }
 
 
-@pytest.mark.parametrize("changes", [{}, LAGGING])
+ELASTIC = {"stroke.at_end": "elastic", "stroke.stiffness": 100.0}
+
+
+@pytest.mark.parametrize("changes", [{}, LAGGING, ELASTIC])
 def test_the_result_has_the_quantities_of_simulate(changes):
     """Scenario by scenario, with another inertia and amplitude in each."""
     scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
