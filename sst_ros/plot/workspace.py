@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
+from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -25,6 +25,9 @@ from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
 
 WORST_COND = 10.0
 """cond J from which on the colour stays the same."""
+
+LABEL_INSET = math.radians(5.0)
+"""Distance from a side of the triangle below which a contour has no label."""
 
 _INK, _PALE, _ALARM = "#222222", "#ececec", "#d1182b"
 
@@ -124,6 +127,9 @@ def _panel(
             mesh, whole, cmap=colours, shading="gouraud", norm=norm, rasterized=True
         )
         lines = _contours(axes, mesh, whole, limits)
+        inset = LinearTriInterpolator(mesh, np.arcsin((chart.s @ chart.geometry.w.T).min(axis=1)))
+        for label in lines[1:]:
+            label.set_visible(bool(inset(*label.get_position()).filled(0.0) > LABEL_INSET))
         if not known.all():
             for part in (filled, *lines):
                 part.set_clip_path(edge.get_paths()[0], axes.transData)
