@@ -25,4 +25,4 @@ for (name, motion), style in zip(motions.items(), ("-", "--"), strict=True):
         axes[k].set_xlabel(f"γ{'₁₂₃'[k]} [deg]")
 axes[0].set_ylabel("rate [rad/s]")
 axes[0].legend(fontsize=8)
-figure.savefig("stick_slip.png")
+figure.savefig("friction.png")
