@@ -261,6 +261,7 @@ def test_every_command_names_itself(capsys):
 
 def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
     words = ["simulate", "example2", "--duration", "0.05", "--out", "run.parquet", "--plot"]
     assert main(words) == 0
     assert "example2: reached the end\n" in capsys.readouterr().out

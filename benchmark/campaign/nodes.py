@@ -3,172 +3,41 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import math
 import os
 import random
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from benchmark.campaign.ledger import Budget, Ledger
-from sst_ros import child_process
+from benchmark.campaign.processes import (
+    FAULT_S,
+    NODE,
+    REPLY_S,
+    Client,
+    domain,
+    ended,
+    is_alive,
+    running,
+    start,
+    stop,
+)
+from benchmark.campaign.scenes import needle
 
-REPLY_S = 0.5
-"""A node answers every service within this time."""
-CLOSE_S = 2.0
-"""A node ends within this time of a signal."""
-NODE = "/sst_simulator"
-
-
-@contextmanager
-def domain() -> Iterator[int]:
-    """Give the processes that are started inside a ROS domain of their own, on localhost."""
-    before = dict(os.environ)
-    with contextlib.ExitStack() as stack:
-        number = _lock(stack)
-        os.environ.update(
-            ROS_DOMAIN_ID=str(number), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", SST_ROS_NUMBA="0"
-        )
-        try:
-            yield number
-        finally:
-            os.environ.clear()
-            os.environ.update(before)
-
-
-def _lock(stack: contextlib.ExitStack) -> int:
-    """Take a domain that no other part and no test on this machine has."""
-    for number in range(1, 101):
-        lock = (Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}").open("w")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
-        stack.callback(lock.close)
-        return number
-    raise RuntimeError("no ROS domain is free")
-
-
-def start(command: str, **given: object) -> subprocess.Popen[str]:
-    """Start a node with parameters."""
-    words = ["--ros-args", *child_process.words(given)] if given else []
-    return subprocess.Popen(
-        [sys.executable, "-m", "sst_ros", command, *words],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        pipesize=1 << 20,  # nobody reads before the end, and a full pipe stops the node
-    )  # fmt: skip
-
-
-def ended(process: subprocess.Popen[str], number: int, timeout: float = 20.0) -> tuple[int, str]:
-    """Send a signal, wait for the end; return the exit status and all that was printed."""
-    if process.poll() is None:
-        process.send_signal(number)
-    try:
-        out, _ = process.communicate(timeout=timeout)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        out, _ = process.communicate()
-        return 255, out or ""
-    except ValueError:  # its output has been read and closed already
-        return process.wait(), ""
-    return process.returncode, out or ""
-
-
-class Client:
-    """A node of this process that publishes, calls and listens."""
-
-    def __init__(self, number: int) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.qos import QoSProfile
-
-        # Replies to all clients of a service arrive at each: ten, the default, displace its own.
-        self.qos = QoSProfile(depth=1000)
-        self.rclpy, self.context = rclpy, rclpy.Context()
-        rclpy.init(context=self.context, domain_id=number)
-        self.node = rclpy.create_node("campaign", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-
-    def until(self, condition: Callable[[], Any], timeout: float = 20.0) -> bool:
-        """Spin until a condition holds; False after the time-out."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self.executor.spin_once(timeout_sec=0.02)
-        return True
-
-    def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> tuple[Any, float]:
-        """Call a service; return the reply, or None, and how long it took [s]."""
-        client = self.node.create_client(kind, name, qos_profile=self.qos)
-        try:
-            if not self.until(client.service_is_ready):
-                return None, math.inf
-            future, began = client.call_async(kind.Request(**fields)), time.monotonic()
-            done = self.until(future.done, timeout)
-            return (future.result() if done else None), time.monotonic() - began
-        finally:
-            self.node.destroy_client(client)
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.rclpy.try_shutdown(context=self.context)
-
-
-@contextmanager
-def running(**given: object) -> Iterator[tuple[subprocess.Popen[str], Client]]:
-    """Give a running simulator and a client of it."""
-    with domain() as number:
-        process = start("simulator", scene="swing", duration=0.0, **given)
-        client = Client(number)
-        try:
-            yield process, client
-        finally:
-            client.close()
-            ended(process, signal.SIGKILL)
-
-
-def _alive(ledger: Ledger, process: subprocess.Popen[str], client: Client, after: str) -> bool:
-    """Count a node that has died or does not answer."""
-    from std_srvs.srv import SetBool
-
-    if process.poll() is not None:
-        ledger.found("tracebacks", f"the node ended after {after}: {ended(process, 0)[1][-300:]}")
-        return False
-    reply, took = client.call(SetBool, f"{NODE}/pause", data=False)
-    if reply is None:
-        ledger.found("lost", f"no reply after {after}")
-    elif (
-        took > (REPLY_S + 0.5) * ledger.patience
-    ):  # two processes and discovery share two cores with the campaign
-        ledger.found("hangs", f"a reply took {took:.2f} s after {after}")
-    ledger.longest_s = max(ledger.longest_s, took if math.isfinite(took) else 0.0)
-    return True
-
-
-def _stopped(ledger: Ledger, process: subprocess.Popen[str], number: int = signal.SIGINT) -> None:
-    began = time.monotonic()
-    status, text = ended(process, number)
-    took = time.monotonic() - began
-    if status not in (0, 1):
-        ledger.found("tracebacks", f"exit status {status}")
-    if "Traceback" in text:
-        ledger.found("tracebacks", text[-300:])
-    if took > 2 * CLOSE_S * ledger.patience:
-        ledger.found("hangs", f"it took {took:.1f} s to close")
+ENDLESS = """
+from sst_ros.simulation.simulation import Simulation
+steps = Simulation.steps
+def endless(self, *given):
+    while self.time_ns:
+        pass
+    steps(self, *given)
+Simulation.steps = endless
+"""
+"""All steps but the first never end."""
 
 
 def messages(budget: Budget, seed: int) -> Ledger:
@@ -208,12 +77,12 @@ def messages(budget: Budget, seed: int) -> Ledger:
                 message.wrench.torque.x = rng.choice(odd)
                 wrench.publish(message)
             client.executor.spin_once(timeout_sec=0.0)
-            if number % 200 == 0 and not _alive(ledger, process, client, f"message {number}"):
+            if number % 200 == 0 and not is_alive(ledger, process, client, f"message {number}"):
                 return ledger
-        _alive(ledger, process, client, "all messages")
+        is_alive(ledger, process, client, "all messages")
         if bad:
             ledger.found("silent", f"a state is not finite: {bad[0]}", len(bad))
-        _stopped(ledger, process)
+        stop(ledger, process)
     return ledger
 
 
@@ -223,7 +92,7 @@ def floods(budget: Budget, seed: int) -> Ledger:
 
     ledger, sent = budget.ledger("messages of three floods"), [0, 0, 0]
     with running() as (process, client):
-        stop = threading.Event()
+        enough = threading.Event()
         publishers = [
             client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
             for _ in range(3)
@@ -232,7 +101,7 @@ def floods(budget: Budget, seed: int) -> Ledger:
 
         def flood(index: int) -> None:
             message = Float64MultiArray(data=[0.1, 0.0, -0.1])
-            while not stop.is_set():
+            while not enough.is_set():
                 publishers[index].publish(message)
                 sent[index] += 1
 
@@ -241,13 +110,13 @@ def floods(budget: Budget, seed: int) -> Ledger:
             thread.start()
         end = time.monotonic() + max(1.0, 20.0 * budget.share)
         while time.monotonic() < end:
-            if not _alive(ledger, process, client, f"{sum(sent)} messages"):
+            if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
                 break
-        stop.set()
+        enough.set()
         for thread in threads:
             thread.join()
         ledger.tried = sum(sent)
-        _stopped(ledger, process, signal.SIGTERM)
+        stop(ledger, process, signal.SIGTERM)
     del seed
     return ledger
 
@@ -259,7 +128,7 @@ def services(budget: Budget, seed: int) -> Ledger:
     ledger = budget.ledger("service calls of four clients")
     lock = threading.Lock()
     with running() as (process, client):
-        _alive(ledger, process, client, "the start")
+        is_alive(ledger, process, client, "the start")
         number = int(os.environ["ROS_DOMAIN_ID"])
 
         def work(index: int) -> None:
@@ -282,7 +151,7 @@ def services(budget: Budget, seed: int) -> Ledger:
                     ledger.longest_s = max(ledger.longest_s, took)
                     if not done:
                         ledger.found("lost", f"no reply of {name} within 10 s")
-                    elif took > (REPLY_S + 0.5) * ledger.patience:
+                    elif took > REPLY_S * ledger.patience:
                         ledger.found("hangs", f"{name} took {took:.2f} s")
             caller.close()
 
@@ -291,7 +160,7 @@ def services(budget: Budget, seed: int) -> Ledger:
             thread.start()
         for thread in threads:
             thread.join()
-        _stopped(ledger, process)
+        stop(ledger, process)
     return ledger
 
 
@@ -319,10 +188,10 @@ def parameters(budget: Budget, seed: int) -> Ledger:
             if done is None:
                 ledger.found("lost", f"no reply to {name} = {value}")
             ledger.longest_s = max(ledger.longest_s, took if math.isfinite(took) else 0.0)
-            if number % 50 == 0 and not _alive(ledger, process, client, f"{name} = {value}"):
+            if number % 50 == 0 and not is_alive(ledger, process, client, f"{name} = {value}"):
                 return ledger
-        _alive(ledger, process, client, "all parameters")
-        _stopped(ledger, process)
+        is_alive(ledger, process, client, "all parameters")
+        stop(ledger, process)
     return ledger
 
 
@@ -332,16 +201,58 @@ def kills(budget: Budget, seed: int) -> Ledger:
     for number in budget.cases(66, least=1):
         ledger.tried += 1
         with running(wait_for_command=True) as (process, client):
-            kind = ("torque_player", "inverse_dynamics")[number % 2]
-            other = start(kind, scene="swing" if number % 2 == 0 else "reach")
+            kind, scene = (("torque_player", "example1"), ("inverse_dynamics", "reach"))[number % 2]
+            other = start(kind, scene=scene)
             client.until(lambda: client.node.count_subscribers("/joint_states"))
             # The wait is the experiment: the moment of the kill is random.
             time.sleep(rng.uniform(0.0, 1.5))
             other.kill()
             other.communicate()
-            _alive(ledger, process, client, f"the kill of {kind}")
-            _stopped(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
+            is_alive(ledger, process, client, f"the kill of {kind}")
+            stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
     return ledger
+
+
+def stuck(budget: Budget, seed: int) -> Ledger:
+    """Run a step that does not end, or only by its budget: a fault, and the node still answers."""
+    ledger, rng = budget.ledger("steps that do not end"), random.Random(seed)
+    for number in budget.cases(20, least=2):
+        ledger.tried += 1
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "needle.yaml"
+            path.write_text(needle())
+            case: dict[str, Any] = {"patch": ENDLESS} if number % 2 else {"scene": path}
+            with running(**case, wait_for_command=True) as (process, client):
+                _time_fault(ledger, client)
+                stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
+    return ledger
+
+
+def _time_fault(ledger: Ledger, client: Client) -> None:
+    """Start the run; measure the time to the fault and to the replies after it."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import Float64MultiArray, String
+    from std_srvs.srv import SetBool, Trigger
+
+    phases: list[str] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    client.node.create_subscription(
+        String, f"{NODE}/phase", lambda message: phases.append(message.data), latched
+    )
+    commands = client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
+    client.until(lambda: phases and commands.get_subscription_count())
+    commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
+    began = time.monotonic()
+    client.until(lambda: phases[-1].startswith("fault"))
+    times = [(time.monotonic() - began, FAULT_S, "the fault")]
+    calls: tuple[tuple[Any, str, dict[str, Any]], ...]
+    calls = (SetBool, "pause", {"data": True}), (Trigger, "reset", {})
+    for kind, name, fields in calls:
+        times.append((client.call(kind, f"{NODE}/{name}", **fields)[1], REPLY_S, name))
+    for took, bound, what in times:
+        ledger.longest_s = max(ledger.longest_s, took)
+        if took > bound * ledger.patience:
+            ledger.found("hangs", f"{what} after {took:.2f} s")
 
 
 def clock(budget: Budget, seed: int) -> Ledger:
@@ -359,8 +270,8 @@ def clock(budget: Budget, seed: int) -> Ledger:
             message.clock.sec, message.clock.nanosec = int(min(now, 2**31 - 1)), int(now % 1 * 1e9)
             publisher.publish(message)
             client.executor.spin_once(timeout_sec=0.005)
-        _alive(ledger, process, client, "the jumps")
-        _stopped(ledger, process)
+        is_alive(ledger, process, client, "the jumps")
+        stop(ledger, process)
     return ledger
 
 

@@ -13,7 +13,7 @@ PARTS = {
     "command_lines": "commands", "surroundings": "commands",
     "damages": "recordings", "recorder_kills": "recordings",
     "messages": "nodes", "floods": "nodes", "services": "nodes", "parameters": "nodes",
-    "node_kills": "nodes", "clock": "nodes", "starts": "nodes",
+    "stuck": "nodes", "node_kills": "nodes", "clock": "nodes", "starts": "nodes",
 }  # fmt: skip
 FUNCTIONS = {"recorder_kills": "kills", "node_kills": "kills"}
 

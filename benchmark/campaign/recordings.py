@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmark.campaign.ledger import Budget, Ledger
-from benchmark.campaign.nodes import domain, ended, start
+from benchmark.campaign.processes import domain, ended, start
 from sst_ros.errors import SstError
 from sst_ros.recording import recovery
 from sst_ros.recording.recording import Recording, read

@@ -133,6 +133,14 @@ def _extremes() -> dict[str, dict[tuple[Any, ...], object]]:
     return {**sharp, **needles, **light, **stiff, **springs, **fast, **lag}
 
 
+def needle() -> str:
+    """Return scene `swing` with a star whose first step of 1 ms would take a minute."""
+    tree = copy.deepcopy(trees()["swing"])
+    for path, value in _extremes()["star diag(1, 1, 1e-12)"].items():
+        put(tree, path, value)
+    return _text({**tree, "stroke": {"at_end": "ignore"}, "workspace": {"at_edge": "ignore"}})
+
+
 def extremes(budget: Budget, seed: int) -> Ledger:
     """Step extreme scenes: each step bounded, each state finite, each error one of ours."""
     ledger, rng = budget.ledger("extreme scenes, 20 steps each"), random.Random(seed)

@@ -21,7 +21,8 @@ from rclpy.publisher import Publisher
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
 """Of ROS 2 Kilted."""
 
-ACKNOWLEDGE_S = 2.0
+ACKNOWLEDGE_S = 1.5
+"""A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 
 
 def configure() -> None:

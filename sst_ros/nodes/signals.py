@@ -11,6 +11,10 @@ stop = threading.Event()
 
 
 def handle() -> None:
-    """Have SIGINT and SIGTERM end the node in order, also while it starts."""
+    """Have SIGINT and SIGTERM end the node in order, also while it starts.
+
+    A SIGINT that the executables have blocked until now is delivered.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))

@@ -24,6 +24,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
 from sst_ros import child_process  # noqa: E402
+from sst_ros.__main__ import main  # noqa: E402
 from sst_ros.description.frame_ids import IDLE_FRAME_ID  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
 
@@ -109,6 +110,25 @@ def nodes(domain):
     started.close()
 
 
+@pytest.fixture
+def run_here(domain, capfd):
+    """Run a node that ends by itself in this process: a new one takes a second to start."""
+
+    def run(command, *words, **given):
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            options = ["--ros-args", *child_process.words(given)] if given else []
+            status = main([command, *words, *options])
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        out, err = capfd.readouterr()
+        assert "Traceback" not in err
+        return status, out, err
+
+    return run
+
+
 class Observer:
     """A node in the test's own process that keeps all it hears."""
 
@@ -137,6 +157,16 @@ class Observer:
         while not condition():
             assert time.monotonic() < deadline, f"no {what} within {timeout} s"
             self.executor.spin_once(timeout_sec=0.05)
+
+    def publish_until(self, publisher, message, condition, what):
+        """Publish every 50 ms: a node answers no state before its commands have a subscriber."""
+
+        def published():
+            publisher.publish(message)
+            self.executor.spin_once(timeout_sec=0.05)
+            return condition()
+
+        self.until(published, what)
 
     def call(self, kind, name, **fields):
         client = self.node.create_client(kind, name)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from sensor_msgs.msg import JointState
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
 SOURCE = Path(__file__).parents[2]
 
 

@@ -87,6 +87,7 @@ def test_a_fault_is_held_still_until_a_reset(nodes, observer):
     observer.until(lambda: observer.stamp(states[-1]) == 0, "the held state")
     sample = next(state for state in reversed(states) if observer.stamp(state))
     assert list(states[-1].position) == list(sample.position)
+    assert 1.5 < sample.position[0] <= math.pi / 2
     assert any(sample.velocity) and not any(states[-1].velocity) and not any(states[-1].effort)
     said = observer.told("phase", "fault")
     assert said["level"] == b"\x02" and "gamma_1 > 1.570796 rad" in said["fault"]
@@ -98,3 +99,4 @@ def test_a_fault_is_held_still_until_a_reset(nodes, observer):
     assert all(math.isfinite(x) for state in states for x in (*state.position, *state.velocity))
     status, _, err = nodes.stop(process)
     assert status == 0 and "Traceback" not in err and "held until ~/reset" in err
+    assert "gamma_1 > 1.570796 rad" in err

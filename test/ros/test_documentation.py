@@ -72,6 +72,7 @@ def used(observer, name):
     }
 
 
+@pytest.mark.slow
 def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, tmp_path):
     nodes.run("simulator", wait_for_command=True)
     observer.told("phase", "waiting")
@@ -101,8 +102,10 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, 
             assert names <= expected.get(right, set()), (node.name, right)
 
 
-def test_the_diagnostics_say_what_the_docs_say(nodes, observer):
-    nodes.run("simulator", scene="example2_heavy")  # which has limits, and so distances to them
+def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_out(nodes, observer):
+    # The scene has limits, and so distances to them.
+    nodes.run("simulator", scene="example2_heavy", publish_description=False)
     said = observer.told("phase", "running")
     said = observer.told("error_estimate", lambda value: True)
     assert list(said)[:-2] == list(diagnostics.KEYS)
+    assert "/robot_description" not in dict(observer.node.get_topic_names_and_types())

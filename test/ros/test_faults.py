@@ -16,8 +16,9 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from sst_ros import load_scene
-from sst_ros.scene.yaml_document import dump
+from sst_ros import Scene, load_scene
+from sst_ros.description.urdf import urdf
+from sst_ros.scene.yaml_document import dump, read
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_simulator"
@@ -132,6 +133,7 @@ def test_two_publishers_are_told(nodes, observer):
     assert "2 publishers of commands" in err
 
 
+@pytest.mark.slow
 def test_a_flood_of_commands_is_bounded(nodes, observer):
     """20 kHz for a second, if the machine can: no crash, no growth, samples go on."""
     process = nodes.run("simulator")
@@ -176,12 +178,16 @@ def test_kill_of_a_view_ends_its_simulator(nodes, observer):
 
 
 def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer):
-    nodes.run("simulator")
+    nodes.run("simulator", scene="general", real_time_factor=0.1)
     observer.told("phase", "running")
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
     phase = observer.listen(String, f"{NODE}/phase", latched=True)
-    observer.until(lambda: scene and phase, "latched messages")
+    drawn = observer.listen(String, "/robot_description", latched=True)
+    observer.until(lambda: scene and phase and drawn, "latched messages")
     assert phase[-1].data == "running"
+    assert read(Scene, scene[0].data, "topic") == load_scene("general")
+    assert drawn[0].data == urdf(load_scene("general"))
+    assert '<link name="base_link">' in drawn[0].data
 
 
 def test_kill_of_the_controller_ends_in_zero_torque(nodes, observer, tmp_path):

@@ -25,6 +25,7 @@ def recorded(nodes, observer, bag, **given):
     return recorder, simulator
 
 
+@pytest.mark.slow  # the campaign does the same
 def test_kill_of_the_recorder_leaves_all_but_the_last_second(nodes, observer, tmp_path):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
     published = int(

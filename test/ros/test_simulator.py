@@ -6,12 +6,10 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
-from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import read
 from sst_ros.simulation.simulation import Simulation
 
 pytestmark = pytest.mark.ros
@@ -111,38 +109,6 @@ def test_without_a_command_the_torque_is_zero(nodes, observer):
     assert states[-1].position[0] != states[0].position[0]
 
 
-def test_a_fault_is_told_and_the_last_valid_state_kept(nodes, observer):
-    told = observer.listen(DiagnosticArray, "/diagnostics")
-    states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", scene="example2_stroke", wait_for_command=True)
-    commands = observer.publisher(Float64MultiArray, COMMANDS)
-    commands.publish(Float64MultiArray(data=[50.0, 0.0, 0.0]))
-    observer.until(lambda: told and values(told[-1])["phase"] == "fault", "fault")
-    assert "gamma_1 > 1.570796 rad" in values(told[-1])["fault"]
-    assert told[-1].status[0].level == b"\x02"
-    assert 1.5 < states[-1].position[0] <= math.pi / 2
-    status, _, err = nodes.stop(process)
-    assert status == 0
-    assert "gamma_1 > 1.570796 rad" in err
-
-
-def test_the_scene_is_latched(nodes, observer):
-    nodes.run("simulator", scene="example1")
-    document = observer.listen(String, "/sst_simulator/scene", latched=True)
-    observer.until(lambda: document, "scene")
-    assert read(Scene, document[0].data, "topic") == load_scene("example1")
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_in_order(nodes, observer, number):
-    states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator")
-    observer.until(lambda: states, "states")
-    status, _, err = nodes.stop(process, number)
-    assert status == 0
-    assert "Traceback" not in err
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -156,18 +122,18 @@ def test_signals_end_it_in_order(nodes, observer, number):
         ({"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
     ],
 )
-def test_refused_parameters_are_named(nodes, given, said):
-    process = nodes.run("simulator", **given)
-    _, err = process.communicate(timeout=20)
-    assert process.returncode == 1
+def test_refused_parameters_are_named(run_here, given, said):
+    status, _, err = run_here("simulator", **given)
+    assert status == 1
     assert said in err
-    assert "Traceback" not in err
 
 
-def test_who_looks_sees_at_once_that_it_has_left(nodes, observer):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, observer, number):
     """Otherwise it would be there for 20 s more, and a new one would not be the only one."""
     process = nodes.run("simulator")
     names = observer.node.get_node_names
     observer.told("phase", "running")
-    assert nodes.stop(process)[0] == 0
+    status, _, err = nodes.stop(process, number)
+    assert status == 0 and "Traceback" not in err
     observer.until(lambda: "sst_simulator" not in names(), "end of it", 5.0)

@@ -2,6 +2,7 @@
 """Command lines, warnings of the graph, signals, and ends of real nodes."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -32,9 +33,8 @@ def ended(process, timeout=40):
 
 
 @pytest.mark.parametrize("command", NODES)
-def test_help_starts_nothing(nodes, tmp_path, command):
-    process = nodes.start(command, "--help")
-    status, out, _ = ended(process)
+def test_help_starts_nothing(run_here, command):
+    status, out, _ = run_here(command, "--help")
     assert status == 0 and f"usage: {command}" in out and "default:" in out
 
 
@@ -48,16 +48,16 @@ def test_help_starts_nothing(nodes, tmp_path, command):
         (["--ros-args", "--params-file", __file__], "must be a parameter file"),
     ],
 )
-def test_unknown_arguments_are_refused(nodes, words, said):
-    status, _, err = ended(nodes.start("simulator", *words))
+def test_unknown_arguments_are_refused(run_here, words, said):
+    status, _, err = run_here("simulator", *words)
     assert status in (1, 2)
     assert said in err
 
 
-def test_an_unknown_parameter_of_a_file_is_refused(nodes, tmp_path):
+def test_an_unknown_parameter_of_a_file_is_refused(run_here, tmp_path):
     path = tmp_path / "file.yaml"
     path.write_text("/**: {ros__parameters: {sceen: friction, csv: foreign}}\n")
-    status, _, err = ended(nodes.start("simulator", "--ros-args", "--params-file", str(path)))
+    status, _, err = run_here("simulator", "--ros-args", "--params-file", str(path))
     assert status == 1
     assert "did you mean scene?" in err and "csv = " not in err
 
@@ -131,14 +131,34 @@ def handles_signals(process):
     return int(caught, 16) >> (signal.SIGTERM - 1) & 1
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1, 0.3, 0.6, 1.0, 1.5])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("number", "delay"),
+    [
+        *((signal.SIGINT, delay) for delay in (0.0, 0.3, 1.0)),
+        *((signal.SIGTERM, delay) for delay in (0.1, 0.6, 1.5)),
+    ],
+)
 def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, delay, number):
     process = nodes.start("simulator", "--duration", "0")
     observer.until(lambda: handles_signals(process), "signal handler")
     time.sleep(delay)  # the moment of the start is what is varied
     status, _, err = nodes.stop(process, number)
     assert (status, "Traceback" in err) == (0, False), err
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.02, 0.05, 0.1, 0.15])
+def test_ctrl_c_while_python_starts_a_node_of_ros2_run_ends_it(nodes, delay):
+    """Its executable blocks SIGINT until the node handles it: Python would print a traceback."""
+    root = Path(sst_ros.__file__).parents[1]
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    process = nodes.start(
+        "", executable=[str(root / "executables" / "simulator")],
+        env={"PATH": path, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    time.sleep(delay)  # the moment of the start is what is varied
+    status, _, err = nodes.stop(process)
+    # Before `env` has blocked it, the signal ends the process without a word.
+    assert status in (0, -signal.SIGINT) and err == ""
 
 
 def test_signals_are_handled_before_what_takes_time_to_import():
@@ -166,8 +186,7 @@ def stiff_scene(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_step_that_does_not_end_is_a_fault_and_the_node_ends(nodes, observer, tmp_path, number):
+def test_a_step_that_does_not_end_is_a_fault_and_the_node_ends(nodes, observer, tmp_path):
     process = nodes.run("simulator", scene=stiff_scene(tmp_path), wait_for_command=True)
     commands = observer.publisher(Float64MultiArray, f"{NODE}/commands")
     observer.told("phase", "waiting")
@@ -182,7 +201,7 @@ def test_a_step_that_does_not_end_is_a_fault_and_the_node_ends(nodes, observer, 
     observer.call(Trigger, f"{NODE}/reset")
     answered = time.monotonic() - asked
     stopped = time.monotonic()
-    status, _, err = nodes.stop(process, number)
+    status, _, err = nodes.stop(process)
     assert status == 0 and "Traceback" not in err
-    # Twice what is promised on an idle machine.
+    # benchmark.campaign asks for 1, 0.5 and 2 s, which a machine with other work does not keep.
     assert (faulted < 4.0, answered < 4.0, time.monotonic() - stopped < 5.0) == (True,) * 3

@@ -9,38 +9,46 @@ from std_msgs.msg import Float64MultiArray
 pytestmark = pytest.mark.ros
 
 
+def sample(nanosec):
+    message = JointState()
+    message.header.stamp.nanosec = nanosec
+    return message
+
+
 def test_plays_a_table_against_the_stamps_it_hears(nodes, observer, tmp_path):
     table = tmp_path / "torque.csv"
     table.write_text("time,tau_1,tau_2,tau_3\n0,0.1,0.2,0.3\n0.1,0.4,0.5,0.6\n0.2,0,0,0\n")
     heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
     player = nodes.run("torque_player", csv=table, hold="start")
     states = observer.publisher(JointState, "/joint_states")
-    for nanosec in (0, 500, 99_999_999 + 500, 100_000_000 + 500, 200_000_000 + 500):
-        message = JointState()
-        message.header.stamp.nanosec = nanosec
-        before = len(heard)
-        states.publish(message)
-        observer.until(lambda before=before: len(heard) > before, "answer")
-    expected = [[0.1, 0.2, 0.3]] * 3 + [[0.4, 0.5, 0.6], [0.0, 0.0, 0.0]]
-    assert [list(message.data) for message in heard] == expected
+    observer.publish_until(states, sample(0), lambda: heard, "answer to a state before the run")
+    for nanosec in (500, 99_999_999 + 500, 100_000_000 + 500, 200_000_000 + 500):
+        states.publish(sample(nanosec))
+    observer.until(lambda: not any(heard[-1].data), "end of the profile")
+    *before, second, last = (list(message.data) for message in heard)
+    assert len(before) >= 3 and all(torque == [0.1, 0.2, 0.3] for torque in before)
+    assert (second, last) == ([0.4, 0.5, 0.6], [0.0, 0.0, 0.0])
     assert player.wait(timeout=10) == 0
 
 
 def test_answers_with_the_torque_of_the_middle_of_the_hold(nodes, observer):
     """At the rate given; the last hold ends with the profile. Other periods are reported."""
-    heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
-    player = nodes.run("torque_player", scene="example1", rate=250)
+    heard = observer.listen(JointState, "/sst_simulator/commands_stamped")
+    player = nodes.run("torque_player", scene="example1", rate=250, stamped=True)
     states = observer.publisher(JointState, "/joint_states")
+    observer.publish_until(states, sample(0), lambda: heard, "answer to a state before the run")
     end_ns = 523_598_776
-    for nanosec in (0, 500, 500 + 4_000_000, 500 + 10_000_000, 500 + 522_000_000, 500 + end_ns):
-        message = JointState()
-        message.header.stamp.nanosec = nanosec
-        before = len(heard)
-        states.publish(message)
-        observer.until(lambda before=before: len(heard) > before, "answer")
+    stamps = [500 + passed for passed in (0, 4_000_000, 10_000_000, 522_000_000, end_ns)]
+    for stamp in stamps:
+        states.publish(sample(stamp))
+    observer.until(lambda: heard[-1].header.stamp.nanosec == stamps[-1], "the last answer")
     last = (522_000_000 + end_ns) / 2 / 1e9
-    expected = [1.13 * math.sin(12.0 * t) for t in (0.002, 0.002, 0.006, 0.012, last)]
-    assert [list(message.data) for message in heard] == [[x] * 3 for x in [*expected, 0.0]]
+    expected = [1.13 * math.sin(12.0 * t) for t in (0.002, 0.006, 0.012, last)]
+    answers = [(answer.header.stamp.nanosec, list(answer.effort)) for answer in heard]
+    previews = [effort for stamp, effort in answers if stamp == 0]
+    assert all(effort == [expected[0]] * 3 for effort in previews)
+    efforts = [[torque] * 3 for torque in (*expected, 0.0)]
+    assert answers[len(previews) :] == list(zip(stamps, efforts, strict=True))
     _, err = player.communicate(timeout=10)
     assert player.returncode == 0
     assert err.count("two samples are 0.006 s apart, not 1 / rate = 0.004 s") == 1
@@ -62,17 +70,9 @@ def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, tmp
     )
     player = nodes.run("torque_player", csv=table, min_subscribers=2)
     states = observer.publisher(JointState, "/joint_states")
-    message = JointState()
-    message.header.stamp.nanosec = 500
-
-    def begun():
-        states.publish(message)
-        return heard
-
-    observer.until(begun, "torque")
+    observer.publish_until(states, sample(500), lambda: heard, "torque")
     observer.node.destroy_subscription(other)
-    message.header.stamp.nanosec = 100_000_500
-    states.publish(message)
+    states.publish(sample(100_000_500))
     observer.until(lambda: list(heard[-1].data) == [0.0, 0.0, 0.0], "end of the profile")
     assert player.wait(timeout=10) == 0
 
@@ -84,33 +84,23 @@ def test_a_player_that_was_held_up_counts_from_the_first_sample(nodes, observer,
     heard = observer.listen(Float64MultiArray, "/sst_simulator/commands")
     player = nodes.run("torque_player", csv=table)
     states = observer.node.create_publisher(JointState, "/joint_states", 1000)
-    message = JointState()
-
-    def called():
-        states.publish(message)
-        return heard
-
-    observer.until(called, "torque")
+    observer.publish_until(states, sample(0), lambda: heard, "torque")
     player.send_signal(signal.SIGSTOP)
-    for sample in range(101):
-        message.header.stamp.nanosec = 500 + 2_000_000 * sample
-        states.publish(message)
+    for number in range(101):
+        states.publish(sample(500 + 2_000_000 * number))
     player.send_signal(signal.SIGCONT)
     assert player.wait(timeout=10) == 0
 
 
-def test_silence_of_the_simulator_ends_it_with_a_message(nodes):
-    player = nodes.run("torque_player", timeout=0.5)
-    _, err = player.communicate(timeout=20)
-    assert player.returncode == 1
+def test_silence_of_the_simulator_ends_it_with_a_message(run_here):
+    status, _, err = run_here("torque_player", timeout=0.5)
+    assert status == 1
     assert "no joint_states for" in err
-    assert "Traceback" not in err
 
 
-def test_a_bad_table_is_refused(nodes, tmp_path):
+def test_a_bad_table_is_refused(run_here, tmp_path):
     table = tmp_path / "torque.csv"
     table.write_text("time,tau_1,tau_2,tau_3\n0,1,2,nan\n")
-    player = nodes.run("torque_player", csv=table)
-    _, err = player.communicate(timeout=20)
-    assert player.returncode == 1
+    status, _, err = run_here("torque_player", csv=table)
+    assert status == 1
     assert "line 2: row" in err

@@ -20,6 +20,7 @@ from tools.browser import chromium
 
 pytestmark = [
     pytest.mark.ros,
+    pytest.mark.slow,
     pytest.mark.timeout(300),
     pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH"),
 ]

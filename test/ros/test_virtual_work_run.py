@@ -12,7 +12,7 @@ pytestmark = pytest.mark.ros
 PERIOD_NS = 2_000_000
 
 
-@pytest.mark.parametrize("name", ["example1", "example2"])
+@pytest.mark.parametrize("name", [pytest.param("example1", marks=pytest.mark.slow), "example2"])
 def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
     states = observer.listen(JointState, "/joint_states")
     simulator = nodes.run(

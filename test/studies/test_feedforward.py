@@ -46,6 +46,7 @@ def held(scene, delay, damping=1.0):
 @pytest.fixture(scope="module")
 def small():
     """A study of 0.4 s with one failure in it: delay 5 at 180 rad/s."""
+    pytest.importorskip("numba", reason="takes minutes without numba: pip install .[fast]")
     plan = FeedforwardPlan(
         SHORT, bandwidths=(180.0,), errors=errors("inertia +20%", "inertia -20%", "delay 5"),
         delays=(0,),
