@@ -7,10 +7,10 @@ import math
 import os
 import random
 import signal
-import tempfile
 import threading
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmark.campaign.ledger import Budget, Ledger
@@ -200,9 +200,13 @@ def kills(budget: Budget, seed: int) -> Ledger:
     ledger, rng = budget.ledger("players and controllers killed with -9"), random.Random(seed)
     for number in budget.cases(66, least=1):
         ledger.tried += 1
-        with running(wait_for_command=True) as (process, client):
-            kind, scene = (("torque_player", "example1"), ("inverse_dynamics", "reach"))[number % 2]
-            other = start(kind, scene=scene)
+        with running(wait_for_command=True) as (process, client), TemporaryDirectory() as folder:
+            table = Path(folder) / "torques.csv"
+            table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
+            kind, given = (
+                ("torque_player", {"csv": table}), ("inverse_dynamics", {"scene": "reach"})
+            )[number % 2]  # fmt: skip
+            other = start(kind, **given)
             client.until(lambda: client.node.count_subscribers("/joint_states"))
             # The wait is the experiment: the moment of the kill is random.
             time.sleep(rng.uniform(0.0, 1.5))
@@ -218,7 +222,7 @@ def stuck(budget: Budget, seed: int) -> Ledger:
     ledger, rng = budget.ledger("steps that do not end"), random.Random(seed)
     for number in budget.cases(20, least=2):
         ledger.tried += 1
-        with tempfile.TemporaryDirectory() as folder:
+        with TemporaryDirectory() as folder:
             path = Path(folder) / "needle.yaml"
             path.write_text(needle())
             case: dict[str, Any] = {"patch": ENDLESS} if number % 2 else {"scene": path}

@@ -100,7 +100,7 @@ def kills(budget: Budget, seed: int) -> Ledger:
         with tempfile.TemporaryDirectory() as name, domain():
             bag = Path(name) / "bag"
             recorder = start("recorder", output=bag)
-            simulator = start("simulator", scene="swing")
+            simulator = start("simulator", scene="swing", duration=0.0)
             try:
                 _kill(ledger, f"kill {number}", rng.uniform(1.5, 4.0), recorder, bag)
             except SstError as error:
