@@ -79,19 +79,27 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
             _wait_for_end("inverse_dynamics", controller, 20.0 * seconds + _END_S)
 
 
-def record(name: str, bag: Path) -> None:
+def record(name: str, bag: Path, *, rate: int = 0, hold: str = "middle") -> None:
     """Play a scene's torques to its simulator, in processes of their own, and record the run.
 
     It goes by the clock, and in lockstep: to the same bits however busy the machine is.
+
+    Args:
+        name: of the scene.
+        bag: folder of the recording.
+        rate: steps, samples and commands per second; 0 for the defaults of the nodes.
+        hold: instant of the hold whose torque is commanded.
 
     Raises:
         SstError: a node failed or did not end in time; names it.
 
     """
     duration = scene.load(name).duration or 1.0
+    run = {"rate": rate, "publish_rate": rate} if rate else {}
+    played = {"hold": hold, **({"rate": rate} if rate else {})}
     with (
-        _recorded(bag, scene=name, sync="lockstep", duration=duration),
-        _node("torque_player", scene=name, stamped=True, min_subscribers=2) as player,
+        _recorded(bag, scene=name, sync="lockstep", duration=duration, **run),
+        _node("torque_player", scene=name, stamped=True, min_subscribers=2, **played) as player,
     ):
         _wait_for_end("torque_player", player, duration + _END_S)
 
@@ -108,9 +116,9 @@ def _recorded(bag: Path, **run: object) -> Iterator[None]:
         _wait_for_end("recorder", recorder, _END_S)
 
 
-def empty_bag(folder: Path) -> Path:
+def empty_bag(folder: Path, name: str = "bag") -> Path:
     """Return the folder of a bag, without that of an earlier demo."""
-    bag = folder / "bag"
+    bag = folder / name
     if bag.exists():
         shutil.rmtree(bag)
     folder.mkdir(parents=True, exist_ok=True)

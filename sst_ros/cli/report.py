@@ -28,6 +28,12 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     add_out(accuracy, "folder of the results", "accuracy_out")
     accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
+    accuracy.add_argument(
+        "--control", action="store_true",
+        help="error against control rate, method and hold in the run loop; scenes with torques,"
+        " default: example2 friction",
+    )  # fmt: skip
+    accuracy.add_argument("--nodes", action="store_true", help="with --control: real nodes, too")
     accuracy.set_defaults(run=_accuracy)
     stability = kinds.add_parser("stability", help="stiff and extreme cases, largest steps")
     add_out(stability, "folder of the results", "stability_out")
@@ -52,12 +58,25 @@ def _run(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     out = require_free(options.out or Path("accuracy_out"), "report", force=options.force)
+    if options.control:
+        _control(options, out)
+        return
     from sst_ros.scene.scene import names
     from sst_ros.studies.accuracy_report import report
     from sst_ros.studies.high_precision import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
     report(options.scene or names(), out, kind=kind)
+
+
+def _control(options: argparse.Namespace, out: Path) -> None:
+    from sst_ros import demo
+    from sst_ros.studies.control_rate_report import SCENES, report
+
+    def record(name: str, bag: Path, rate: int, hold: str) -> None:
+        demo.record(name, demo.empty_bag(bag.parent, bag.name), rate=rate, hold=hold)
+
+    report(options.scene or SCENES, out, record=record if options.nodes else None)
 
 
 def _stability(options: argparse.Namespace) -> int:

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Error against processor time of the run loop: control rate, method, and how torques are held.
+
+Torques that a controller holds over a period are not those of the continuous motion: the error of
+the motion is of order 1 in the period where the torque is that of the start of the hold, of order 2
+where it is that of its middle (`sampled_data` derives both). Each point is a real run of the run
+loop of the simulator node, without ROS, as fast as possible, with a sample at every tick; its
+states are compared with the reference of the continuous motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sst_ros.control.torque_profiles import sine
+from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.methods import METHODS
+from sst_ros.progress import slices
+from sst_ros.runtime.pacing import Pacer, SteadyTime
+from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.run_types import HasState, Phase
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State, Triple
+from sst_ros.studies.initial_value_problem import InitialValueProblem
+from sst_ros.studies.reference_solution import ReferenceSolution, solve_reference
+from sst_ros.studies.results import table
+from sst_ros.studies.sampled_data import slope
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+RATES = (100, 200, 500, 1000, 2000, 5000, 10_000)
+"""Control rates [Hz]."""
+
+NODE_RATES = (100, 500, 1000)
+"""Rates at which the nodes are run, too [Hz]."""
+
+START, MIDDLE, EXACT = "start", "middle", "exact"
+RUN_LOOP, NODES = "run loop", "nodes"
+HOLDS = (START, MIDDLE, EXACT)
+"""What acts over a period: the torque at its start, at its middle, or the profile itself."""
+
+TOLERANCE = 1e-10
+"""Local tolerance of a step, the default of the node."""
+
+COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "estimate_rad",
+           "tick_us", "core_share", "by")  # fmt: skip
+
+_LONGEST_S = 120.0
+
+
+@dataclass(frozen=True)
+class ControlRun:
+    """One point of the grid.
+
+    Attributes:
+        rate: control rate [Hz], that of the samples too.
+        method: of integration.
+        hold: START, MIDDLE or EXACT.
+        times_ns: times of the samples [ns], shape (n,).
+        states: quaternions and body rates of the samples, shape (n, 7).
+        estimate: error estimate of the integrator at the end [rad].
+        tick_s: processor time of the thread of the run per tick, median [s].
+
+    """
+
+    rate: int
+    method: str
+    hold: str
+    times_ns: np.ndarray[Any, np.dtype[np.int64]]
+    states: np.ndarray[Any, np.dtype[np.float64]]
+    estimate: float
+    tick_s: float
+
+
+class ProfileInput(TorqueInput):
+    """Torque input that reads a profile at the time of the simulation instead of messages."""
+
+    def __init__(self, owner: Any, scene: Scene, hold: str, period_ns: int) -> None:
+        super().__init__(owner, scene.actuators, lambda: None, lambda: None)
+        assert scene.torque is not None
+        self._profile, self._sine = sine(scene.torque), scene.torque
+        self._exact = hold == EXACT
+        self._shift_ns = period_ns // 2 if hold == MIDDLE else 0
+
+    def torque(self, simulation: HasState) -> Any:
+        """Return the torques of the tick that begins now [N m], or the profile itself."""
+        if self._exact:
+            return self._sine
+        time_ns = simulation.state.time_ns + self._shift_ns
+        return self._limited(self._profile(time_ns / NANOSECONDS))
+
+
+class _Output:
+    """Keeps the states of all samples, and the processor time of the thread at each."""
+
+    def __init__(self) -> None:
+        self.states: list[State] = []
+        self.times: list[float] = []
+
+    def now_ns(self) -> int:
+        return NANOSECONDS
+
+    def missing_subscribers(self) -> list[str]:
+        return []
+
+    def start(self) -> None:
+        pass
+
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        pass
+
+    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+        self.states.append(simulation.state)
+        self.times.append(time.thread_time())
+
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+        pass
+
+    def phase_changed(self, phase: str) -> None:
+        pass
+
+
+class _Owner:
+    def __init__(self, parameters: SimulatorParameters) -> None:
+        self.parameters = parameters
+
+
+def run_controlled(
+    scene: Scene, rate: int, method: str, hold: str, seconds: float, *, compiled: bool = True
+) -> ControlRun:
+    """Run the run loop over a time span, a sample at every tick.
+
+    Args:
+        scene: a scene with torques.
+        rate: control rate [Hz], a divisor of 1e9.
+        method: of integration, or auto.
+        hold: START, MIDDLE or EXACT.
+        seconds: time span [s].
+        compiled: under numba, where it is installed.
+
+    Raises:
+        SstError: the run stopped early; says why.
+
+    """
+    given = SimulatorParameters(
+        scene=scene.name, rate=rate, publish_rate=rate, duration=seconds, real_time_factor=0.0,
+        integrator=method, tolerance=TOLERANCE,
+    )  # fmt: skip
+    owner, output = _Owner(given), _Output()
+    torques = ProfileInput(owner, scene, hold, given.period_ns)
+    compiled = compiled and numba_version() is not None
+
+    def build(built: Scene) -> Simulation:
+        return Simulation(built, method, tolerance=TOLERANCE, compiled=compiled)
+
+    loop = RunLoop(
+        scene, build, owner, torques, Pacer(given.period_ns, 0.0, SteadyTime()), output
+    )  # fmt: skip
+    thread = threading.Thread(target=loop.run, daemon=True)
+    thread.start()
+    thread.join(_LONGEST_S)
+    loop.stop()
+    if loop.phase is not Phase.FINISHED:
+        raise SstError(f"{scene.name} at {rate} Hz: {loop.fault or 'the run takes too long'}")
+    rows = [(*state.quaternion, *state.body_rate) for state in output.states]
+    return ControlRun(
+        rate, method, hold, np.array([state.time_ns for state in output.states]), np.array(rows),
+        loop.simulation.error_estimate, float(np.median(np.diff(output.times))),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ControlStudy:
+    """Result of a study: the grid as a table of COLUMNS, and the reference that it is held to."""
+
+    scene: str
+    seconds: float
+    reference: ReferenceSolution
+    rows: DataFrame
+
+    def order(self, hold: str) -> float:
+        """Power of the period with which the largest error falls."""
+        rows = self.rows[self.rows.hold == hold]
+        return slope((1.0 / rows.rate_Hz).tolist(), rows.largest_rad.tolist())
+
+    def spread(self, hold: str) -> float:
+        """Largest ratio of the errors of two methods at the same rate."""
+        rows = self.rows[(self.rows.hold == hold) & (self.rows.by == RUN_LOOP)]
+        errors = rows.groupby("rate_Hz").largest_rad
+        return float((errors.max() / errors.min()).max())
+
+
+def control_study(
+    scene: Scene,
+    *,
+    rates: Sequence[int] = RATES,
+    methods: Sequence[str] = tuple(METHODS),
+    compiled: bool = True,
+    recorded: Callable[[int, str], ControlRun] | None = None,
+    shown: bool = False,
+) -> ControlStudy:
+    """Run the grid, one point after another: processor times are those of a core that is free.
+
+    Rates whose period does not divide the spacing of the reference are left out.
+
+    Args:
+        scene: a scene with torques.
+        rates: control rates [Hz].
+        methods: of integration.
+        compiled: under numba, where it is installed.
+        recorded: runs the nodes at a rate with a hold; for NODE_RATES.
+        shown: draw a progress bar on the terminal.
+
+    Raises:
+        InputError: the scene has no torques of its own, or cannot start.
+        SstError: a run stopped early.
+
+    """
+    if scene.torque is None:
+        raise InputError(scene.name, [Problem("torque", None, "must be given")])
+    problem = InitialValueProblem(scene)
+    reference = solve_reference(problem, compiled=compiled and numba_version() is not None)
+    points = [
+        (rate, method, hold)
+        for rate, method, hold in itertools.product(rates, methods, HOLDS)
+        if problem.interval_ns % (NANOSECONDS // rate) == 0
+    ]
+    rows = []
+    for part in slices(len(points), 1, f"{scene.name:<16}", shown):
+        rate, method, hold = points[part.start]
+        run = run_controlled(scene, rate, method, hold, problem.seconds, compiled=compiled)
+        rows.append(row_of(problem, reference, run))
+    for rate, hold in itertools.product(NODE_RATES, (START, MIDDLE)) if recorded else ():
+        assert recorded is not None
+        rows.append(row_of(problem, reference, recorded(rate, hold), NODES))
+    return ControlStudy(scene.name, problem.seconds, reference, table(rows, COLUMNS))
+
+
+def row_of(
+    problem: InitialValueProblem, reference: ReferenceSolution, run: ControlRun, by: str = RUN_LOOP
+) -> dict[str, Any]:
+    """Compare a run with the reference: a row with the keys of COLUMNS."""
+    chosen = np.isin(run.times_ns, problem.interval_ns * np.arange(problem.count + 1))
+    final, largest = problem.errors(run.states[chosen], reference.states)
+    values = (
+        problem.scene.name, run.rate, run.method, run.hold, final.orientation,
+        largest.orientation, run.estimate, 1e6 * run.tick_s, run.tick_s * run.rate, by,
+    )  # fmt: skip
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def advice(study: ControlStudy) -> str:
+    """Return what to change for a smaller error, from the grid."""
+    largest = max(study.spread(hold) for hold in (START, MIDDLE))
+    if largest > 1.05:
+        worst = max((START, MIDDLE), key=study.spread)
+        return (
+            f"the methods differ by up to {largest:.2g} times (hold: {worst}): choose a finer "
+            "method or tolerance first"
+        )
+    least = study.rows[study.rows.rate_Hz == study.rows.rate_Hz.min()]
+    start, middle = (least[least.hold == hold].largest_rad.max() for hold in (START, MIDDLE))
+    return (
+        "raise the rate or command the torque of the middle of the hold; do not change the method: "
+        f"at the same rate all methods have the same error, to {100 * (largest - 1):.1g} %, "
+        f"and at {least.rate_Hz.max():g} Hz the middle gives {start / middle:.0f} times "
+        "less than the start"
+    )
