@@ -16,8 +16,8 @@ from typing import NamedTuple
 from sst_ros.nodes import inverse_dynamics, topics
 from sst_ros.nodes.topics import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.runtime import diagnostics
-from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
 from sst_ros.runtime.settings import (
+    ControllerNodeParameters,
     PlayerParameters,
     RecorderParameters,
     SimulatorParameters,

@@ -80,8 +80,9 @@ def _run(words: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
     if words and words[0] in NODES:
-        started: int = importlib.import_module(f"sst_ros.nodes.{words[0]}").main(words)
-        return started
+        from sst_ros.nodes import process
+
+        return process.run(words)
     commands = parser(words[0] if words and words[0] in COMMANDS else None)
     options, unknown = commands.parse_known_args(words)
     if unknown:

@@ -58,11 +58,11 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _live(options: argparse.Namespace) -> int:
-    from sst_ros.nodes import viewer
+    from sst_ros.nodes import process
 
     given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
     space = f"__ns:={options.namespace}"
-    return viewer.main(["viewer", "--ros-args", "-r", space, *child_process.words(given)])
+    return process.run(["viewer", "--ros-args", "-r", space, *child_process.words(given)])
 
 
 def _replay(options: argparse.Namespace) -> int:

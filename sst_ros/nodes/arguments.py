@@ -7,18 +7,18 @@ Imports no ROS: `--help` and a misspelt option need none.
 from __future__ import annotations
 
 import difflib
-import importlib
 import json
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.runtime import settings
 from sst_ros.scene.schema import Section, Spec, accept, specs
 
 USE_SIM_TIME = "use_sim_time"
@@ -33,35 +33,14 @@ _FLAGS = re.compile(r"--(enable|disable)-(rosout|stdout|external-lib)-logs")
 _YAML = {True: "true", False: "false"}
 
 
-class CommandLine(NamedTuple):
-    """A node as the command line sees it."""
-
-    command: str
-    node: str
-    module: str
-    name: str
-
-    @property
-    def parameters(self) -> type[Section]:
-        """Its parameters."""
-        found: type[Section] = getattr(importlib.import_module(self.module), self.name)
-        return found
-
-
-_SETTINGS = "sst_ros.runtime.settings"
-_CONTROLLER = "sst_ros.runtime.controller_node_settings"
-COMMANDS = {
-    line.command: line
-    for line in (
-        CommandLine("simulator", "sst_simulator", _SETTINGS, "SimulatorParameters"),
-        CommandLine("torque_player", "sst_torque_player", _SETTINGS, "PlayerParameters"),
-        CommandLine(
-            "inverse_dynamics", "sst_inverse_dynamics", _CONTROLLER, "ControllerNodeParameters"
-        ),
-        CommandLine("recorder", "sst_recorder", _SETTINGS, "RecorderParameters"),
-        CommandLine("viewer", "sst_viewer", _SETTINGS, "ViewerParameters"),
-    )
+COMMANDS: dict[str, tuple[str, type[Section]]] = {
+    "simulator": ("Simulator", settings.SimulatorParameters),
+    "torque_player": ("TorquePlayer", settings.PlayerParameters),
+    "inverse_dynamics": ("InverseDynamicsController", settings.ControllerNodeParameters),
+    "recorder": ("Recorder", settings.RecorderParameters),
+    "viewer": ("Viewer", settings.ViewerParameters),
 }
+"""Class of `nodes.COMMAND` that does the work of each node sst_COMMAND, and its parameters."""
 
 
 def wants_help(words: Sequence[str]) -> bool:
@@ -71,15 +50,15 @@ def wants_help(words: Sequence[str]) -> bool:
 
 def help_text(command: str) -> str:
     """Return the parameters of a node with defaults, units and bounds."""
-    line = COMMANDS[command]
-    defaults = line.parameters()
+    _, parameters = COMMANDS[command]
+    defaults = parameters()
     text = [
         f"usage: {command} [--PARAMETER VALUE ...] [--ros-args ROS_ARGUMENT ...]",
         "",
-        f"Node {line.node}. Parameters, also as `--ros-args -p NAME:=VALUE`:",
+        f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:",
         "",
     ]
-    for name, spec in specs(line.parameters).items():
+    for name, spec in specs(parameters).items():
         value = getattr(defaults, name)
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
         text.append(f"  --{name.replace('_', '-')}")
@@ -96,10 +75,9 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
         InputError: lists every word that is no argument of the node, with the closest one.
 
     """
-    line = COMMANDS[command]
-    known = {**specs(line.parameters), USE_SIM_TIME: Spec("flag", "follow /clock")}
+    known = {**specs(COMMANDS[command][1]), USE_SIM_TIME: Spec("flag", "follow /clock")}
     plain, ros = _split(words)
-    problems = [*_faults(line, ros, known)]
+    problems = [*_faults(ros, known)]
     options: list[str] = []
     index = 0
     while index < len(plain):
@@ -130,7 +108,7 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
 
 def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
     """Return one line for each parameter file that has no parameters for the node of the words."""
-    node, namespace = COMMANDS[command].node, ""
+    node, namespace = f"sst_{command}", ""
     _, ros = _split(words)
     for rule in _values(ros, ("-r", "--remap")):
         if found := re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule):
@@ -150,7 +128,7 @@ def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
 
 def known_anywhere() -> set[str]:
     """Names of the parameters of all nodes: they may share a parameter file."""
-    return {name for line in COMMANDS.values() for name in specs(line.parameters)}
+    return {name for _, parameters in COMMANDS.values() for name in specs(parameters)}
 
 
 def is_foreign(name: str) -> bool:
@@ -180,7 +158,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return plain, ros
 
 
-def _faults(line: CommandLine, ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]:
+def _faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]:
     index = 0
     while index < len(ros):
         word, index = ros[index], index + 1

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from array import array
 
@@ -19,11 +18,11 @@ from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.vec3 import ZERO, axpy
-from sst_ros.nodes import middleware, parameters, process, topics
+from sst_ros.nodes import middleware, parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.torque_commands import TorqueCommands
-from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
+from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 
@@ -202,12 +201,3 @@ class InverseDynamicsController:
         """Print the tracking errors of the last motion."""
         if (tracking := self._follower.tracking()) is not None:
             print(table(tracking), flush=True)
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; `args` begin with the name of the program."""
-    return process.run("inverse_dynamics", InverseDynamicsController, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

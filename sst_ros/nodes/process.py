@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import rclpy
@@ -32,23 +33,20 @@ class Worker(Protocol):
         """Finish while still connected; raise an SstError where the work has failed."""
 
 
-def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None = None) -> int:
+def run(words: Sequence[str]) -> int:
     """Run a node until SIGINT, SIGTERM, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker close.
 
     Args:
-        command: name of the node on the command line.
-        build: makes the worker when rclpy is ready.
-        words: arguments behind the program's name, which is the first; those of the process where
-            None.
+        words: a key of `arguments.COMMANDS` and the arguments behind it.
 
     Returns:
         The exit status: 0, 1 for a failure, 2 for arguments that are refused.
 
     """
     signals.handle()
-    given = list(sys.argv if words is None else words)[1:]
+    command, *given = words
     if arguments.wants_help(given):
         print(arguments.help_text(command))
         return 0
@@ -64,7 +62,8 @@ def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None =
         return 2
     try:
         if not signals.stop.is_set():
-            _spin(build)
+            module = importlib.import_module(f"sst_ros.nodes.{command}")
+            _spin(getattr(module, arguments.COMMANDS[command][0])())
     except (SstError, ParameterException) as error:
         print(f"{command}: {error}", file=sys.stderr)
         return 1
@@ -73,8 +72,7 @@ def run(command: str, build: Callable[[], Worker], words: Sequence[str] | None =
     return 0
 
 
-def _spin(build: Callable[[], Worker]) -> None:
-    worker = build()
+def _spin(worker: Worker) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(worker.node)
     try:

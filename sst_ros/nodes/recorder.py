@@ -9,7 +9,6 @@ an executor, measured in two processes at once.
 from __future__ import annotations
 
 import importlib
-import sys
 import threading
 import time
 from collections.abc import Iterable
@@ -32,7 +31,7 @@ from rosbags.interfaces import (
 )
 
 from sst_ros.errors import SstError
-from sst_ros.nodes import parameters, process, topics
+from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.polling import NeverSpun, take
 from sst_ros.nodes.topics import Endpoint
@@ -256,12 +255,3 @@ def _bag_qos(asked: QoSProfile) -> Qos:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
-
-
-def main(args: list[str] | None = None) -> int:
-    """Entry point of `recorder`."""
-    return process.run("recorder", Recorder, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -13,7 +12,7 @@ from rclpy.node import Node
 
 from sst_ros import scene
 from sst_ros.errors import InputError, SstError
-from sst_ros.nodes import graph, parameters, process, simulation_interfaces, topics
+from sst_ros.nodes import graph, parameters, simulation_interfaces, topics
 from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
 from sst_ros.nodes.compiled_code import CodeCompiler
 from sst_ros.nodes.messages import diagnostics
@@ -149,7 +148,7 @@ class Simulator:
         """Publish the diagnostics, log what is new, request gauges for the next time."""
         own = self.node.get_fully_qualified_name()
         commands = [topic.at(own) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)]
-        publishers = sum(self.node.count_publishers(topic) for topic in commands)
+        publishers = sum(map(self.node.count_publishers, commands))
         level, text, news = self._diagnostics.status(publishers, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
@@ -181,12 +180,3 @@ def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
     except (InputError, TypeError):
         return {}
     return {"duration": simulated.duration or 0.0}
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; `args` begin with the name of the program."""
-    return process.run("simulator", Simulator, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -15,8 +15,7 @@ from sst_ros.description.frame_ids import is_idle
 from sst_ros.errors import SstError
 from sst_ros.mechanism.vec3 import ZERO
 from sst_ros.nodes.messages import nanoseconds
-from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
-from sst_ros.runtime.settings import PlayerParameters
+from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation.simulation import Triple
 
@@ -29,7 +28,7 @@ class TorqueCommands:
 
     """
 
-    def __init__(self, node: Node, given: PlayerParameters | ControllerNodeParameters) -> None:
+    def __init__(self, node: Node, given: AnsweringParameters) -> None:
         self._given = given
         if given.stamped:
             topic = f"{given.simulator}/commands_stamped"

@@ -7,7 +7,6 @@ the period, that of its start first order only.
 
 from __future__ import annotations
 
-import sys
 import threading
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from sst_ros import scene
 from sst_ros.control import torque_profiles
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.vec3 import ZERO
-from sst_ros.nodes import parameters, process, topics
+from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
@@ -106,12 +105,3 @@ class TorquePlayer:
             f"{given.period_ns / NANOSECONDS:g} s: torques are not those of the middle of the hold;"
             " give rate = publish_rate of the simulator, or hold:=start"
         )
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; `args` begin with the name of the program."""
-    return process.run("torque_player", TorquePlayer, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

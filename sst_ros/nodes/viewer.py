@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import threading
 from array import array
 from collections import deque
@@ -22,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.description.frame_ids import is_idle
 from sst_ros.errors import InputError
-from sst_ros.nodes import parameters, process, topics
+from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import nanoseconds
 from sst_ros.runtime.settings import ViewerParameters
@@ -188,12 +187,3 @@ class Viewer:
             return False, f"no reply within {_REPLY_S:g} s"
         reply: Any = future.result()
         return bool(reply.success), str(reply.message)
-
-
-def main(args: list[str] | None = None) -> int:
-    """Entry point of `viewer`."""
-    return process.run("viewer", Viewer, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
+from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
@@ -144,17 +145,9 @@ class SimulatorParameters(Section):
 
 
 @dataclass(frozen=True)
-class PlayerParameters(Section):
-    """Parameters of sst_torque_player."""
+class AnsweringParameters(Section):
+    """Parameters of the nodes that answer joint states with torques."""
 
-    scene: str = text("scene whose torque is played, by name or by path", default="example2")
-    csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
-    hold: str = choice(
-        "instant whose torque is held from a sample until the next: the middle of the hold gives "
-        "an error of second order in the period, its start one of first order",
-        ("middle", "start"),
-        default="middle",
-    )
     rate: int = integer(
         "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
         "Hz",
@@ -179,6 +172,7 @@ class PlayerParameters(Section):
 
     def check(self) -> Iterator[Problem]:
         """Refuse a rate without a whole period."""
+        yield from super().check()
         if NANOSECONDS % self.rate:
             yield Problem("rate", self.rate, "must divide 1e9, so that a period is whole")
 
@@ -186,6 +180,51 @@ class PlayerParameters(Section):
     def period_ns(self) -> int:
         """Time from one command to the next [ns]."""
         return NANOSECONDS // self.rate
+
+
+@dataclass(frozen=True)
+class PlayerParameters(AnsweringParameters):
+    """Parameters of sst_torque_player."""
+
+    scene: str = text("scene whose torque is played, by name or by path", default="example2")
+    csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
+    hold: str = choice(
+        "instant whose torque is held from a sample until the next: the middle of the hold gives "
+        "an error of second order in the period, its start one of first order",
+        ("middle", "start"),
+        default="middle",
+    )
+
+
+@dataclass(frozen=True)
+class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
+    """Parameters of sst_inverse_dynamics: those of the control law and those of the node."""
+
+    scene: str = text("scene of the controller's model, by name or by path", default="reach")
+    motion: str = choice(
+        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until it is "
+        "stopped",
+        ("scene", "topic"),
+        default="scene",
+    )
+    hold: float = number(
+        "time for which the end of the scene's motion is held",
+        "s",
+        default=0.0,
+        least=0.0,
+        most=1e6,
+    )
+    start_tolerance: float = number(
+        "largest distance of gamma from the start of the motion",
+        "rad",
+        default=0.05,
+        above=0.0,
+        most=1.0,
+    )
+    wait_for_recorder: bool = flag(
+        "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",
+        default=False,
+    )
 
 
 def default_topics() -> tuple[str, ...]:

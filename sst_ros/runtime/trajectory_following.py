@@ -23,7 +23,7 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, axpy, dot
 from sst_ros.runtime import joint_trajectory
-from sst_ros.runtime.controller_node_settings import ControllerNodeParameters
+from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.scene.scene import Actuators, Scene
 from sst_ros.simulation.simulation import NANOSECONDS
 

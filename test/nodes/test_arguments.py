@@ -114,7 +114,7 @@ def test_a_parameter_file_for_another_node_is_reported(tmp_path, nodes, words, m
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_every_parameter_with_default_and_bounds(command):
     text = " ".join(help_text(command).split())
-    for name, spec in specs(COMMANDS[command].parameters).items():
+    for name, spec in specs(COMMANDS[command][1]).items():
         assert f"--{name.replace('_', '-')} " in text
         assert spec.allowed() in text
 
