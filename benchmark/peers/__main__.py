@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmark.peers import floor, page, picture, reference, results
+from benchmark.peers import floor, page, picture, readme, reference, results
 from benchmark.peers.series import Series
 from benchmark.peers.study import TARGETS, studied
 from benchmark.peers.task import Task
@@ -46,20 +46,23 @@ def main(arguments: list[str] | None = None) -> int:
     begin = time.monotonic()
     task = Task()
     series, missing = collected(task, options.quick, options.only)
-    truth = reference.solved(task, lambda done, of: told("reference", done, of))
+    truth = reference.solved(task, lambda done, of: progress("reference", done, of))
     rounds = options.rounds or (3 if options.quick else 9)
-    curves = studied(task, truth, series, rounds, told)
+    curves = studied(task, truth, series, rounds, progress)
     least = floor.found(task, TARGETS)
     seconds = time.monotonic() - begin
     result = results.Results(curves, missing, truth.error, rounds, options.quick, seconds, least)
-    told("", 0, 0)
+    progress("", 0, 0)
     print(results.table(result))
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)
         results.write(result, options.out)
-        picture.draw(result, options.out / "peers.png")
+        picture.draw(options.out)
         page.write(result, options.out / "peers.md")
         print(f"\nWritten: {options.out}/peers.md, .png, .csv, .json")
+        if options.out == DOCS and not (options.quick or options.only):
+            readme.write()
+            print("Written: the table of README.md")
     return 0 if all(curve.passed for curve in curves) else 1
 
 
@@ -80,7 +83,7 @@ def collected(
     return found, missing
 
 
-def told(what: str, done: int, of: int) -> None:
+def progress(what: str, done: int, of: int) -> None:
     """Progress on a terminal; nothing in a pipe."""
     if not sys.stderr.isatty():
         return

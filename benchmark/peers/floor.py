@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How soon any program could be there at all that evaluates these accelerations one at a time.
 
-A method that is told values of W_dot, and not its derivatives, needs as many as a polynomial
+A method that uses values of W_dot, and not its derivatives, needs as many as a polynomial
 through them over the whole second to tell the orientation at its end to an error. The nodes here
 are Gauss's, at the true motion, which no method knows beforehand.
 Times the cost of an evaluation in C, that is a floor for one core without SIMD over evaluations.

@@ -37,7 +37,7 @@ class Model:
         import mujoco
 
         self.mujoco: Any = mujoco
-        # A setting that diverges is told in our table; MuJoCo would write files about it.
+        # A setting that diverges is reported in our table; MuJoCo would write files about it.
         mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
         self.model = model = mujoco.MjModel.from_xml_string(_xml(task, settle, motors))
@@ -150,9 +150,9 @@ def _xml(task: Task, settle: float, motors: bool) -> str:
     for body in tree.bodies(task):
         six = body.about_centre[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         text[body.name] = (
-            f'<body name="{body.name}"><inertial pos="{_told(body.centre)}" mass="{body.mass}"'
-            f' fullinertia="{_told(six)}"/>'
-            f'<joint name="{body.joint}" type="hinge" axis="{_told(body.axis)}"/>'
+            f'<body name="{body.name}"><inertial pos="{_numbers(body.centre)}" mass="{body.mass}"'
+            f' fullinertia="{_numbers(six)}"/>'
+            f'<joint name="{body.joint}" type="hinge" axis="{_numbers(body.axis)}"/>'
         )
         children.setdefault(body.parent, []).append(body.name)
 
@@ -160,7 +160,7 @@ def _xml(task: Task, settle: float, motors: bool) -> str:
         return text[name] + "".join(map(nested, children.get(name, []))) + "</body>"
 
     ties = "".join(
-        f'<connect body1="s" body2="{name}" anchor="{_told(point)}" solref="{settle} 1"'
+        f'<connect body1="s" body2="{name}" anchor="{_numbers(point)}" solref="{settle} 1"'
         ' solimp="0.9999 0.9999 0.001"/>'
         for name, point in tree.ties(task)
     )
@@ -173,5 +173,5 @@ def _xml(task: Task, settle: float, motors: bool) -> str:
     )
 
 
-def _told(values: Iterable[float]) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.17g}" for value in values)

@@ -6,13 +6,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmark import machine
-from benchmark.peers import results as told
+from benchmark.peers import results as tables
 from benchmark.peers.results import Results
 
 TEXT = """\
-# sst_ros and its peers, on the same second
+# Speed and accuracy compared with MuJoCo, Pinocchio, Drake, Exudyn and SciPy
 
-<!-- Written by `python -m benchmark.peers`: run it again rather than edit this. -->
+<!-- Written by `python -m benchmark.peers`. -->
 
 {date}. One second of Example 2 of the paper (scene `example2_heavy`: its star is 1.25 times
 as heavy; three sine torques, from rest) on every engine, with the same seven links. The error is
@@ -21,7 +21,7 @@ second, in seconds of the processor.
 
 ![Error against processor time](peers.png)
 
-## How soon an error is reached
+## Time to reach an error
 
 Time in ms, and how many times ours that is. The time is that of the fastest setting tried
 whose error is as small or smaller, not interpolated. Ours is a call of `sst_ros.simulate`, its
@@ -33,21 +33,21 @@ for Drake and at 8000 for Exudyn.
 
 {verdicts}
 
-## What can exist at all
+## Lower bound of the cost
 
-A method that evaluates the acceleration, and not its derivatives, cannot do with fewer than
-a polynomial through them needs to tell the orientation at the end to the error, at the true motion
-and at Gauss's nodes. In C, one after the other on one core, these take so long; and so many times
-longer take the engines:
+A method that evaluates the acceleration, and not its derivatives, needs at least as many
+evaluations as a polynomial through them, at the Gauss nodes of the true motion, needs to give the
+orientation at the end to the error. The table has their time in C, one after the other on one core,
+and the ratio of each engine to it:
 
 {floor}
 
-A ratio beyond a peer's in this table cannot be had by evaluations one at a time. The collocation
-of sst_ros evaluates eight or twelve at once, by SIMD, and iterates.
+No method that evaluates one acceleration at a time can be faster. The collocation of sst_ros
+evaluates eight or twelve at once, by SIMD, and iterates.
 
 ## By method
 
-"Python runs" says what the Python interpreter does while the clock runs. "Gate" is the relative
+"Python runs" names what the Python interpreter does while the clock runs. "Gate" is the relative
 difference of gamma_ddot to the paper's equations at three moving states; an engine that fails it
 is not timed.
 
@@ -55,11 +55,11 @@ is not timed.
 
 {missing}{settings}
 
-## How to read this, honestly
+## Notes and limits
 
 - **Not the same kind of program.** MuJoCo, Pinocchio, Drake and Exudyn simulate any mechanism,
   with contacts, limits and much else; sst_ros simulates this one, in three coordinates that close
-  its loops by construction. The ratios say what such a formulation is worth here. They do not say
+  its loops by construction. The ratios measure what such a formulation gains here. They do not mean
   that those engines are slow: each does more work per step than this mechanism needs.
 - **Where Python is.** sst_ros compiled by numba, Drake, Exudyn and MuJoCo with compiled torques
   have nothing of Python in their loop. Pinocchio is driven from Python, with preallocated arrays
@@ -82,12 +82,12 @@ is not timed.
 - **Drake** closes loops only in its discrete solver, which holds torques over a step and is of
   order 1: it is made for contact, not for this. **Exudyn** integrates redundant coordinates with
   methods of order 2.
-- **SciPy** is on the paper's matrix equations in NumPy as they are written, 3 x 3 at a time: what
-  most would write first, not what SciPy can do with a compiled right-hand side. With the state
-  (γ, γ̇) it solves the direct kinematics for all eight assemblies at every evaluation, as the paper
-  says; with (q, γ̇) it need not.
-- **What is laid out before.** Every engine has its data ready, and its clock begins at the start:
-  MuJoCo's `mjData`, Pinocchio's arrays and views, the prepared motion that `simulate` remembers.
+- **SciPy** is on the paper's matrix equations in NumPy as they are written, 3 x 3 at a time: the
+  direct translation, not what SciPy can do with a compiled right-hand side. With the state
+  (γ, γ̇) it solves the direct kinematics for all eight assembly modes at every evaluation, as in
+  the paper; with (q, γ̇) this is not needed.
+- **Prepared before the clock starts.** Every engine has its data ready, and its clock begins at
+  the start: MuJoCo's `mjData`, Pinocchio's arrays and views, the prepared motion that `simulate` remembers.
   Torques are evaluated while the clock runs, on all engines but for MuJoCo's rollout.
 - **Rounding.** Collocation alone is compiled with fused multiply-adds and shared reciprocals, so
   its last digits are not those of plain Python. Its sines are arithmetic (`integration.sines`):
@@ -113,10 +113,10 @@ def write(results: Results, path: Path) -> None:
     missing = "".join(f"{name}: {why}.\n\n" for name, why in results.missing.items())
     text = TEXT.format(
         date=results.machine["date"],
-        best=_markdown(told.best_rows(results)),
-        verdicts="\n".join(f"- {line}." for line in told.verdicts(results)),
-        series=_markdown(told.rows(results)),
-        floor=_markdown(told.floor_rows(results)),
+        best=_markdown(tables.best_rows(results)),
+        verdicts="\n".join(f"- {line}." for line in tables.verdicts(results)),
+        series=_markdown(tables.rows(results)),
+        floor=_markdown(tables.floor_rows(results)),
         missing=missing,
         settings=_settings(results),
         rounds=results.rounds,
@@ -134,7 +134,7 @@ def _settings(results: Results) -> str:
     lines = ["The settings behind the best times:", ""]
     for engine in results.engines:
         parts = []
-        for target in told.TARGETS:
+        for target in tables.TARGETS:
             point = results.best(engine, target).point
             if point is not None:
                 method = next(c.series.name for c in results.curves if point in c.points)

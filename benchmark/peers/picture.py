@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error against processor time, both logarithmic; colours of Okabe and Ito, a marker a curve."""
+"""Work-precision diagram of the engines, from peers.csv: python -m benchmark.peers.picture.
+
+The best settings of each engine are one strong curve, all its methods are thin ones. Colours are
+those of Okabe and Ito.
+"""
 
 from __future__ import annotations
 
-import re
+import csv
+import json
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -11,67 +17,85 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmark.peers.results import Results
-from benchmark.peers.study import TARGETS, Curve
+from benchmark.peers.ours import PUBLIC
 
-COLOURS = {
-    "sst_ros": "#0072B2",
-    "MuJoCo": "#D55E00",
-    "Pinocchio": "#009E73",
-    "Drake": "#CC79A7",
-    "Exudyn": "#E69F00",
-    "SciPy on the paper's form": "#000000",
+STYLES = {
+    "sst_ros": ("#0072B2", "o"),
+    "MuJoCo": ("#D55E00", "s"),
+    "Pinocchio": ("#009E73", "D"),
+    "Drake": ("#CC79A7", "^"),
+    "Exudyn": ("#E69F00", "v"),
+    "SciPy on the paper's form": ("#000000", "P"),
 }
-LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
-MARKERS = "osD^vPX<>*hpdH8"
+"""Colour and marker of each engine, in the order of the legend."""
+
 SMALLEST, LARGEST = 2e-14, 1.0
+LINES = (1e-6, 1e-9)
+"""Errors that the tables name [rad]."""
 STYLE: Any = {
-    "font.size": 10,
+    "font.size": 11,
     "axes.grid": True,
     "grid.alpha": 0.3,
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
 
+Points = list[tuple[float, float]]
+"""Processor time [ms] and error [rad]."""
 
-def draw(results: Results, path: Path) -> None:
-    """Write the PNG."""
+
+def draw(folder: Path) -> None:
+    """Write peers.png beside peers.csv and peers.json."""
+    with (folder / "peers.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["median_ms"] and not row["failed"]]
+    machine = json.loads((folder / "peers.json").read_text(encoding="utf-8"))["machine"]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 6.2), dpi=150, layout="constrained")
+        figure = Figure(figsize=(10.5, 5.4), dpi=150, layout="constrained")
         axes = figure.subplots()
-        shown: dict[str, int] = {}
-        for index, curve in enumerate(c for c in results.curves if c.front):
-            line = shown.setdefault(curve.series.engine, 0)
-            shown[curve.series.engine] += 1
-            _curve(axes, curve, MARKERS[index % len(MARKERS)], LINES[line % len(LINES)])
-        for target in TARGETS[1:]:
-            axes.axhline(target, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
+        for engine, (colour, marker) in STYLES.items():
+            own = [row for row in rows if row["engine"] == engine]
+            if own:
+                _engine(axes, engine, own, colour, marker)
+        for error in LINES:
+            axes.axhline(error, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
         axes.set(xscale="log", yscale="log", ylim=(0.5 * SMALLEST, LARGEST))
         axes.set_xlabel("processor time of one simulated second [ms], median")
-        axes.set_ylabel("error of the star's orientation at t = 1 s [rad]")
-        axes.set_title("Example 2 of the paper, the same second on each engine", loc="left")
-        figure.legend(loc="outside right upper", fontsize=8.5, handlelength=3.6, frameon=False)
-        told = results.machine
-        note = f"{told['processor']}, one core, {told['date']}. General engines against a solver"
-        note += " for this mechanism only: see peers.md."
-        figure.supxlabel(note, fontsize=8, color="#444444")
-        figure.savefig(path)
+        axes.set_ylabel("error of the orientation at t = 1 s [rad]")
+        axes.set_title("Work-precision diagram: Example 2 of the paper", loc="left")
+        figure.legend(loc="outside right upper", fontsize=9.5, title="best of all settings")
+        note = f"Thin: single methods. {machine['processor']}, one core, {machine['date']}."
+        figure.supxlabel(note, fontsize=8.5, color="#444444")
+        figure.savefig(folder / "peers.png")
 
 
-def _curve(axes: Axes, curve: Curve, marker: str, line: Any) -> None:
-    points = [p for p in curve.front if p.error >= SMALLEST]
-    engine = curve.series.engine
-    short = re.sub(" on the paper's form$", ", paper's form", engine)
-    colour = COLOURS.get(engine, "#666666")
+def _engine(axes: Axes, engine: str, rows: list[dict[str, str]], colour: str, marker: str) -> None:
+    """Draw one thin curve a method, and the best of all; of sst_ros that of the public call."""
+    found: Points = []
+    public = any(row["method"].startswith(PUBLIC) for row in rows)
+    for _, group in groupby(rows, key=lambda row: row["method"]):
+        of_method = list(group)
+        points = front(_points(of_method))
+        if not public or of_method[0]["method"].startswith(PUBLIC):
+            found += points
+        axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.0, alpha=0.3)
     axes.plot(
-        [1e3 * p.time for p in points],
-        [p.error for p in points],
-        color=colour,
-        linestyle=line,
-        linewidth=1.5,
-        marker=marker,
-        markersize=5.5,
-        markerfacecolor=colour if engine == "sst_ros" else "white",
-        markeredgecolor=colour,
-        label=f"{short}: {curve.series.name}",
+        *zip(*front(found), strict=True), color=colour, marker=marker, markersize=5, label=engine
     )
+
+
+def _points(rows: list[dict[str, str]]) -> Points:
+    values = [(float(row["median_ms"]), float(row["error_at_end_rad"])) for row in rows]
+    return [(time, max(error, SMALLEST)) for time, error in values]
+
+
+def front(points: Points) -> Points:
+    """Points that no faster one is as accurate as, in order of time."""
+    best: Points = []
+    for time, error in sorted(points):
+        if not best or error < best[-1][1]:
+            best.append((time, error))
+    return best
+
+
+if __name__ == "__main__":
+    draw(Path(__file__).parents[2] / "docs")

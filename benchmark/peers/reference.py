@@ -30,13 +30,13 @@ class Reference:
     error: float
 
 
-def solved(task: Task, told: Callable[[int, int], None] = lambda done, of: None) -> Reference:
+def solved(task: Task, progress: Callable[[int, int], None] = lambda done, of: None) -> Reference:
     """Integrate twice, with steps of DURATION / 20 and / 40."""
     with mp.workdps(DIGITS):
         slope = _slope(task)
         start = [mp.mpf(number) for number in task.start]
-        rough = _samples(slope, start, 1, lambda k: told(k, 3 * SAMPLES))
-        fine = _samples(slope, start, 2, lambda k: told(SAMPLES + 2 * k, 3 * SAMPLES))
+        rough = _samples(slope, start, 1, lambda k: progress(k, 3 * SAMPLES))
+        fine = _samples(slope, start, 2, lambda k: progress(SAMPLES + 2 * k, 3 * SAMPLES))
         error = max(
             2 * mp.sqrt(sum((a - b) ** 2 for a, b in zip(x[:4], y[:4], strict=True)))
             for x, y in zip(rough, fine, strict=True)
@@ -52,7 +52,7 @@ def _slope(task: Task) -> Callable[..., Any]:
     return function
 
 
-def _samples(slope: Any, y: Any, per_sample: int, told: Callable[[int], None]) -> list[Any]:
+def _samples(slope: Any, y: Any, per_sample: int, progress: Callable[[int], None]) -> list[Any]:
     h = mp.mpf(DURATION) / (SAMPLES * per_sample)
     found = []
     for k in range(SAMPLES):
@@ -61,7 +61,7 @@ def _samples(slope: Any, y: Any, per_sample: int, told: Callable[[int], None]) -
             length = mp.sqrt(sum(part * part for part in y[:4]))
             y = [part / length for part in y[:4]] + y[4:]
         found.append(y)
-        told(k + 1)
+        progress(k + 1)
     return found
 
 

@@ -25,13 +25,12 @@ CLAIMS = (
     ("Pinocchio", "", "Pinocchio under our DOP853 in Python", {1e-6: 300, 1e-9: 800}),
     ("SciPy on the paper's form", "", "SciPy on the NumPy form", {1e-6: 10000, 1e-9: 10000}),
 )
-"""Engine, begin of the method's name, what it is called, and how many times sooner we want to be
-there, by error."""
+"""Engine, begin of the method's name, what it is called, and the target ratio by error."""
 
 
 @dataclass
 class Results:
-    """Everything that is told about a study."""
+    """Everything that is reported about a study."""
 
     curves: list[Curve]
     missing: dict[str, str]
@@ -57,7 +56,7 @@ class Results:
         return reached([c for c in curves if c.series.name.startswith(method)], target)
 
     def ratio(self, other: Reached, target: float) -> float | None:
-        """How many times sooner we reach it: median of the quotients of each round."""
+        """How many times faster we reach it: median of the quotients of each round."""
         ours = self.best(OURS, target).point
         if ours is None or other.point is None:
             return None
@@ -97,19 +96,19 @@ def best_rows(results: Results) -> list[list[str]]:
 
 def verdicts(results: Results) -> list[str]:
     """One sentence a claim."""
-    told = []
+    found = []
     for name, target, wanted, ratio in results.claims():
         if ratio is None:
-            told.append(
-                f"{target:.0e} rad: {name}: no setting tried gets there (wanted {wanted:,} x)"
+            found.append(
+                f"{target:.0e} rad: {name}: not reached by any setting (target {wanted:,})"
             )
             continue
         verdict = "met" if ratio >= wanted else "NOT met"
-        told.append(
-            f"{target:.0e} rad: {_rounded(ratio)} x sooner than {name}"
-            f" (wanted {wanted:,} x: {verdict})"
+        found.append(
+            f"{target:.0e} rad: {_rounded(ratio)} times faster than {name}"
+            f" (target {wanted:,}: {verdict})"
         )
-    return told
+    return found
 
 
 def floor_rows(results: Results) -> list[list[str]]:
@@ -120,14 +119,14 @@ def floor_rows(results: Results) -> list[list[str]]:
     if cost is None:
         return [heads, counts]
     times = {t: n * cost for t, n in results.floor.evaluations.items()}
-    told = [heads, counts, ["in C [ms]", *(f"{1e3 * x:.3g}" for x in times.values())]]
+    found = [heads, counts, ["in C [ms]", *(f"{1e3 * x:.3g}" for x in times.values())]]
     for engine in results.engines:
         cells = []
         for target, least in times.items():
             time = results.best(engine, target).time
             cells.append("-" if time is None else f"{_rounded(time / least)} x")
-        told.append([f"{engine} over that", *cells])
-    return told
+        found.append([f"{engine} over that", *cells])
+    return found
 
 
 def reference_line(results: Results) -> str:
@@ -238,8 +237,8 @@ def _cell(results: Results, found: Reached, target: float) -> str:
     if found.time is None:
         return "-"
     ratio = results.ratio(found, target)
-    told = "" if ratio is None else f" ({_rounded(ratio)} x)"
-    return f"{1e3 * found.time:.3g}{told}"
+    found = "" if ratio is None else f" ({_rounded(ratio)} x)"
+    return f"{1e3 * found.time:.3g}{found}"
 
 
 def _rounded(ratio: float) -> str:

@@ -5,21 +5,23 @@ Engines that are not installed are skipped; nothing is timed here.
 """
 
 import importlib
+import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = str(Path(__file__).parents[2])
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
 def peers():
     """Import from benchmark/peers, which is not part of the package."""
-    sys.path.insert(0, ROOT)
+    sys.path.insert(0, str(ROOT))
     yield lambda name: importlib.import_module(f"benchmark.peers.{name}")
-    sys.path.remove(ROOT)
+    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +99,25 @@ def test_our_headline_is_the_public_call(peers, task):
     for setting, end in zip(first.settings, ends, strict=True):
         tolerance = float(setting.label.split()[1])
         assert peers("task").apart(end, ends[-1]) <= tolerance + 1e-13
+
+
+def test_the_readme_has_the_table_of_the_published_results(peers):
+    readme = peers("readme")
+    text = readme.README.read_text(encoding="utf-8")
+    results = json.loads(readme.RESULTS.read_text(encoding="utf-8"))
+    assert readme.written(text, results) == text, "run python -m benchmark.peers.readme"
+    page = (readme.RESULTS.parent / "peers.md").read_text(encoding="utf-8")
+    assert results["machine"]["date"] in page
+    for row in results["reached"]:
+        if row["method"] == "best of all" and row["ms"] is not None:
+            assert f"{row['ms']:.3g}" in page
+
+
+def test_the_picture_shows_the_best_settings(peers, tmp_path):
+    pytest.importorskip("matplotlib")
+    picture = peers("picture")
+    assert picture.front([(2.0, 1.0), (1.0, 3.0), (3.0, 2.0)]) == [(1.0, 3.0), (2.0, 1.0)]
+    for name in ("peers.csv", "peers.json"):
+        shutil.copy(ROOT / "docs" / name, tmp_path)
+    picture.draw(tmp_path)
+    assert (tmp_path / "peers.png").stat().st_size > 30_000
