@@ -87,8 +87,8 @@ is not timed.
   (γ, γ̇) it solves the direct kinematics for all eight assembly modes at every evaluation, as in
   the paper; with (q, γ̇) this is not needed.
 - **Prepared before the clock starts.** Every engine has its data ready, and its clock begins at
-  the start: MuJoCo's `mjData`, Pinocchio's arrays and views, the prepared motion that `simulate` remembers.
-  Torques are evaluated while the clock runs, on all engines but for MuJoCo's rollout.
+  the start: MuJoCo's `mjData`, Pinocchio's arrays and views, the prepared motion that `simulate`
+  remembers. Torques are evaluated while the clock runs, on all engines but for MuJoCo's rollout.
 - **Rounding.** Collocation alone is compiled with fused multiply-adds and shared reciprocals, so
   its last digits are not those of plain Python. Its sines are arithmetic (`integration.sines`):
   a call of the library would end SIMD.

@@ -4,6 +4,7 @@
 import re
 import shlex
 from functools import cache
+from itertools import pairwise
 
 import yaml
 from docs.blocks import ROOT
@@ -75,11 +76,18 @@ def run(words):
     command, *rest = words
     assert command in {node.command for node in NODES} or command == "viewer", command
     assert (ROOT / "executables" / command).is_file(), command
-    for given in (rest[i + 1] for i, word in enumerate(rest) if word == "-p"):
-        name, _, text = given.partition(":=")
+    pairs = [rest[i + 1].partition(":=")[::2] for i, word in enumerate(rest) if word == "-p"]
+    for name, text in pairs:
         if name not in STANDARD:
             assert name in parameters(command), f"{command} has no parameter {name}"
             _value(parameters(command)[name], text)
+    for option, following in pairwise([*rest, "--"]):
+        if option.startswith("--") and option not in ("--", "--ros-args"):
+            name, given, text = option.removeprefix("--").partition("=")
+            spec = parameters(command)[name.replace("-", "_")]
+            if spec.kind in ("flag", "integer", "number"):
+                text = text if given else "true" if following.startswith("-") else following
+                _value(spec, text + ".0" if spec.kind == "number" and text.isdigit() else text)
 
 
 def _value(spec, text):

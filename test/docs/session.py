@@ -17,6 +17,7 @@ from docs import installed
 from sst_ros.cli.main import NODES
 
 PYTHONS = (".venv/bin/python", "python", "python3")
+COMMAND = "sst-ros"
 LIMIT_S = 60.0
 RECORDED_BYTES = 20_000
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
@@ -87,6 +88,9 @@ class Session:
 
     def _line(self, line, block):
         words = shlex.split(line)
+        if words[0] == COMMAND:
+            line = line.replace(COMMAND, "python -m sst_ros", 1)
+            words = shlex.split(line)
         if words[0] in installed.KINDS:
             try:
                 installed.check(line)
@@ -174,7 +178,7 @@ def _is_shell(block):
     if block.language or not block.text.strip():
         return False
     first = {line.split()[0] for line in commands(block.text)}
-    return first <= {*installed.KINDS, *PYTHONS}
+    return first <= {*installed.KINDS, *PYTHONS, COMMAND}
 
 
 def _program(text):

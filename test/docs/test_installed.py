@@ -12,6 +12,7 @@ from docs import installed
 
 GOOD = (
     "ros2 run sst_ros simulator --ros-args -p scene:=example2 -p rate:=500 -p compiled:=true",
+    "ros2 run sst_ros simulator --scene example2 --wait-for-command --duration=0",
     "ros2 topic pub -1 /sst_simulator/commands std_msgs/msg/Float64MultiArray '{data: [1.0]}'",
     "ros2 service call /sst_simulator/reset std_srvs/srv/Trigger",
     "ros2 bag record $(cat $(ros2 pkg prefix --share sst_ros)/config/topics.txt)",
@@ -22,6 +23,8 @@ GOOD = (
 BAD = (
     "ros2 run sst_ros simulater",
     "ros2 run sst_ros simulator --ros-args -p scen:=example2",
+    "ros2 run sst_ros simulator --scen example2",
+    "ros2 run sst_ros simulator --rate 500.5",
     "ros2 run sst_ros simulator --ros-args -p rate:=500.0",
     "ros2 run sst_ros simulator --ros-args -p compiled:=1",
     "ros2 topic echo /sst_simulator/command",
@@ -54,7 +57,7 @@ def test_what_does_not_exist_is_seen(line):
     ("language", "text", "said"),
     [
         ("python", "assert 1 == 2", "AssertionError"),
-        ("bash", "true\n.venv/bin/python -m sst_ros scene show nowhere", "must be a readable"),
+        ("bash", "true\nsst-ros scene show nowhere", "must be a readable"),
         ("bash", "ros2 run sst_ros nothing", "ros2 run sst_ros nothing"),
         ("python", "# examples/push.py\nimport rclpy", "is not examples/push.py"),
         ("fortran", "END", "nobody knows what to do with fortran"),

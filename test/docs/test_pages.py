@@ -64,8 +64,8 @@ def anchors(path):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_in_the_text_are_commands(page):
-    """`python -m sst_ros ...` in running text names commands, options and nodes that exist."""
-    for text in re.findall(r"`[^`\n]*python -m sst_ros ([^`\n]+)`", prose(page)):
+    """`sst-ros ...` in running text names commands, options and nodes that exist."""
+    for text in re.findall(r"`(?:sst-ros|python -m sst_ros) ([^`\n]+)`", prose(page)):
         words = shlex.split(text.replace("...", ""))
         if words[0] in NODES or words[0].isupper():
             continue
