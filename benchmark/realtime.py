@@ -349,13 +349,13 @@ def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
 
 
 _HEAD = """\
-# Keeping time
+# Real-time performance: missed ticks, lateness, processor load
 
 Measured by `python -m benchmark.realtime --minutes 10 --write`; shorter runs say so in their
 tables. Python without a real-time kernel is soft real time. A tick is missed when the one before
 it, or the machine, makes it late by a whole period; simulated time then drops it and the
-diagnostics count it. A loop that does nothing but sleep to the same deadlines, in a process of its
-own, says in the same minutes what the machine alone makes anybody miss."""
+diagnostics count it. A loop that only sleeps to the same deadlines, in a process of its
+own, measures in the same minutes how many deadlines the machine alone misses."""
 
 
 if __name__ == "__main__":
