@@ -23,6 +23,8 @@ if TYPE_CHECKING:
         SingularConfiguration,
         SstError,
     )
+    from sst_ros.identification.identification import Identification
+    from sst_ros.identification.identify import identify
     from sst_ros.integration.batch import Batch
     from sst_ros.mechanism.geometry import Geometry
     from sst_ros.mechanism.kinematics import direct as direct_kinematics
@@ -49,6 +51,7 @@ __all__ = [
     "Controller",
     "ControllerSettings",
     "Geometry",
+    "Identification",
     "InputError",
     "InverseDynamics",
     "PolynomialTorque",
@@ -66,6 +69,7 @@ __all__ = [
     "__version__",
     "arc_inertia",
     "direct_kinematics",
+    "identify",
     "inverse_kinematics",
     "load_scene",
     "plot_workspace",
@@ -82,6 +86,7 @@ _MODULES = {
     "Controller": "control.controller",
     "ControllerSettings": "control.controller_settings",
     "Geometry": "mechanism.geometry",
+    "Identification": "identification.identification",
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
     "PolynomialTorque": "simulation.torque",
@@ -98,6 +103,7 @@ _MODULES = {
     "Trajectory": "simulation.trajectory",
     "arc_inertia": "scene.arcs",
     "direct_kinematics": "mechanism.kinematics:direct",
+    "identify": "identification.identify",
     "inverse_kinematics": "mechanism.kinematics:inverse",
     "load_scene": "scene.scene:load",
     "plot_workspace": "plot.workspace",

@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures for all rooms: a run of Example 2, as messages and as a recording."""
 
+import os
+
+# Before NumPy is imported: OpenBLAS's threads wait for each other where workers share the cores.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 from bags import bags, example2, written
 

@@ -25,7 +25,7 @@ FLOORS = (
     {"plot", "view"},
     {"report"},
     {"runtime"},
-    {"studies"},
+    {"studies", "identification"},
     {"nodes"},
     {"demo", "launch_parts", "paper"},
     {"cli"},

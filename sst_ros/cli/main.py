@@ -28,6 +28,7 @@ COMMANDS = (
     "export",
     "recover",
     "study",
+    "identify",
 )
 NODES = {
     "simulator": "node: integrate the equation of motion in real time",

@@ -10,6 +10,8 @@ mode.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 from sst_ros.control.reference import Quadruple, Reference, Triple
@@ -17,7 +19,13 @@ from sst_ros.dynamics import kernel, loads
 from sst_ros.dynamics.expression import trace
 from sst_ros.dynamics.kernel import Leg
 from sst_ros.dynamics.math_functions import sqrt
-from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE, compiled
+from sst_ros.dynamics.traced_dynamics import (
+    BODY_ACCELERATION,
+    QUATERNION,
+    RATE,
+    compiled,
+    compiled_for_arrays,
+)
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, cross, dot, rotation_rows, scaled, turned_back
 
@@ -97,6 +105,11 @@ class ActuatorSpaceMap:
                 break
             q = (moved[0], moved[1], moved[2], moved[3])
         return best
+
+    @cached_property
+    def star_rates(self) -> Callable[..., tuple[Any, ...]]:
+        """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
+        return compiled_for_arrays(trace(self._of_actuators, (*QUATERNION, *_ACTUATORS)))
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]

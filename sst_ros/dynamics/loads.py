@@ -91,7 +91,7 @@ def of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     if scene.stroke.stiffness is not None:
         damping = damping_of(scene.stroke)
         stops = CompliantStops(float(geometry.arc[k]), scene.stroke.stiffness, damping)
-    heavy = any(map(np.any, (*drive, *link)))
+    heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
     if not (any(friction) or any(by_joint) or heavy or stops):
         return None
     return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)

@@ -13,7 +13,18 @@ from docs.blocks import ROOT, blocks, links, pages, prose
 from sst_ros.cli.main import NODES, parser
 
 PAGES = pages()
-LONG = ("batch", "evaluate", "fast", "follow", "lockstep", "look", "many", "plot", "record")
+LONG = (
+    "batch",
+    "evaluate",
+    "fast",
+    "follow",
+    "identify",
+    "lockstep",
+    "look",
+    "many",
+    "plot",
+    "record",
+)
 """How-to pages whose commands are those of the tutorial in another order, or that compile."""
 WITH_BLOCKS = [
     pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG else page

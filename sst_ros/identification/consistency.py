@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Physically consistent parameters: those of bodies that can exist.
+
+A body has mass m, first moment h and inertia I about O if and only if its pseudo-inertia
+
+    J = [[S, h], [h^T, m]],  S = tr(I) / 2 - I,
+
+is positive semidefinite: mass >= 0, I positive definite, and the triangle inequality of its
+principal moments (Wensing, Kim and Slotine, IEEE Robot. Autom. Lett. 3 (2018) 60-67). Its centre
+lies within a distance r of O if [[m r 1, h], [h^T, m r]] is. Friction, stiffness and rotors must be
+>= 0. All this is linear in the parameters, and to minimise
+
+    chi^2 of the base parameters + squared distance from the values given, in sizes of the bodies
+
+under it is a semidefinite programme (Sousa and Cortesao, Int. J. Robotics Research 33 (2014)
+931-944), solved by the logarithmic barrier. The distance decides what torques leave open, and
+nothing that torques determine. Newton's step of each barrier problem is itself a linear
+least-squares problem, so that data without noise are fitted to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from sst_ros.identification.base_parameters import BaseParameters
+from sst_ros.identification.least_squares import LinearFit
+from sst_ros.identification.parameters import STANDARD, bodies_of
+from sst_ros.mechanism.geometry import Array
+
+INTERIOR = 1e-3
+"""Share of its trace that J of a flat body is lifted by at the start, into the interior."""
+
+BARRIERS = tuple(10.0**-k for k in range(0, 11))
+"""Weights of the barrier; at the last, chi^2 is off by 1e-10 for each boundary that is active."""
+
+CENTRED = 1e-2
+"""Squared decrement, over the barrier, below which Newton's method converges quadratically."""
+
+_NEWTON_STEPS = 100
+_CLOSE = 0.95
+"""Share of the way to the boundary that a step may go."""
+
+
+class Cone(NamedTuple):
+    """A matrix that must be positive semidefinite: sum of values[places] times basis.
+
+    Attributes:
+        places: of the parameters that it depends on.
+        basis: shape (len(places), n, n).
+
+    """
+
+    places: list[int]
+    basis: Array
+
+    def matrix(self, values: Array) -> Array:
+        """Return the matrix for all parameters."""
+        return np.asarray(np.tensordot(values[self.places], self.basis, 1))
+
+
+def consistent_values(
+    names: Sequence[str], given: Array, base: BaseParameters, fit: LinearFit, reach: float
+) -> tuple[Array, float]:
+    """Values of all parameters that fit the base parameters, those of bodies that can exist.
+
+    Args:
+        names: of the parameters, length p.
+        given: their values in the scene, shape (p,).
+        base: the combinations that were estimated.
+        fit: their estimates.
+        reach: distance from O within which centres of mass lie [m].
+
+    Returns:
+        The values, shape (p,), and chi^2 of the base parameters there: how much worse the torques
+        are fitted than without the constraints.
+
+    """
+    cones = list(_cones(tuple(names), reach))
+    rows = np.vstack([fit.root @ base.transform, np.diag(1.0 / scales(names, given))])
+    right = np.concatenate([fit.root @ fit.estimate, given / scales(names, given)])
+    values = _interior(cones, given)
+    for barrier in BARRIERS:
+        for _ in range(_NEWTON_STEPS):
+            step, size, decrement = _newton_step(cones, rows, right, values, barrier)
+            if decrement < CENTRED:
+                values = values + size * step
+                break
+            before = _cost(cones, rows, right, values, barrier)
+            while _cost(cones, rows, right, values + size * step, barrier) > before:
+                size *= 0.5
+                if size < 1e-12:  # rounding: the step cannot get better
+                    break
+            values = values + size * step
+    off = fit.root @ (base.transform @ values - fit.estimate)
+    return values, float(off @ off)
+
+
+def scales(names: Sequence[str], given: Array) -> Array:
+    """Size that a parameter may have: of bodies by their mass and inertia, shape (p,)."""
+    values = dict(zip(names, given.tolist(), strict=True))
+    sizes = []
+    for name in names:
+        body, _, part = name.partition(".")
+        trace = sum(abs(values.get(f"{body}.inertia.{axis}", 0.0)) for axis in ("xx", "yy", "zz"))
+        mass = abs(values.get(f"{body}.mass", 0.0)) or 1.0
+        size = abs(values[name])
+        if part.startswith("inertia"):
+            size = trace
+        elif part.startswith("moment"):
+            size = float(np.sqrt(mass * trace))
+        elif part == "mass":
+            size = mass
+        sizes.append(size or 1.0)
+    return np.array(sizes)
+
+
+def pseudo_inertia(standard: Array) -> Array:
+    """J of the ten parameters of a body in the order of `STANDARD`, shape (4, 4)."""
+    return np.asarray(np.tensordot(standard, _PSEUDO, 1))
+
+
+def _cost(cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float) -> float:
+    """Cost of a barrier problem; infinite outside the cones."""
+    try:
+        logs = [np.log(np.diag(np.linalg.cholesky(cone.matrix(values)))) for cone in cones]
+    except np.linalg.LinAlgError:
+        return np.inf
+    off = rows @ values - right
+    return float(0.5 * off @ off - 2.0 * barrier * sum(float(one.sum()) for one in logs))
+
+
+def _newton_step(
+    cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float
+) -> tuple[Array, float, float]:
+    """Newton's step for |rows values - right|^2 / 2 - barrier sum log det.
+
+    Returns:
+        The step, how far to go along it, and its decrement, squared and over the barrier.
+
+    """
+    blocks, targets, whitened = [rows], [right - rows @ values], []
+    for cone in cones:
+        inverse = np.linalg.inv(np.linalg.cholesky(cone.matrix(values)))
+        slopes = inverse @ cone.basis @ inverse.T  # of the matrix, in units of itself
+        block = np.zeros((slopes[0].size, len(values)))
+        block[:, cone.places] = slopes.reshape(len(slopes), -1).T
+        blocks.append(np.sqrt(barrier) * block)
+        targets.append(np.sqrt(barrier) * np.eye(len(inverse)).ravel())
+        whitened.append((cone.places, slopes))
+    matrix = np.vstack(blocks)
+    lengths = np.linalg.norm(matrix, axis=0)
+    q, r = np.linalg.qr(matrix / lengths)
+    part = q.T @ np.concatenate(targets)
+    step = np.asarray(solve_triangular(r, part) / lengths)
+    least = min(
+        (float(np.linalg.eigvalsh(np.tensordot(step[places], slopes, 1))[0])
+         for places, slopes in whitened),
+        default=0.0,
+    )  # fmt: skip
+    return step, 1.0 if least > -_CLOSE else -_CLOSE / least, float(part @ part) / barrier
+
+
+def _cones(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
+    """Yield what must be positive semidefinite."""
+    index = {name: i for i, name in enumerate(names)}
+    for body in bodies_of(names):
+        if f"{body}.mass" in index:
+            places = [index[f"{body}.{part}"] for part in STANDARD]
+            yield Cone(places, _PSEUDO)
+            yield Cone(places[:4], _centre(reach))
+        else:
+            places = [index[f"{body}.{part}"] for part in STANDARD[4:]]
+            yield Cone(places, _PSEUDO[4:, :3, :3])
+    for name, place in index.items():
+        if name.startswith(("friction", "springs", "actuators")):
+            yield Cone([place], np.ones((1, 1, 1)))
+
+
+def _interior(cones: list[Cone], given: Array) -> Array:
+    """Values near those given at which every matrix is positive definite."""
+    values = given.copy()
+    for cone in cones:
+        n = cone.basis.shape[1]
+        if n == 1:
+            values[cone.places] = np.maximum(values[cone.places], INTERIOR)
+        elif len(cone.places) > n:
+            j = cone.matrix(values)
+            lifted = j + INTERIOR * (float(np.trace(j[:3, :3])) or 1.0) * np.eye(n)
+            back = np.linalg.pinv(cone.basis.reshape(len(cone.places), -1).T)
+            values[cone.places] = back @ lifted.ravel()
+    return np.asarray(values)
+
+
+def _pseudo_basis() -> Array:
+    """J of each of the ten parameters alone, shape (10, 4, 4)."""
+    result = np.zeros((10, 4, 4))
+    result[0, 3, 3] = 1.0
+    for i in range(3):
+        result[1 + i, i, 3] = result[1 + i, 3, i] = 1.0
+    for row, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
+        inertia = np.zeros((3, 3))
+        inertia[i, j] = inertia[j, i] = 1.0
+        result[row, :3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    return np.asarray(result)
+
+
+def _centre(reach: float) -> Array:
+    """Basis of [[m r 1, h], [h^T, m r]] for m and h, shape (4, 4, 4)."""
+    basis = _PSEUDO[:4].copy()
+    basis[0] = reach * np.eye(4)
+    return np.asarray(basis)
+
+
+_PSEUDO = _pseudo_basis()

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification from noise-free runs of a digital controller, and what is refused."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from identification import manipulators
+
+from sst_ros import InverseDynamics, load_scene, reference_motion, simulate
+from sst_ros.errors import InputError
+from sst_ros.identification import parameters
+from sst_ros.identification.identify import identify
+
+EXACT = 1e-9
+SCENES = ("thin_arcs", "general", "payload")
+
+
+@cache
+def identified(name):
+    """The true scene and what is identified from a run of it, from wrong values."""
+    plant = getattr(manipulators, name)()
+    # The mean over a period is of fourth order; general geometry has the worst condition.
+    period = 4e-4 if name == "general" else manipulators.PERIOD
+    return plant, identify(manipulators.run(plant, period=period), manipulators.wrong(plant))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_base_parameters_are_those_of_the_plant(name):
+    plant, found = identified(name)
+    true = found.base.transform @ parameters.values(plant, found.names)
+    assert np.linalg.norm(found.estimate - true) < EXACT * np.linalg.norm(true)
+    assert found.undetermined == found.vague == found.warnings == ()
+    assert found.consistent
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_torques_of_another_motion_are_predicted(name):
+    """By the base parameters, and by the inverse dynamics of the identified scene."""
+    plant, found = identified(name)
+    other = manipulators.sweeping(plant, 1.0, speed=0.9)
+    motion, inverse = reference_motion(other), InverseDynamics(plant)
+    model = InverseDynamics(found.scene)
+    references = [motion.at(t) for t in np.linspace(0.0, 1.0, 50).tolist()]
+    expected = np.array([inverse.reference_torque(one) for one in references])
+    by_scene = np.array([model.reference_torque(one) for one in references])
+    states = (
+        np.array([one.quaternion for one in references]),
+        np.array([one.body_rate for one in references]),
+        np.array([one.body_acceleration for one in references]),
+    )
+    known, columns = found.regressor(*states)
+    by_base = known + found.base.of_columns(columns) @ found.estimate
+    size = np.abs(expected).max()
+    assert np.abs(by_base - expected).max() < EXACT * size
+    assert np.abs(by_scene - expected).max() < EXACT * size
+
+
+def test_predict_compares_with_the_measured_torques():
+    plant, found = identified("thin_arcs")
+    predicted, measured = found.predict(manipulators.run(manipulators.sweeping(plant, 1.0, 0.9)))
+    assert np.abs(predicted - measured).max() < EXACT * np.abs(measured).max()
+
+
+def test_smooth_samples_without_a_hold_are_as_exact():
+    """A free swing under sine torques: samples of torque, angle and rate at the same instants."""
+    scene = load_scene("example2_heavy")
+    motion = simulate(scene, t_eval=np.arange(1001) * 1e-3, tolerance=1e-13)
+    found = identify(motion, scene.with_values({"star.inertia.xx": 0.5}), parameters=("star",))
+    true = found.base.transform @ parameters.values(scene, found.names)
+    assert np.abs(found.estimate - true).max() < EXACT * np.abs(true).max()
+
+
+def test_unknown_friction_and_offsets_are_found():
+    plant = manipulators.sweeping(manipulators.thin_arcs(), 1.5).with_values(manipulators.FRICTION)
+    motion = manipulators.run(plant)
+    arrays = {
+        "t": motion.t, "gamma": motion.gamma, "gamma_dot": motion.gamma_dot, "held": True,
+        "torque": motion.torque[1:] + np.array([0.1, -0.2, 0.3]),
+        "quaternion": motion.quaternion[0],
+    }  # fmt: skip
+    guessed = {"viscous": 1.0, "coulomb": 1.0, "smoothing": 0.1}
+    model = plant.with_values({"friction": {"gamma": guessed}})
+    found = identify(arrays, model, parameters=("star", "friction", "offset"))
+    values = dict(zip(found.names, found.values, strict=True))
+    for name, true in manipulators.FRICTION.items():
+        if "smoothing" not in name:
+            assert values[name] == pytest.approx(true, rel=1e-6)
+    assert [values[f"offset[{k}]"] for k in range(3)] == pytest.approx([0.1, -0.2, 0.3], rel=1e-7)
+    assert found.scene.friction.gamma.viscous == pytest.approx(0.2, rel=1e-6)
+
+
+def test_a_motion_that_is_too_poor_names_what_it_leaves_open():
+    """All gamma equal: the star turns about E alone, so xx, yy and xy do not matter."""
+    scene = load_scene("example1")
+    motion = simulate(scene, t_eval=np.arange(501) * 1e-3)
+    found = identify(motion, scene)
+    lost = {label.split()[0] for label in found.undetermined}
+    assert lost >= {"star.inertia.xx", "star.inertia.yy", "star.inertia.xy"}
+    assert "star.inertia.zz" not in lost
+    assert "not determined by this motion: star.inertia.xx" in found.table()
+    assert "identify design" in found.table()
+
+
+def test_saturated_samples_are_left_out_with_a_warning():
+    plant = manipulators.sweeping(manipulators.thin_arcs(), 1.5)
+    motion = manipulators.run(plant, period=1e-3)
+    limit = float(np.abs(motion.torque).max()) * 0.8
+    model = plant.with_values({"actuators.torque_limit": limit})
+    arrays = {
+        "t": motion.t, "gamma": motion.gamma, "gamma_dot": motion.gamma_dot, "held": True,
+        "torque": np.clip(motion.torque[1:], -limit, limit), "quaternion": motion.quaternion[0],
+    }  # fmt: skip
+    found = identify(arrays, model)
+    assert "a torque was at the limit" in found.warnings[0]
+    true = found.base.transform @ parameters.values(plant, found.names)
+    assert np.linalg.norm(found.estimate - true) < EXACT * np.linalg.norm(true)
+
+
+def good():
+    plant = manipulators.thin_arcs()
+    motion = reference_motion(plant)
+    inverse = InverseDynamics(plant)
+    t = np.arange(400) * 5e-3
+    references = [motion.at(time) for time in t.tolist()]
+    return {
+        "t": t,
+        "gamma": np.array([one.gamma for one in references]),
+        "torque": np.array([inverse.reference_torque(one) for one in references]),
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gamma": None}, "gamma = None: must be given"),
+        ({"t": np.zeros(400)}, "must be rising times"),
+        ({"torque": np.zeros((400, 2))}, r"torque = \(400, 2\): must have the shape \(400, 3\)"),
+        ({"speed": 1.0}, "speed = 1.0: must be one of t, gamma"),
+        ({"gamma": np.full((400, 3), np.nan)}, "must be finite numbers"),
+        (
+            {"gamma": np.linspace(3.0, 3.1, 1200).reshape(400, 3)},
+            "must be angles of this manipulator",
+        ),
+        ({"gamma": np.full((400, 3), 0.785)}, "a manipulator at rest shows no inertia"),
+        ({"quaternion": (0.0, 0.0, 0.0, 1.0)}, "must be angles of this manipulator"),
+    ],
+)
+def test_bad_data_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        identify(good() | change, manipulators.thin_arcs())
+
+
+def test_bad_arguments_are_refused():
+    scene = manipulators.thin_arcs()
+    short = {name: rows[:10] for name, rows in good().items()}
+    for data, options, message in (
+        (short, {}, "must be 20 samples or more"),
+        (good(), {"method": "magic"}, "must be one of"),
+        (good(), {"cutoff": 1e3}, "below half the rate of samples"),
+        (good(), {"noise": (0.1, 0.0, 0.1)}, "three finite standard deviations"),
+        (good(), {"parameters": ("mass",)}, "begins no parameter"),
+    ):
+        with pytest.raises(InputError, match=message):
+            identify(data, scene, **options)
+    with pytest.raises(InputError, match="must be given with arrays"):
+        identify(good())
