@@ -141,7 +141,7 @@ class Simulator:
             self.node.get_logger().info(f"scheduling of the run: {granted}")
 
     def _read_gauges(self) -> Reply:
-        self._diagnostics.gauges = read_gauges(self._loop.simulation)
+        self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)
         return Reply(True, "")
 
     def _report(self) -> None:

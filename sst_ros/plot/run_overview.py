@@ -54,6 +54,9 @@ class Overview(NamedTuple):
         latency_s, latency_us: times [s] and latencies of commands [us].
         late_ms: delay of each sample [ms], shape (n,).
         effort: difference of effort and applied torque [N m], shape (n,).
+        used_s: computing time of the steps so far [s] at each report of the simulator, shape (r,).
+        estimates: errors of the orientation [rad] by name, shape (r,) each.
+        reported_s, step_us: times of the reports [s], mean time of a step so far [us].
 
     """
 
@@ -69,6 +72,10 @@ class Overview(NamedTuple):
     latency_us: Array
     late_ms: Array
     effort: Array
+    used_s: Array
+    estimates: Mapping[str, Array]
+    reported_s: Array
+    step_us: Array
 
 
 @styled
@@ -99,9 +106,9 @@ def draw_errors(seconds: Array, panels: Mapping[str, ErrorCurves]) -> Figure:
 
 @styled
 def draw_overview(run: Overview, title: str, footnote: str) -> Figure:
-    """Draw a run on one page with eight panels."""
-    figure = Figure(figsize=(12.0, 13.4))
-    grid = figure.subplots(4, 2)
+    """Draw a run on one page with ten panels."""
+    figure = Figure(figsize=(12.0, 16.6))
+    grid = figure.subplots(5, 2)
     grid[0, 0].set_title("Integration error, against the same torques")
     _errors(grid[0, 0], run.seconds, run.error)
     if np.isfinite(run.error.gamma).any():
@@ -114,10 +121,15 @@ def draw_overview(run: Overview, title: str, footnote: str) -> Figure:
     _losses(grid[2, 0], run)
     _latency(grid[2, 1], run)
     _curve(grid[3, 0], run.seconds, run.late_ms, "Delay of samples",
-           "reception delay relative to the fastest sample [ms]")  # fmt: skip
+           "delay, less the shortest [ms]")  # fmt: skip
     _curve(grid[3, 1], run.seconds, run.effort, "Effort of joint_states against applied torque",
            "largest difference [N m]", zero="none")  # fmt: skip
-    for axes in (*grid[:, 0], *grid[[0, 2, 3], 1]):
+    _used(grid[4, 0], run)
+    known = np.isfinite(run.step_us)
+    step_us = run.step_us[known] if known.any() else None
+    _curve(grid[4, 1], run.reported_s[known], step_us, "Computing time of a step, by the simulator",
+           "mean so far [µs]", zero="none", marker="o")  # fmt: skip
+    for axes in (*grid[:4, 0], *grid[[0, 2, 3, 4], 1]):
         axes.set_xlabel("time t [s]")
         axes.set_xlim(0.0, run.seconds[-1])
     figure.suptitle(title, fontsize=13)
@@ -138,19 +150,42 @@ def _errors(axes: Axes, seconds: Array, error: ErrorCurves) -> None:
 
 
 def _curve(
-    axes: Axes, seconds: Array, values: Array | None, title: str, label: str, zero: str = ""
+    axes: Axes,
+    seconds: Array,
+    values: Array | None,
+    title: str,
+    label: str,
+    zero: str = "",
+    marker: str = "",
 ) -> None:
     axes.set_title(title)
     axes.set_ylabel(label)
     if values is None or not np.isfinite(values).any():
         _unknown(axes)
         return
-    axes.plot(*few(seconds, values), color=BLUE, linewidth=1.4)
+    axes.plot(*few(seconds, values), color=BLUE, linewidth=1.4, marker=marker, markersize=4)
     if zero:
         axes.set_ylim(bottom=0.0)
         if not np.nanmax(values):
             axes.set_ylim(0.0, 1.0)
             _unknown(axes, zero)
+
+
+def _used(axes: Axes, run: Overview) -> None:
+    axes.set_title("Error against computing time used, at the reports of the simulator")
+    axes.set_xlabel("computing time of the steps so far [ms]")
+    axes.set_ylabel("error of the orientation [rad]")
+    some = False
+    for (name, values), style in zip(run.estimates.items(), LINES, strict=False):
+        shown = positive(values)
+        if (np.isfinite(shown) & np.isfinite(run.used_s)).any():
+            some = True
+            axes.plot(1e3 * run.used_s, shown, label=name, marker="o", markersize=4, **style)
+    if not some:
+        _unknown(axes)
+        return
+    axes.set_yscale("log")
+    axes.legend(fontsize=8, loc="best")
 
 
 def _pace(axes: Axes, run: Overview) -> None:

@@ -12,11 +12,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.run_overview import ErrorCurves, Overview, draw_overview
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.table import made_line, table
 from sst_ros.report.timing import Timing
+
+ESTIMATES = (
+    "integration error so far", "its estimate by the simulator",
+    "hold error if torques are those of the start", "the same, of the middle",
+)  # fmt: skip
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 1100px; color: #222;
@@ -38,19 +44,25 @@ def overview(
     recording: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
 ) -> Figure:
     """Draw a run on one page."""
-    losses = {
+    losses: dict[str, tuple[Array, Array] | None] = {
         name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
         for name, times in (("samples lost", timing.lost_s),
                             ("gaps between applied torques", timing.gaps_s))
     }  # fmt: skip
-    missed = (timing.missed_s, timing.missed) if len(timing.missed) else None
+    at, missed, ticks, step_us, *estimates = timing.reported.T
+    known = np.isfinite(missed)
+    losses["ticks missed"] = (at[known], missed[known]) if known.any() else None
+    used = 1e-6 * ticks * step_us
+    largest = np.fmax.accumulate(integration.error.orientation)
+    found = np.interp(at, recording.seconds, largest) if len(at) else at
+    curves = dict(zip(ESTIMATES, [found, *estimates], strict=True))
     seconds, count = recording.seconds, len(recording.time_ns)
     return draw_overview(
         Overview(
             seconds, error_curves(integration), timing.energy, timing.pace_s, timing.pace,
-            timing.period_us, timing.nominal_us, {**losses, "ticks missed": missed},
+            timing.period_us, timing.nominal_us, losses,
             timing.latency.time_s, timing.latency.received_us, timing.late_us / 1e3,
-            recording.effort_difference,
+            recording.effort_difference, used, curves, at, step_us,
         ),
         f"Run of {recording.scene.name}: {seconds[-1]:g} s, {count} samples",
         made_line(summary),

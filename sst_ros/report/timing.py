@@ -19,6 +19,12 @@ from sst_ros.recording.time_series import NANOSECONDS
 from sst_ros.report import energy_balance
 from sst_ros.report.latency import Latency, latency
 
+REPORTED = (
+    "ticks_missed", "ticks", "step_mean_us", "error_estimate", "hold_error_start",
+    "hold_error_middle",
+)  # fmt: skip
+"""Numbers of the diagnostics that are shown over the run."""
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -32,8 +38,8 @@ class Timing:
         pace_s, pace: times [s] and simulated time per time on the recorder's clock.
         late_us: reception delay of each sample relative to the fastest one, by its stamp
             [us], shape (n,): it grows where the simulator falls behind.
-        missed_s, missed: times at which the simulator reported its dropped ticks
-            [s], and how many.
+        reported: a row for each of the simulator's reports: time of the run [s], and the numbers
+            of REPORTED, nan where one was not reported, shape (r, 1 + len(REPORTED)).
         latency: of commands.
         energy: energy balance residual of each sample since the start [J], shape
             (n,); nan where it is not known. None where it cannot be known.
@@ -48,8 +54,7 @@ class Timing:
     pace_s: Array
     pace: Array
     late_us: Array
-    missed_s: Array
-    missed: Array
+    reported: Array
     latency: Latency
     energy: Array | None
     missing: tuple[str, ...]
@@ -71,13 +76,12 @@ def timing(recording: Recording) -> Timing:
     gaps = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
     pace_s, pace = _pace(recording)
     late = recording.received_ns - recording.time_ns
-    missed_s, missed = _missed(recording)
     if not recording.diagnostics:
         missing.append("no diagnostics: missed ticks and samples published are not known")
     return Timing(
         received, period / 1e3,
         np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
-        gaps / NANOSECONDS, pace_s, pace, (late - late.min()) / 1e3, missed_s, missed,
+        gaps / NANOSECONDS, pace_s, pace, (late - late.min()) / 1e3, _reported(recording),
         latency(recording, missing), energy_balance.residual(recording, missing),
         tuple(missing),
     )  # fmt: skip
@@ -128,11 +132,13 @@ def _pace(recording: Recording) -> tuple[Array, Array]:
     return (0.5 * (time[1:] + time[:-1]) / NANOSECONDS)[good], pace[good]
 
 
-def _missed(recording: Recording) -> tuple[Array, Array]:
-    """Return times [s] and numbers of dropped ticks, from the simulator's reports."""
-    counts = [(at, count) for at, values in recording.reports
-            if (count := values.get("ticks_missed", "")).isdecimal()]  # fmt: skip
-    first = recording.received_ns[0]
-    since = (recording.received_ns - first).astype(float)
-    at = np.interp([at - first for at, _ in counts], since, recording.seconds)
-    return at, np.array([int(count) for _, count in counts], dtype=float)
+def _reported(recording: Recording) -> Array:
+    """Return times of the run [s] and the numbers of REPORTED, from the simulator's reports."""
+    rows = [
+        [at - recording.received_ns[0], *(float(values.get(key) or "nan") for key in REPORTED)]
+        for at, values in recording.reports
+    ]
+    reported = np.array(rows, dtype=float).reshape(-1, 1 + len(REPORTED))
+    since = (recording.received_ns - recording.received_ns[0]).astype(float)
+    reported[:, 0] = np.interp(reported[:, 0], since, recording.seconds)
+    return reported

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from sst_ros.dynamics.limits import limits_of
+from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase
@@ -20,6 +21,9 @@ _ROWS = 16
 GAUGES = {
     "error_estimate": "estimated error of the orientation so far [rad]",
     "rate_error_estimate": "estimated error of the body rate so far [rad/s]",
+    "hold_error_start": "estimated error of the orientation from holding torques [rad], where "
+    "they are those of the start of their hold",
+    "hold_error_middle": "the same where they are those of its middle",
     "energy_residual_J": "energy less that of the start and the work done since [J]",
     "closure_residual": "largest abs(r_k . t_k), 0 where the loops are closed",
     "singularity_serial": "least sin(mu_k), 0 at a serial singularity",
@@ -28,6 +32,8 @@ GAUGES = {
     "workspace_margin_rad": "least distance of beta to the edge of the workspace [rad]",
     "integrator": "method in use",
     "integrator_changes": "number of changes of the method",
+    "step_evaluations": "mean evaluations of the right-hand side per accepted step",
+    "step_budget": "evaluations that one tick may take",
 }
 """Keys of the values that the simulation itself reports."""
 
@@ -40,6 +46,8 @@ KEYS = {
     "samples_published": "samples of the run published",
     "step_mean_us": "mean time of a step [us]",
     "step_max_us": "longest step [us]",
+    "tick_time_left": "share of a tick's period that its step leaves, mean, at real-time factor 1",
+    "tick_time_left_least": "the same of the longest step",
     "late_mean_us": "mean lateness of the steps [us]",
     "late_std_us": "standard deviation of it: the jitter of the period [us]",
     "late_max_us": "largest lateness [us]",
@@ -109,6 +117,8 @@ class RunDiagnostics:
             "samples_published": count.published,
             "step_mean_us": 1e6 * count.step_mean_s,
             "step_max_us": 1e6 * count.step_max_s,
+            "tick_time_left": 1.0 - count.step_mean_s / self._period_s,
+            "tick_time_left_least": 1.0 - count.step_max_s / self._period_s,
             "late_mean_us": mean,
             "late_std_us": deviation,
             "late_max_us": largest,
@@ -195,9 +205,9 @@ class RunDiagnostics:
         self._last = row
 
 
-def read_gauges(simulation: Simulation) -> dict[str, object]:
+def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     """Read the gauges in the thread of the run; those without a finite value are left out."""
-    state = simulation.state
+    state, hold = simulation.state, held.errors(simulation)
     conditioning = simulation.conditioning
     angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
     margins: dict[bool, list[float]] = {True: [], False: []}
@@ -207,6 +217,8 @@ def read_gauges(simulation: Simulation) -> dict[str, object]:
     values: dict[str, object] = {
         "error_estimate": simulation.error_estimate,
         "rate_error_estimate": simulation.rate_error_estimate,
+        "hold_error_start": None if hold is None else hold[0],
+        "hold_error_middle": None if hold is None else hold[1],
         "energy_residual_J": simulation.energy_residual,
         "closure_residual": simulation.closure_residual,
         "singularity_serial": conditioning["sin_mu"],
@@ -215,6 +227,8 @@ def read_gauges(simulation: Simulation) -> dict[str, object]:
         "workspace_margin_rad": min(margins[False], default=None),
         "integrator": simulation.method,
         "integrator_changes": len(simulation.changes),
+        "step_evaluations": simulation.evaluations / max(simulation.accepted_steps, 1),
+        "step_budget": simulation.step_budget,
     }
     return {key: value for key, value in values.items() if _is_known(value)}
 

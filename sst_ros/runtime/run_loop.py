@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.counters import Counters
+from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_types import PendingReply, Phase, Reply, RunOutput
 from sst_ros.runtime.tick_loop import NoAnswer, TickLoop
@@ -74,6 +75,11 @@ class RunLoop:
     def counters(self) -> Counters:
         """Counters of the run."""
         return self._ticks.counters
+
+    @property
+    def held(self) -> HeldTorques:
+        """Torques of the run so far."""
+        return self._ticks.held
 
     @property
     def begun(self) -> bool:

@@ -10,6 +10,7 @@ import time
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.counters import Counters
+from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_types import RunOutput
 from sst_ros.runtime.torque_input import ZERO, HasParameters, TorqueInput
@@ -33,6 +34,7 @@ class TickLoop:
         simulation: what is run; its `state` may be read by any thread.
         begun: the first sample has been published.
         counters: counters of the run.
+        held: torques so far, for the estimate of the hold error.
         step_since: time.perf_counter at which the step in progress began; 0 between steps.
         requested, stopped: set by others to interrupt a wait, or to end.
 
@@ -48,6 +50,7 @@ class TickLoop:
     ) -> None:
         given = owner.parameters
         self.simulation, self.begun, self.counters = simulation, False, Counters()
+        self.held = HeldTorques()
         self.requested, self.stopped = threading.Event(), threading.Event()
         self.step_since = 0.0
         self._owner, self._input, self._pacer, self._output = owner, torque_input, pacer, output
@@ -73,6 +76,7 @@ class TickLoop:
         """Take another simulation, or the same at its start; stamps go on."""
         self.simulation, self.begun, self._tick = simulation, False, 0
         self._input.clear()
+        self.held.clear()
 
     def begin(self) -> bool:
         """Publish the first sample; False as long as a followed clock has no time."""
@@ -166,6 +170,7 @@ class TickLoop:
             if done:
                 self.counters.stepped(took, self._pacer.late_ns, done)
                 self._output.ticks(torque, moment, done)
+                self.held.add(torque, 1e-9 * done * self._period_ns)
                 self._tick += done
 
     def _answer(self, paced: bool) -> Triple | None:

@@ -12,7 +12,7 @@ from matplotlib import image
 from sst_ros import scene
 from sst_ros.control.torque_profiles import sine
 from sst_ros.recording import recording
-from sst_ros.report import reference, timing
+from sst_ros.report import page, reference, timing
 from sst_ros.report.run import evaluate, report
 from sst_ros.report.table import table
 
@@ -152,6 +152,25 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(tmp_path,
     assert numbers["command_latency_mean_us"] == pytest.approx(1050.0, abs=1e-2)
 
 
+def test_error_estimates_are_drawn_against_the_computing_time_used(tmp_path, bags, example2):
+    entries = list(example2)
+    for k in (1, 2):
+        entries.append(bags.diagnostics_entry(
+            bags.START_NS + k * 100_000_000, phase="running", ticks=100 * k, step_mean_us=50.0,
+            error_estimate=10.0 ** -(12 - k), hold_error_start=1e-3 * k,
+        ))  # fmt: skip
+    run = recording.read(bags.write(tmp_path / "bag", sorted(entries, key=lambda e: e.received_ns)))
+    found = evaluate(run)
+    drawn = page.overview(run, found.integration, found.timing, found.summary)
+    titles = {axes.get_title("left"): axes for axes in drawn.axes}
+    panel = titles["Error against computing time used, at the reports of the simulator"]
+    curves = {line.get_label(): line.get_xydata() for line in panel.lines}
+    estimate = curves["its estimate by the simulator"]
+    assert estimate[:2, 0] == pytest.approx([5.0, 10.0])  # 100 and 200 steps of 50 us, in ms
+    assert estimate[:2, 1] == pytest.approx([1e-11, 1e-10])
+    assert curves["hold error if torques are those of the start"][1, 1] == pytest.approx(2e-3)
+
+
 def test_ticks_that_were_missed_show_when_they_were(tmp_path, bags, example2):
     """At 0.1 s the simulator falls behind by seven ticks, and says so from then on."""
     entries = [
@@ -163,8 +182,9 @@ def test_ticks_that_were_missed_show_when_they_were(tmp_path, bags, example2):
         received = bags.START_NS + round(seconds * 1e9) + SENT_NS + missed * bags.TICK_NS
         entries.append(bags.diagnostics_entry(received, phase="running", ticks_missed=missed))
     found = _timing(bags, tmp_path, sorted(entries, key=lambda entry: entry.received_ns))
-    assert found.missed_s == pytest.approx(list(reports), abs=1e-9)
-    assert found.missed.tolist() == list(reports.values())
+    at, missed = found.reported[:, :2].T
+    assert at == pytest.approx(list(reports), abs=1e-9)
+    assert missed.tolist() == list(reports.values())
     assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
     assert not len(found.lost_s)
     assert numbers_of_run(tmp_path)["ticks_missed"] == 7
