@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulator, and as wanted the player of the scene's torques, a recorder and RViz.
+"""Start the simulator and, as asked, the player of the scene's torques, a recorder and RViz.
 
 The launch ends with the simulator, that is after `duration`, by default the duration of the scene;
 with play:=true and duration:=0 it ends with the player.

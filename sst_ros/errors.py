@@ -91,7 +91,7 @@ class SingularConfiguration(SstError):
 
 
 class RunStopped(SstError):
-    """The motion cannot go on; `state` is the last valid one, `time` [s] is when it ended."""
+    """The motion cannot continue; `state` is the last valid one, `time` [s] is when it ended."""
 
     def __init__(self, reason: str, time: float, state: State) -> None:
         self.reason = reason

@@ -21,14 +21,14 @@ _COMMANDS = """# The command line
     sst-ros COMMAND ...
 
 `python -m sst_ros COMMAND ...` is the same without an installation. Exit status 0 is success, 1 an
-error, reported in one line on stderr (or what the command says below), 2 a command that is not
+error, reported in one line on stderr (or as described below), 2 a command that is not
 understood, 3 an internal error; `--debug` prints the traceback. No command overwrites earlier
 results without `--force`. `sst-ros COMMAND --help` describes a command.
 
 Where [argcomplete](https://pypi.org/project/argcomplete/) is installed,
 `eval "$(register-python-argcomplete sst-ros)"` completes commands, options and names of scenes.
 
-Nodes are started in the same way and take the arguments of ROS nodes, `--ros-args -p name:=value`:
+Nodes are started by the same command and take the arguments of ROS nodes, `--ros-args -p name:=value`:
 {nodes}.
 Their parameters are in [the reference of nodes](nodes.md).
 """

@@ -25,7 +25,7 @@ second, in seconds of the processor.
 
 Time in ms, and how many times ours that is. The time is that of the fastest setting tried
 whose error is as small or smaller, not interpolated. Ours is a call of `sst_ros.simulate`, its
-checks and the `Trajectory` that it returns included. "-" means that no setting tried gets there:
+checks and the `Trajectory` that it returns included. "-": not reached by any setting;
 the steps end at 16000 a second for MuJoCo (3200 with Python torques, 6400 for rollout), at 20000
 for Drake and at 8000 for Exudyn.
 

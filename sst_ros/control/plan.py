@@ -229,7 +229,7 @@ def _posture(coordinates: ActuatorSpaceMap, at: Reference) -> tuple[float, ...]:
     found = list(coordinates.posture(at.quaternion))
     turned = coordinates.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
     for leg in range(3):
-        # On the other branch of the leg r_k points the other way: gamma differs by pi.
+        # On the other branch of the leg r_k has the opposite direction: gamma differs by pi.
         if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
             found[leg] = -found[leg]
     return tuple(found)

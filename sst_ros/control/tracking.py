@@ -126,7 +126,7 @@ def _lines(found: TrackingMetrics) -> Iterator[str]:
     limited = "-" if found.limited is None else found.limited
     yield f"{'samples at a limit':24}{limited:>12}  (of {found.samples})"
     yield ""
-    yield f"{'run time [s]':>16}{'RMS so far [rad]':>20}{'largest so far [rad]':>24}"
+    yield f"{'run time [s]':>16}{'RMS to then [rad]':>20}{'largest to then [rad]':>24}"
     for time, rms, largest in found.history:
         yield f"{time:16.4f}{rms:20.3e}{largest:24.3e}"
 

@@ -27,7 +27,7 @@ LEG_COLOURS: tuple[Colour, Colour, Colour] = (
     (0.84, 0.37, 0.00),
     (0.00, 0.62, 0.45),
 )
-"""Colours of legs 1 to 3 that the colour-blind can tell apart (Okabe and Ito)."""
+"""Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
 STEP = np.radians(6.0)
 """Arcs are drawn as chords of this length or less: 0.14 % of the radius off."""

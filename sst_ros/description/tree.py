@@ -6,7 +6,7 @@
                                                          -beta_3- star_from_3
 
 All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
-The star hangs on leg 1. On legs 2 and 3 hangs a frame without a body: {E} as that leg sees it. The
+The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it. The
 loops are closed where the three are one.
 """
 

@@ -3,7 +3,7 @@
 
 The tree's joints are those of joint_states, the passive ones included, so that the loops of what is
 shown are as closed as those of the simulation. URDF has no loops, no springs, no elastic or impact
-ends and no Stribeck friction: whoever simulates by the file must add them. No shape is meant for
+ends and no Stribeck friction: a simulation of the file must add them. No shape is meant for
 collisions.
 """
 

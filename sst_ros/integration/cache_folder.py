@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of compiled code: numba unpickles what lies there, so nobody else may write into it.
+"""The folder of compiled code: numba unpickles its files, so no other user may write into it.
 
 The rules are those of StrictModes of OpenSSH: the folder and all folders above it belong to the
-user or to root, and nobody else can write into them. A folder above it may be writable where its
+user or to root, and no other user can write into them. A folder above it may be writable where its
 sticky bit keeps others from replacing what is not theirs, as /tmp is, and a group may write whose
 only member is the user.
 """
@@ -62,7 +62,7 @@ def objection(folder: Path) -> str | None:
 
 
 def is_safe_file(path: Path) -> bool:
-    """Return whether a file belongs to the user or root, and nobody else can write it."""
+    """Return whether a file belongs to the user or root, and no other user can write it."""
     return _objection(path, above=False) is None
 
 

@@ -20,7 +20,7 @@ from sst_ros.scene.scene import Scene
 
 
 def is_there(scene: Scene, integrator: str) -> bool:
-    """Tell whether a run of the scene would find all of its code, whatever method it turns to."""
+    """Return whether all code of a run of the scene is there, for each method it may use."""
     if codegen.numba_version() is None:
         return False
     system = ode_with_work(Dynamics.of(scene))

@@ -236,7 +236,7 @@ def has_code(
     *,
     rounding: bool = True,
 ) -> bool:
-    """Tell whether machine code of these functions of the module is there to be loaded."""
+    """Return whether machine code of these functions of the module is there to be loaded."""
     more = "" if rounding else _FREE_ROUNDING
     try:
         path = _path_of(_for_numba(texts, constants, more=more))

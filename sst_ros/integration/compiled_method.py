@@ -129,7 +129,7 @@ class CompiledMethod:
 
 
 def has_code(system: ODE, method: Method) -> bool:
-    """Tell whether machine code of what a run calls is there, to be loaded in no time."""
+    """Return whether machine code of what a run calls is there, to be loaded quickly."""
     return codegen.has_code(*_source(system, method), ("step_pair", "step_many"))
 
 

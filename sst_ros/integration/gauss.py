@@ -45,7 +45,7 @@ class EndState(NamedTuple):
 
 
 class PreparedMotion:
-    """A motion whose numbers are laid out once, to be computed as often as one likes.
+    """A motion whose arrays are prepared once, to be computed any number of times.
 
     Attributes:
         run: compute it; returns the change of `EndState`, infinite where the motion has no finite
@@ -110,7 +110,7 @@ class Collocation:
     Args:
         ode: what is integrated.
         nodes: of a step; the order is twice as many.
-        limits: margins of the state's first seven numbers, watched at all nodes; none by default.
+        limits: margins of the state's first seven numbers, monitored at all nodes; none by default.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
 
     Raises:
@@ -138,7 +138,7 @@ class Collocation:
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
         *, iterations: int = 5,
     ) -> PreparedMotion:  # fmt: skip
-        """Lay out `count` steps of h from t.
+        """Prepare `count` steps of h from t.
 
         Args:
             t: time [s].
@@ -184,7 +184,7 @@ class Collocation:
 
 
 def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> bool:
-    """Tell whether the machine code of a `Collocation` is there to be loaded."""
+    """Return whether the machine code of a `Collocation` is there to be loaded."""
     texts = gauss_source.source(ode, nodes, limits)
     known = codegen.numba_version() is not None
     return known and codegen.has_code(texts, {}, ("march",), rounding=False)

@@ -32,7 +32,7 @@ class Places(NamedTuple):
 
 
 def places(system: ODE, nodes: int, limits: Program | None) -> Places:
-    """Lay out what `march` reads and writes."""
+    """Allocate what `march` reads and writes."""
     at, inputs = _layout(system, nodes, limits), len(system.program.inputs)
     begin, table, least = (at.first(group) for group in ("begin", "node", "least"))
     return Places(

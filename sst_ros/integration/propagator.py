@@ -154,7 +154,7 @@ class Propagator:
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the derivative so far; a Jacobian counts as `JACOBIAN_COST`."""
+        """Evaluations of the derivative since the start; a Jacobian counts as `JACOBIAN_COST`."""
         return self._budget.spent
 
     def errors(self, at: Point) -> tuple[float, float]:

@@ -102,7 +102,7 @@ def serial(geometry: Geometry, points: int = 90) -> SingularPoses:
 
 
 def report(geometry: Geometry, chart: OrientationMap) -> str:
-    """Say in a few lines which singular poses there are."""
+    """Summarise the singular poses in a few lines."""
     lines = []
     for poses in (parallel(chart), serial(geometry)):
         if not len(poses):

@@ -76,6 +76,6 @@ def _is_compiling() -> bool:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # nobody has compiled yet
+    except OSError:  # not compiled yet
         return False
     return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the simulator, laid out once; afterwards only their numbers are written."""
+"""Messages of the simulator, allocated once; afterwards only their numbers are written."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class TorqueLog:
 
 
 def clock_message() -> CdrMessage:
-    """Lay out a rosgraph_msgs/Clock."""
+    """Allocate a rosgraph_msgs/Clock."""
     message = CdrMessage()
     message.time(0)
     return message

@@ -2,7 +2,7 @@
 """The recorder: topics into a rosbag2 in MCAP, without a ROS installation.
 
 Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken in batches
-from the subscriptions: 1850 messages a second cost 7 % of a core that way and 27 % by callbacks of
+from the subscriptions: 1850 messages a second cost 7 % of a core by this and 27 % by callbacks of
 an executor, measured in two processes at once.
 """
 
@@ -217,7 +217,7 @@ def _declared(topic: str, types: Iterable[str]) -> Endpoint | None:
 
 
 def _declared_qos(own: Endpoint) -> QoSProfile:
-    """QoS of a topic of ours, whoever has been discovered first: a subscriber or the publisher."""
+    """QoS of a topic of the simulator, independent of the order of discovery."""
     return _qos(latched=own.latched, reliable=True)
 
 

@@ -39,7 +39,7 @@ class SimulationInterfaces:
     def features(self, _: Any, response: Any) -> Any:
         """GetSimulatorFeatures."""
         response.features.features = list(FEATURES)
-        response.features.custom_info = "sst_ros; ROS time goes on over a reset"
+        response.features.custom_info = "sst_ros; ROS time continues over a reset"
         return response
 
     def get_state(self, _: Any, response: Any) -> Any:
@@ -77,7 +77,7 @@ class SimulationInterfaces:
             response.result.result = DONE
         else:
             response.result.result = UNSUPPORTED
-            response.result.error_message = "ROS time goes on; reset the state"
+            response.result.error_message = "ROS time continues; reset the state"
         return response
 
     def step(self, request: Any, response: Any) -> Any:

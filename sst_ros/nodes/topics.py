@@ -138,7 +138,7 @@ SET_STATE = Endpoint(
     SUBSCRIBES,
     "~/set_state",
     JointState,
-    "state to go on from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3; "
+    "state to continue from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3; "
     "refused while running, in fault, and where it is not admissible",
 )
 PAUSE = Endpoint(SERVES, "~/pause", SetBool, "pause the run, or resume it; idempotent")
@@ -146,7 +146,7 @@ STEP = Endpoint(
     SERVES, "~/step", Trigger, "advance a paused run by one sample; refused while running"
 )
 RESET = Endpoint(
-    SERVES, "~/reset", Trigger, "back to the initial state, also out of a fault; stamps go on"
+    SERVES, "~/reset", Trigger, "back to the initial state, also out of a fault; stamps continue"
 )
 
 SIMULATOR = (

@@ -189,7 +189,7 @@ def _used(axes: Axes, run: Overview) -> None:
 
 
 def _pace(axes: Axes, run: Overview) -> None:
-    axes.set_title("Real-time factor by the recorder's clock")
+    axes.set_title("Real-time factor (recorder clock)")
     axes.set_ylabel("real-time factor")
     if not len(run.pace):
         _unknown(axes)
@@ -225,7 +225,7 @@ def _periods(axes: Axes, run: Overview) -> None:
 
 
 def _losses(axes: Axes, run: Overview) -> None:
-    axes.set_title("Losses so far")
+    axes.set_title("Cumulative losses")
     axes.set_ylabel("count")
     most = 0.0
     for (name, loss), style in zip(run.losses.items(), LINES, strict=False):
@@ -291,7 +291,7 @@ def draw_tracking(
     growth.set_ylabel("error [rad]")
     worst = np.abs(error).max(axis=1)
     curves = {"largest of γ": worst, "orientation": orientation_error,
-              "largest of γ so far": np.maximum.accumulate(worst)}  # fmt: skip
+              "running maximum of γ": np.maximum.accumulate(worst)}  # fmt: skip
     for (name, values), style in zip(curves.items(), LINES, strict=False):
         shown = positive(values)
         if np.isfinite(shown).any():

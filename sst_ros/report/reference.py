@@ -45,7 +45,7 @@ CHUNK = 25_000
 
 @dataclass(frozen=True)
 class Deviation:
-    """Distance between two motions at each sample, shape (n,); nan where there is nothing to say.
+    """Distance between two motions at each sample, shape (n,); nan where there is none.
 
     Attributes:
         gamma: largest difference of the actuator angles [rad].
@@ -60,7 +60,7 @@ class Deviation:
 
     @classmethod
     def none(cls, count: int) -> Deviation:
-        """Nothing to say about `count` samples."""
+        """No error at `count` samples."""
         return cls(*np.full((3, count), np.nan))
 
 

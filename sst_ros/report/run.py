@@ -41,7 +41,7 @@ def evaluate(run: Recording) -> RunEvaluation:
 
     """
     measured = timing.timing(run)
-    # Compiled loops let go of the interpreter: the two comparisons run beside each other.
+    # Compiled loops release the interpreter lock: the two comparisons run in parallel.
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()

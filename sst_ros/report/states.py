@@ -40,7 +40,7 @@ def initial(scene: Scene) -> Vector:
 
 
 def lags(scene: Scene) -> bool:
-    """Tell whether the torques of the actuators are part of the state."""
+    """Return whether the torques of the actuators are part of the state."""
     return scene.actuators is not None and scene.actuators.time_constant is not None
 
 
@@ -57,7 +57,7 @@ def recorded(geometry: Geometry, recording: Recording, samples: Places) -> Array
 
 
 def begins(recording: Recording) -> bool:
-    """Tell whether the first sample is that of the start of the run.
+    """Return whether the first sample is that of the start of the run.
 
     Only a recording that lost samples is doubted: where all are there, a first sample that is not
     what the scene asks for is an error of the simulator, and must be seen as one.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A report in numbers: one flat mapping, units in the names, nothing that is not finite.
 
-What a recording does not tell is None, never a guess.
+What a recording does not contain is None, never a guess.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def summarise(
     ideal: Comparison | None,
     formulation: Formulation,
 ) -> dict[str, Any]:
-    """Collect everything that the report says."""
+    """Collect all figures of the report."""
     summary: dict[str, Any] = {"scene": recording.scene.name, "bag": str(recording.path)}
     summary |= _run(recording)
     summary |= _loss(recording)
@@ -168,7 +168,7 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
     notes = []
     reported, last = recording.diagnostics, recording.seconds[-1]
     if not reported:
-        notes.append("no diagnostics of the run are recorded: what they tell is unknown")
+        notes.append("no diagnostics of the run are recorded: missed ticks and error estimates are unknown")
     elif reported.get("phase") not in ("finished", "fault"):
         notes.append(
             f"the run or its recording was cut short: the last phase is {reported.get('phase')}"
@@ -204,7 +204,7 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
 
 
 def made_on() -> dict[str, Any]:
-    """Tell versions, machine and date of a report."""
+    """Return versions, machine and date of a report."""
     versions = {name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")}
     try:
         own = metadata.version("sst_ros")

@@ -75,7 +75,7 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def made_line(summary: dict[str, Any]) -> str:
-    """Tell versions, machine and date in one line."""
+    """Return versions, machine and date in one line."""
     made = summary["report"]
     return (
         f"sst_ros {made['sst_ros']}, Python {made['python']}, NumPy {made['numpy']}, "

@@ -28,7 +28,7 @@ REPORTED = (
 
 @dataclass(frozen=True)
 class Timing:
-    """What the clocks of a recording say, and its balance of energy.
+    """Timing of a recording by its clocks, and its energy balance.
 
     Attributes:
         period_us: time between receptions of samples that follow each other [us], shape (p,).

@@ -19,8 +19,8 @@ OK, WARN, ERROR = range(3)
 _ROWS = 16
 
 GAUGES = {
-    "error_estimate": "estimated error of the orientation so far [rad]",
-    "rate_error_estimate": "estimated error of the body rate so far [rad/s]",
+    "error_estimate": "estimated error of the orientation [rad]",
+    "rate_error_estimate": "estimated error of the body rate [rad/s]",
     "hold_error_start": "estimated error of the orientation from holding torques [rad], where "
     "they are those of the start of their hold",
     "hold_error_middle": "the same where they are those of its middle",
@@ -155,11 +155,11 @@ class RunDiagnostics:
         self._noted = now
         news = []
         if dropped:
-            news.append(f"command dropped: {commands.last_refusal} ({commands.dropped} so far)")
+            news.append(f"command dropped: {commands.last_refusal} ({commands.dropped} in all)")
         if clamped:
-            news.append(f"commands clamped to the scene's torque limit ({commands.clamped} so far)")
+            news.append(f"commands clamped to the scene's torque limit ({commands.clamped} in all)")
         if timeouts:
-            news.append(f"no command within command_timeout: not held ({commands.timeouts} so far)")
+            news.append(f"no command within command_timeout: not held ({commands.timeouts} in all)")
         if publishers > 1:
             news.append(f"{publishers} publishers of commands: the last message wins")
         news += [warning for warning in warnings if warning not in self._warned]

@@ -17,7 +17,7 @@ from sst_ros.simulation.simulation import NANOSECONDS
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
     """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
 
-    It begins at once and goes on from the reference, which may be moving.
+    It begins immediately and continues the reference, which may be moving.
 
     Args:
         message: the trajectory; positions are needed, velocities and accelerations may be left
@@ -27,7 +27,7 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
 
     Raises:
         InputError: lists every fault.
-        SingularConfiguration: a parallel singularity lies in the way.
+        SingularConfiguration: the path crosses a parallel singularity.
 
     """
     if problems := [*_faults(message), *_jump(message, begin)]:
@@ -50,7 +50,7 @@ def _faults(message: Any) -> Iterator[Problem]:
     if sorted(names) != list(ACTUATORS):
         yield Problem("joint_names", names, f"must be {', '.join(ACTUATORS)}, each once")
     if stamp := _ns(message.header.stamp):
-        yield Problem("header.stamp", stamp, "must be zero: a trajectory begins at once")
+        yield Problem("header.stamp", stamp, "must be zero: a trajectory begins immediately")
     for index, point in enumerate(message.points):
         if len(point.effort):
             allowed = "must be left out: it is computed"

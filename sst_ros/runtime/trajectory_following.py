@@ -48,7 +48,7 @@ class TrajectoryFollower:
         stage: present stage.
         samples, irregular: samples answered, and those that came at another period.
         limited: samples of the motion in which a torque was limited.
-        largest: largest error of the motion so far [rad].
+        largest: largest error since the start of the motion [rad].
         refused, last_refusal: trajectories that were refused, and the reason of the last one.
 
     Raises:
@@ -163,7 +163,7 @@ class TrajectoryFollower:
 
     @property
     def rms(self) -> float:
-        """Root of the mean square of all errors of the motion so far [rad]."""
+        """Root of the mean square of all errors since the start of the motion [rad]."""
         count = len(self._rows) // _COLUMNS
         return math.sqrt(self._square / (3 * count)) if count else 0.0
 

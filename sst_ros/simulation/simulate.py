@@ -54,7 +54,7 @@ def simulate(
     """Simulate a motion from the initial state of a scene.
 
     Where a limit of the scene ends the motion, or no step resolves it, the trajectory has the part
-    that is valid, and its `status` and `message` say why it ended.
+    that is valid, and its `status` and `message` give the reason.
 
     Args:
         scene: name or path of a scene, its document as a dict, or a `Scene`.
@@ -80,7 +80,7 @@ def simulate(
         progress: draw a bar on a terminal.
 
     Raises:
-        InputError: an argument is not allowed; says which, and what is.
+        InputError: an argument is not allowed; names it and the allowed values.
         AssemblyError: the initial gamma has no unique admissible assembly.
         SingularConfiguration: the motion starts from a parallel singularity.
 

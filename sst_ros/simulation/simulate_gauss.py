@@ -33,7 +33,7 @@ class CollocatedMotion:
         asked: the caller has chosen this method: compile it, and try hard.
 
     Raises:
-        NotSmooth: the motion is not one for collocation; says why.
+        NotSmooth: the motion is not one for collocation; gives the reason.
 
     """
 

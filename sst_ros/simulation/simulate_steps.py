@@ -19,7 +19,7 @@ from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile, TorqueTab
 from sst_ros.simulation.trajectory import Trajectory
 
 SAMPLES = 200
-"""Intervals of a motion whose times nobody has named."""
+"""Intervals of a motion without `t_eval`."""
 
 
 _ATTEMPTS, _FINEST = 3, 1e-14

@@ -198,17 +198,17 @@ class Simulation:
 
     @property
     def accepted_steps(self) -> int:
-        """Number of accepted steps of the integrator so far."""
+        """Number of accepted steps of the integrator since the start."""
         return self._propagator.accepted_steps
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the derivative so far, rejected steps too; a Jacobian counts as 30."""
+        """Evaluations of the derivative since the start, rejected steps too; a Jacobian counts as 30."""
         return self._propagator.evaluations
 
     @property
     def error_estimate(self) -> float:
-        """Estimated global error of the orientation so far [rad].
+        """Estimated global error of the orientation [rad].
 
         A coarse solution takes steps of twice the length; its distance, over 2^order - 1, is the
         error of the run, rounding included where the distance consists of it.
@@ -217,7 +217,7 @@ class Simulation:
 
     @property
     def rate_error_estimate(self) -> float:
-        """Estimated global error of the body rate so far [rad/s]."""
+        """Estimated global error of the body rate [rad/s]."""
         return self._propagator.errors(self._now.point)[1]
 
     @property

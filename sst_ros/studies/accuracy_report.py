@@ -58,7 +58,7 @@ stands behind it.
 def report(
     names: Sequence[str], out: Path, *, kind: str = EXTENDED, compiled: bool = True
 ) -> list[WorkPrecision]:
-    """Study scenes one after another; print each, and write what is known so far into `out`.
+    """Study scenes one after another; print each, and write all finished results into `out`.
 
     Files: accuracy.csv, accuracy.json, accuracy.md, accuracy_SCENE.png.
 

@@ -76,7 +76,7 @@ def _violent() -> Iterator[Case]:
         ("into a serial singularity", extremes.free, "SingularityReached"),
     ):
         yield Case(
-            f"torque of 1e8 N m {name}", "the same end, sqrt(1e8) times sooner than under 1 N m",
+            f"torque of 1e8 N m {name}", "the same end, sqrt(1e8) times earlier than under 1 N m",
             scene, (1e8, 0.0, 0.0), 10, 100_000, refusal=refusal,
             stop_time=lambda s=scene: 1e-4 * extremes.stop_time(s(), (1.0, 0.0, 0.0)),  # type: ignore[misc]
         )  # fmt: skip

@@ -92,7 +92,7 @@ def _ends(scene: Scene) -> Iterator[tuple[str, str]]:
         more += f" (restitution {stroke.restitution:g} at {stroke.impact_rate:g} rad/s)"
     yield "stroke", f"0 < gamma_k < arc: {stroke.at_end}{more}"
     yield "workspace", f"0 < beta_k <= {workspace.beta_max_deg:g} deg: {workspace.at_edge}"
-    yield "watched", f"{len(list(limits_of(scene, Geometry.of(scene))))} ends between steps"
+    yield "limits", f"{len(list(limits_of(scene, Geometry.of(scene))))} monitored between steps"
 
 
 def _topics(dynamics: Dynamics) -> Iterator[tuple[str, str]]:

@@ -52,7 +52,7 @@ residual relative to the energy. Times include the making of the scene, those of
 compilation too; cases marked "compiled only" would take hours in plain Python.
 
 The error estimate must lie within a factor {FACTOR:g} of the true error, or {WIDER_FACTOR:g} where
-a note below the table says why. In the columns "true error" and
+a note below the table gives the reason. In the columns "true error" and
 "estimate" [rad] the case is run at the tolerance {LOOSE:g}, with steps as long as that
 allows, and compared with its run at the default tolerance, 1e-10. A dash means that the error is
 not resolved: it is that of rounding in both.

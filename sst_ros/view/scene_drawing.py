@@ -113,7 +113,7 @@ class SceneDrawing:
         self._show_torques(np.array(state.torque))
 
     def _show_torques(self, torques: Array) -> None:
-        """Draw tau_k along w_k, outwards where positive; the largest so far has full length."""
+        """Draw tau_k along w_k, outwards where positive; the largest yet has full length."""
         self._largest_torque = max(self._largest_torque, float(np.abs(torques).max()))
         for arrow, torque, w in zip(self._torques, torques, self._geometry.w, strict=True):
             length = 0.45 * self._size * abs(float(torque)) / self._largest_torque
