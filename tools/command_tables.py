@@ -28,7 +28,8 @@ results without `--force`. `sst-ros COMMAND --help` describes a command.
 Where [argcomplete](https://pypi.org/project/argcomplete/) is installed,
 `eval "$(register-python-argcomplete sst-ros)"` completes commands, options and names of scenes.
 
-Nodes are started by the same command and take the arguments of ROS nodes, `--ros-args -p name:=value`:
+Nodes are started by the same command and take the arguments of ROS nodes,
+`--ros-args -p name:=value`, and plain options `--name value`:
 {nodes}.
 Their parameters are in [the reference of nodes](nodes.md).
 """

@@ -6,8 +6,8 @@
                                                          -beta_3- star_from_3
 
 All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
-The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it. The
-loops are closed where the three are one.
+The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it.
+The loops are closed where the three are one.
 """
 
 from __future__ import annotations

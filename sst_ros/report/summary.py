@@ -168,7 +168,7 @@ def _notes(recording: Recording, integration: Comparison, ideal: Comparison | No
     notes = []
     reported, last = recording.diagnostics, recording.seconds[-1]
     if not reported:
-        notes.append("no diagnostics of the run are recorded: missed ticks and error estimates are unknown")
+        notes.append("no diagnostics are recorded: missed ticks and error estimates are unknown")
     elif reported.get("phase") not in ("finished", "fault"):
         notes.append(
             f"the run or its recording was cut short: the last phase is {reported.get('phase')}"

@@ -203,7 +203,7 @@ class Simulation:
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the derivative since the start, rejected steps too; a Jacobian counts as 30."""
+        """Evaluations of the derivative, those of rejected steps too; a Jacobian counts as 30."""
         return self._propagator.evaluations
 
     @property

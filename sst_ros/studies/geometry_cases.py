@@ -83,7 +83,7 @@ def _parallel() -> Iterator[Case]:
             "det J2 changes its sign and the energy stays",
             partial(near_singularity, angle, spin),
             REST, 80, round(2e6 / abs(spin)), crossed, 1e-10,
-            difficulty="J is infinite at the crossing; gamma does not determine how the motion continues",
+            difficulty="J is infinite at the crossing; gamma alone does not determine the motion",
         )  # fmt: skip
     yield Case(
         "rest 0.1 rad beside one",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The web server of the page: viser's, behind a check of address, origin and token.
 
-Everyone who reaches the page can apply torques. Every request, the websocket's included, must therefore
+Everyone who reaches the page can apply torques. Every request, the websocket's too, must therefore
 
 - be addressed to this server (Host): no foreign name that was rebound to this machine is served;
 - come from the page itself where a browser states where it comes from (Origin);
