@@ -26,6 +26,7 @@ def add(commands: Commands) -> None:
         accuracy, "--scene", nargs="+", metavar="S",
         help="names, or paths of .yaml files; default: all",
     )  # fmt: skip
+    accuracy.add_argument("--all", action="store_true", help="all shipped scenes, the default")
     add_out(accuracy, "folder of the results", "accuracy_out")
     accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
     accuracy.add_argument(
@@ -63,10 +64,10 @@ def _accuracy(options: argparse.Namespace) -> None:
         return
     from sst_ros.scene.scene import names
     from sst_ros.studies.accuracy_report import report
-    from sst_ros.studies.high_precision import EXTENDED, MPMATH
+    from sst_ros.studies.reference_solution import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
-    report(options.scene or names(), out, kind=kind)
+    report(names() if options.all else options.scene or names(), out, kind=kind)
 
 
 def _control(options: argparse.Namespace, out: Path) -> None:

@@ -69,6 +69,43 @@ def draw_work_precision(
     return figure
 
 
+@styled
+def draw_summary(rows: DataFrame, footnote: str) -> Figure:
+    """Draw the time of the fastest setting for each error, a line of markers for each scene.
+
+    Args:
+        rows: scene, target [rad], method, share (wall time per time of the motion).
+        footnote: small print.
+
+    """
+    names = list(dict.fromkeys(rows.scene))
+    figure = free_figure(9.0, 1.7 + 0.36 * len(names))
+    axes = figure.subplots()
+    high = 1.0 / (1.7 + 0.36 * len(names))
+    figure.subplots_adjust(left=0.17, right=0.98, top=1.0 - 0.45 * high, bottom=1.05 * high)
+    targets = sorted(set(rows.target), reverse=True)
+    for row in rows.itertuples():
+        colour, marker = MARKERS[row.method]
+        size = 5.5 + 3.0 * targets.index(row.target)
+        axes.plot(100.0 * row.share, names.index(row.scene), marker, color=colour, markersize=size,
+                  markerfacecolor="none", markeredgewidth=1.5)  # fmt: skip
+    axes.axvline(100.0, color=INK, linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlabel("wall time of the integration per time of the motion [%]")
+    axes.set_title("Fastest setting for an error of the orientation")
+    handles = [Line2D([], [], color=colour, marker=marker, linestyle="none", label=name,
+                      markerfacecolor="none") for name, (colour, marker) in MARKERS.items()
+               if name in set(rows.method)]  # fmt: skip
+    handles += [Line2D([], [], color=INK, marker="o", linestyle="none", markerfacecolor="none",
+                       markersize=5.5 + 3.0 * k, label=f"{target:.0e} rad")
+                for k, target in enumerate(targets)]  # fmt: skip
+    axes.legend(handles=handles, fontsize=8, loc="lower right", framealpha=0.9)
+    note(figure, footnote, 150)
+    return figure
+
+
 def _panel(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")

@@ -7,6 +7,7 @@ Loads that a scene may have beside them are no part of the paper and are left ou
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.virtual_work_derivative import body_acceleration
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
@@ -42,26 +44,31 @@ class Formulation:
     states: int
 
 
-def check(recording: Recording, count: int = STATES) -> Formulation:
-    """Compare W_dot at samples spread over the run, under the torques recorded there."""
-    bare = Scene(**{name: getattr(recording.scene, name) for name in PAPER})
+def compare(scene: Scene, given: Iterable[tuple[Array, Sequence[float]]]) -> Formulation:
+    """Compare W_dot at states (seven numbers or more) under torques [N m]; loads are left out."""
+    bare = Scene(**{name: getattr(scene, name) for name in PAPER})
     mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
-    whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
-    chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
     differences, sizes = [], []
-    for sample in whole[chosen] if len(whole) else ():
-        row = states.recorded(mechanism.geometry, recording, [int(sample)])[0]
-        state = tuple(row[:7].tolist())
-        torque = recording.effort[sample]  # the torque that acts, lagged or not
+    for y, (first, second, third) in given:
+        state = tuple(y[:7].tolist())
         try:
-            paper, _ = body_acceleration(mechanism, state, torque)
-        except SingularConfiguration:
+            paper, _ = body_acceleration(mechanism, state, (first, second, third))
+        except (SingularConfiguration, np.linalg.LinAlgError):
             continue
-        first, second, third = torque.tolist()
-        ours = np.array(kernel.derivative(model, state, (first, second, third))[4:])
+        ours = np.array(kernel.derivative(model, state, (first, second, third))[4:7])
         differences.append(float(np.linalg.norm(ours - paper)))
         sizes.append(float(np.linalg.norm(paper)))
     if not sizes:
         return Formulation(None, 0)
     scale = max(sizes)
     return Formulation(max(differences) / scale if scale > 0.0 else max(differences), len(sizes))
+
+
+def check(recording: Recording, count: int = STATES) -> Formulation:
+    """Compare W_dot at samples spread over the run, under the torques recorded there."""
+    whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
+    chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
+    samples = whole[chosen] if len(whole) else np.empty(0, dtype=int)
+    y = states.recorded(Geometry.of(recording.scene), recording, samples)
+    # The torque that acts, lagged or not.
+    return compare(recording.scene, zip(y, recording.effort[samples].tolist(), strict=True))

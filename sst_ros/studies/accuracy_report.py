@@ -9,34 +9,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_ros import scene
-from sst_ros.plot.work_precision import draw_work_precision
-from sst_ros.studies.high_precision import EXTENDED
-from sst_ros.studies.results import markdown, provenance, table, write
-from sst_ros.studies.work_precision import (
-    ABOVE_REFERENCE,
-    SolverResult,
-    WorkPrecision,
-    work_precision,
-)
+from sst_ros.plot.work_precision import draw_summary, draw_work_precision
+from sst_ros.studies.reference_solution import EXTENDED
+from sst_ros.studies.results import markdown, provenance, records, table, write
+from sst_ros.studies.solver_grid import TOLERANCE
+from sst_ros.studies.term_costs import cost_table
+from sst_ros.studies.work_precision import ABOVE_REFERENCE, ERROR, WorkPrecision, work_precision
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from matplotlib.figure import Figure
+    from pandas import DataFrame, Series
 
 TARGET, TARGETS = 1e-9, (1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is marked in figures."""
 
-COLUMNS = (
-    "scene", "method", "kind", "setting", "evaluations", "wall_min_s", "wall_median_s",
-    "final_orientation_rad", "final_gamma_rad", "final_gamma_dot_rad_per_s",
-    "largest_orientation_rad", "largest_gamma_rad", "largest_gamma_dot_rad_per_s",
-    "energy_residual_J", "closure_residual", "below_floor", "failure",
-)  # fmt: skip
-
 INTRODUCTION = """\
 # Accuracy and what it costs
 
-Written by `python -m sst_ros report accuracy`; all figures are from the machine and the date below
-the tables.
+Written by `python -m sst_ros report accuracy --all`; all figures are from the machine and the date
+below the tables. [Control rate and accuracy](control_rate.md) has the error of held torques.
 
 Every method solves the scene under its own torques, as continuous functions of time, and is
 compared with a reference solution at twenty or more instants: DOP853 with fixed steps in extended
@@ -54,42 +45,45 @@ was tried, and at least one, reaches the target too. The advice is that of
 stands behind it.
 """
 
+TERMS_INTRODUCTION = """\
+Operations of the right-hand side are counted in the source that is generated for the scene, and for
+the scene without the term; times are of an evaluation in steps of RK4, with the step around it, the
+shortest of five measurements. A term that folds into constants adds no operation. The source of a
+scene has no operation of a term that the scene does not have.
+"""
+
 
 def report(
     names: Sequence[str], out: Path, *, kind: str = EXTENDED, compiled: bool = True
 ) -> list[WorkPrecision]:
     """Study scenes one after another; print each, and write all finished results into `out`.
 
-    Files: accuracy.csv, accuracy.json, accuracy.md, accuracy_SCENE.png.
+    Files: accuracy.csv, .json, .md, .png, accuracy_SCENE.png, and accuracy_terms.csv.
 
     Raises:
         SstError: a scene is refused or cannot start, or `out` cannot be written.
 
     """
     studies: list[WorkPrecision] = []
+    terms: list[dict[str, Any]] = []
     for each in [scene.load(name) for name in names]:
         studies.append(work_precision(each, kind=kind, compiled=compiled, shown=True))
+        terms += cost_table(each, compiled=compiled)
         print(text(studies[-1]), flush=True)
+        figures = {f"accuracy_{each.name}": figure(studies[-1])}
+        if len(studies) == len(names):
+            figures["accuracy"] = draw_summary(summary(studies), provenance(compiled=compiled))
         write(
-            out, "accuracy", csv=frame(studies), document={"studies": list(documents(studies))},
-            page=page(studies), figures={f"accuracy_{each.name}": figure(studies[-1])},
+            out, "accuracy", csv=frame(studies),
+            document={"studies": list(documents(studies)), "terms": terms},
+            page=page(studies, terms), figures=figures,
         )  # fmt: skip
     return studies
 
 
 def frame(studies: Sequence[WorkPrecision]) -> DataFrame:
-    """Return the grids of all studies as one table, columns as in COLUMNS."""
-    return table((row for study in studies for row in _rows(study)), COLUMNS)
-
-
-def _rows(study: WorkPrecision) -> Iterator[dict[str, Any]]:
-    for row in study.rows:
-        final = (*asdict(row.final).values(),) if row.final else (None,) * 3
-        largest = (*asdict(row.largest).values(),) if row.largest else (None,) * 3
-        below = row.error < study.floor if row.largest else None
-        values = (study.scene, row.method, row.kind, row.setting, row.evaluations, *row.wall_s,
-                  *final, *largest, row.energy, row.closure, below, row.failure)  # fmt: skip
-        yield dict(zip(COLUMNS, values, strict=True))
+    """Return the grids of all studies as one table."""
+    return table(row for study in studies for row in records(study.rows))
 
 
 def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
@@ -107,32 +101,46 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
             "advice_measured_error_rad": study.measured and study.measured[0],
             "fastest": fastest(study),
             "warnings": list(study.warnings),
-            "rows": list(_rows(study)),
+            "rows": records(study.rows),
         }
+
+
+def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
+    """Return the fastest setting of each scene for each target: method, setting, time."""
+    rows = []
+    for study in studies:
+        for target in TARGETS:
+            best = study.best(target) if target >= study.floor else None
+            if best is not None:
+                rows.append({"scene": study.scene, "target": target, "method": best.method,
+                             "setting": setting(best), "wall_s": best.wall_min_s,
+                             "share": best.wall_min_s / study.seconds})  # fmt: skip
+    return table(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
 
 
 def fastest(study: WorkPrecision, target: float = TARGET) -> str:
     """Return the fastest setting for a target as a sentence."""
     best = study.best(target)
     if best is None:
-        least = min((row.error for row in study.rows if row.largest), default=None)
-        reached = "every one failed" if least is None else f"the least error is {least:.0e} rad"
+        errors = study.rows[ERROR].astype(float).dropna()
+        reached = (
+            "every one failed" if errors.empty else f"the least error is {errors.min():.0e} rad"
+        )
         return (
             f"No setting that was tried reaches {target:.0e} rad with every finer one; {reached}."
         )
-    return f"{target:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best)}."
+    return f"{target:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best.wall_min_s)}."
 
 
-def setting(row: SolverResult) -> str:
+def setting(row: Series[Any]) -> str:
     """Return method and setting in words."""
-    if row.kind == "tolerance":
+    if row.kind == TOLERANCE:
         return f"{row.method}, tolerance {row.setting:.0e}"
     return f"{row.method}, {1e3 * row.setting:g} ms steps"
 
 
-def _time(row: SolverResult) -> str:
-    milliseconds = 1e3 * row.wall_s[0]
-    return f"{milliseconds:.2g} ms" if milliseconds < 99.5 else f"{milliseconds:.0f} ms"
+def _time(wall_s: float) -> str:
+    return f"{1e3 * wall_s:.2g} ms" if wall_s < 0.0995 else f"{1e3 * wall_s:.0f} ms"
 
 
 def text(study: WorkPrecision) -> str:
@@ -145,7 +153,7 @@ def text(study: WorkPrecision) -> str:
         *_grid(study),
         "",
     ]
-    below = sum(row.error < study.floor for row in study.rows)
+    below = int((study.rows.below_floor == True).sum())  # noqa: E712
     if below:
         lines.append(f"* {below} rows lie below {study.floor:.0e} rad, 100 times the reference's "
                      "own error, and are not plotted.")  # fmt: skip
@@ -157,13 +165,13 @@ def text(study: WorkPrecision) -> str:
 def _grid(study: WorkPrecision) -> list[str]:
     heads = {
         "wall_min_s": "min [s]", "wall_median_s": "median [s]",
-        "final_orientation_rad": "end [rad]", "largest_orientation_rad": "largest [rad]",
+        "final_orientation_rad": "end [rad]", ERROR: "largest [rad]",
         "largest_gamma_rad": "gamma [rad]", "largest_gamma_dot_rad_per_s": "rate [rad/s]",
         "energy_residual_J": "energy [J]", "closure_residual": "closure",
     }  # fmt: skip
-    shown = frame([study]).assign(setting=[setting(row) for row in study.rows])
-    below = ["*" if row.error < study.floor else "" for row in study.rows]
-    failure = [f"FAILED: {row.failure[:60]}" if row.failure else "" for row in study.rows]
+    shown = study.rows.assign(setting=[setting(row) for _, row in study.rows.iterrows()])
+    below = ["*" if row is True else "" for row in study.rows.below_floor]
+    failure = [f"FAILED: {reason[:60]}" if reason else "" for reason in study.rows.failure]
     shown = shown[["setting", "evaluations", *heads]].rename(columns=heads)
     lines: str = shown.assign(**{"": below, "failure": failure}).to_string(
         index=False, na_rep="-", float_format=lambda x: f"{x:.1e}"
@@ -187,29 +195,37 @@ def facts(study: WorkPrecision) -> Iterator[str]:
     yield f"Advice: {study.advice.text}.{measured}"
 
 
-def figure(study: WorkPrecision) -> Any:
+def figure(study: WorkPrecision) -> Figure:
     """Draw the study."""
     best = study.best(TARGET)
     return draw_work_precision(
-        frame([study]),
+        study.rows,
         floors=(study.floor, ABOVE_REFERENCE * study.reference.own.gamma_dot),
         seconds=study.seconds,
         target=TARGET,
-        best=None if best is None else (1e3 * best.wall_s[0], max(best.error, study.floor)),
+        best=None if best is None else (1e3 * best.wall_min_s, max(best[ERROR], study.floor)),
         title=f"{study.scene}: error against wall time\n{fastest(study)}",
         footnote=f"Reference: {study.reference.how}. {provenance(compiled=study.compiled)}",
     )
 
 
-def page(studies: Sequence[WorkPrecision]) -> str:
-    """Write studies as one Markdown page."""
-    rows = []
+def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
+    """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
+    found, rows = summary(studies), []
     for each in studies:
-        best = {t: each.best(t) if t >= each.floor else None for t in TARGETS}
-        cells = {f"{t:.0e} rad": f"{setting(b)}: {_time(b)}" if b else None
-                 for t, b in best.items()}  # fmt: skip
+        own = found[found.scene == each.scene].set_index("target")
+        cells = {
+            f"{t:.0e} rad": f"{own.setting[t]}: {_time(own.wall_s[t])}" if t in own.index else None
+            for t in TARGETS
+        }
         rows.append({"scene": each.scene, "run": f"{each.seconds:g} s", **cells})
-    lines = [INTRODUCTION, "## Which method and step", "", markdown(table(rows))]
+    lines = [INTRODUCTION, "## Which method and step", "",
+             "![time of the fastest setting, by scene](accuracy.png)", "",
+             markdown(table(rows))]  # fmt: skip
+    if terms:
+        shown = [{**row, "ns": f"{row['ns']:.0f}"} for row in terms]
+        lines += ["", "## What the terms of a scene cost", "", TERMS_INTRODUCTION,
+                  markdown(table(shown))]  # fmt: skip
     for each in studies:
         lines += ["", f"## {each.scene}", "", f"**{fastest(each)}**", "",
                   f"![error against wall time, {each.scene}](accuracy_{each.scene}.png)",
@@ -217,7 +233,7 @@ def page(studies: Sequence[WorkPrecision]) -> str:
         if each.ends:
             lines.append(f"- Compared over {each.seconds:g} s; the run ends there: {each.ends}.")
         lines += [f"- {fact}" for fact in facts(each)]
-        failed = sum(bool(row.failure) for row in each.rows)
+        failed = int((each.rows.failure != "").sum())
         if failed:
             lines.append(f"- {failed} of {len(each.rows)} settings failed; they are in the CSV "
                          "and in the figure.")  # fmt: skip

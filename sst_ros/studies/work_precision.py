@@ -6,25 +6,26 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.dynamics import kernel
-from sst_ros.dynamics.virtual_work_derivative import body_acceleration
-from sst_ros.errors import SingularConfiguration, SstError
+from sst_ros.errors import SstError
 from sst_ros.integration.codegen import numba_version
-from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.report import formulation
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.high_precision import EXTENDED
-from sst_ros.studies.initial_value_problem import InitialValueProblem, StateError
-from sst_ros.studies.reference_solution import ReferenceSolution, solve_reference
+from sst_ros.studies.initial_value_problem import InitialValueProblem
+from sst_ros.studies.reference_solution import EXTENDED, ReferenceSolution, solve_reference
+from sst_ros.studies.results import table
 from sst_ros.studies.solver_grid import TOLERANCE, SolverSetting, solver_grid
 from sst_ros.studies.step_advice import StepAdvice, step_advice
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 ABOVE_REFERENCE = 100.0
 """Errors are reported only if they are so many times larger than the reference's own."""
@@ -50,41 +51,16 @@ SLOWER = 5.0
 
 _REPEAT_S, _REPEATS = 0.15, 15
 
-
-@dataclass(frozen=True)
-class SolverResult:
-    """One point of the solver grid.
-
-    Attributes:
-        method: name of the method.
-        kind: FIXED or TOLERANCE.
-        setting: length of the steps [s], or the tolerance.
-        evaluations: of the right-hand side, rejected steps included; None where not counted.
-        wall_s: shortest and median wall time of the run [s].
-        final, largest: errors at the end, and the largest over the run; None for a failure.
-        energy, closure: residuals at the end: energy [J], None where work is not integrated, and
-            abs(r_k . t_k).
-        failure: why it failed; empty where it did not.
-        end: last state; nan for a failure.
-
-    """
-
-    method: str
-    kind: str
-    setting: float
-    evaluations: int | None
-    wall_s: tuple[float, float]
-    final: StateError | None
-    largest: StateError | None
-    energy: float | None
-    closure: float | None
-    failure: str
-    end: Array
-
-    @property
-    def error(self) -> float:
-        """Largest error of the orientation [rad]; infinite for a failure."""
-        return self.largest.orientation if self.largest else math.inf
+ERROR = "largest_orientation_rad"
+COLUMNS = (
+    "scene", "method", "kind", "setting", "evaluations", "wall_min_s", "wall_median_s",
+    "final_orientation_rad", "final_gamma_rad", "final_gamma_dot_rad_per_s", ERROR,
+    "largest_gamma_rad", "largest_gamma_dot_rad_per_s", "energy_residual_J", "closure_residual",
+    "below_floor", "failure",
+)  # fmt: skip
+"""Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
+`evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
+for a failure, and `failure` for a success."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +73,7 @@ class WorkPrecision:
         ends: why the span ends before the scene's duration; empty where it does not.
         compiled: by numba.
         reference: the reference solution.
-        rows: the solver grid.
+        rows: the solver grid, columns as in COLUMNS; settings of a method from coarse to fine.
         advice: what `step_advice` recommends, as `scene show` prints it.
         measured: error [rad] and wall time [s] of `Simulation` with that advice; None where the
             scene's torques allow no such run.
@@ -112,7 +88,7 @@ class WorkPrecision:
     ends: str
     compiled: bool
     reference: ReferenceSolution
-    rows: tuple[SolverResult, ...]
+    rows: DataFrame
     advice: StepAdvice
     measured: tuple[float, float] | None
     formulation: float | None
@@ -123,17 +99,18 @@ class WorkPrecision:
         """Smallest orientation error that is reported [rad]."""
         return ABOVE_REFERENCE * self.reference.own.orientation
 
-    def best(self, target: float) -> SolverResult | None:
+    def best(self, target: float) -> Series[Any] | None:
         """Return the fastest setting with an orientation error of at most `target` [rad].
 
         A setting counts only if at least one finer setting of its method was tried and every one
         of them is as good: a coarse setting whose errors happen to cancel is no recommendation.
         """
-        good: list[SolverResult] = []
-        for _, group in itertools.groupby(self.rows, key=lambda row: (row.method, row.kind)):
-            fine_first = list(group)[::-1]
-            good += list(itertools.takewhile(lambda row: row.error <= target, fine_first))[1:]
-        return min(good, key=lambda row: row.wall_s[0], default=None)
+        good = []
+        for _, group in self.rows.groupby(["method", "kind"], sort=False):
+            bad = np.flatnonzero(~(group[ERROR].astype(float).to_numpy() <= target))
+            good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()
+        found = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
+        return None if found.empty else found.iloc[0]
 
 
 def work_precision(
@@ -150,7 +127,7 @@ def work_precision(
     Args:
         scene: what the reference solves.
         solved: what the methods solve, if it is another scene: the study must see the difference.
-        kind: arithmetic of the reference, high_precision.EXTENDED or MPMATH.
+        kind: arithmetic of the reference, reference_solution.EXTENDED or MPMATH.
         compiled: by numba, where it is installed.
         shown: draw a progress bar on the terminal.
         longest_s: no finer settings are tried after a run that took longer than this [s].
@@ -164,20 +141,26 @@ def work_precision(
     target = InitialValueProblem(scene)
     problem = target if solved is None else InitialValueProblem(solved, like=target)
     grid = solver_grid(problem, compiled)
-    rows: list[SolverResult] = []
+    rows: list[dict[str, Any]] = []
+    ends: list[Array] = []
     truth: ReferenceSolution | None = None
     for part in slices(len(grid) + 1, 1, f"{scene.name:<16}", shown):
         if truth is None:
             truth = solve_reference(target, kind, compiled=compiled)
-        else:
-            rows += _refined(grid[part.start - 1], problem, truth, longest_s)
+            continue
+        for row, end in _refined(grid[part.start - 1], problem, truth, longest_s):
+            rows.append({"scene": scene.name, **row})
+            ends.append(end)
     assert truth is not None
-    difference = _formulation(target, truth)
+    instants = (k * target.interval for k in range(len(truth.states)))
+    torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
+    along = zip(truth.states.astype(float), torques, strict=True)
+    difference = formulation.compare(scene, along).relative
     advice = step_advice(scene)
     return WorkPrecision(
-        scene.name, target.seconds, target.ends, compiled, truth, tuple(rows), advice,
+        scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS), advice,
         _measured(problem, truth, advice), difference,
-        tuple(_warnings(problem, truth, rows, difference)),
+        tuple(_warnings(problem, truth, rows, ends, difference)),
     )  # fmt: skip
 
 
@@ -186,21 +169,23 @@ def _refined(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
     longest_s: float,
-) -> Iterator[SolverResult]:
+) -> Iterator[tuple[dict[str, Any], Array]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
     for number, setting in enumerate(settings, start=1):
-        row = _result(setting, problem, truth)
-        yield row
-        below += row.error < max(floor, ROUNDING)
+        row, end = _result(setting, problem, truth)
+        yield row, end
+        error = row.get(ERROR, math.inf)
+        below += error < max(floor, ROUNDING)
         slower = SLOWER if problem.kinked and setting.kind == TOLERANCE else 1.0
-        if (row.wall_s[0] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
+        if (row["wall_min_s"] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
             return
 
 
 def _result(
     setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
-) -> SolverResult:
+) -> tuple[dict[str, Any], Array]:
+    """Run one setting: its row of the grid, and its last state, nan for a failure."""
     states, evaluations, failure = np.full((1, len(problem.start)), np.nan), None, ""
     wall = (0.0, 0.0)
     with np.errstate(all="ignore"):
@@ -211,16 +196,21 @@ def _result(
             failure = str(error).splitlines()[0] if str(error) else "not finite"
     if not failure and not np.isfinite(states[:, :7]).all():
         failure = "not finite"
-    final = largest = energy = closure = None
+    row = {
+        "method": setting.method, "kind": setting.kind, "setting": setting.setting,
+        "evaluations": evaluations, "wall_min_s": wall[0], "wall_median_s": wall[1],
+    }  # fmt: skip
     if not failure:
         final, largest = problem.errors(states, truth.states)
         if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
-            failure, final, largest = f"off by {largest.orientation:.1g} rad", None, None
+            failure = f"off by {largest.orientation:.1g} rad"
         else:
-            residual, closure = problem.residuals(states[-1])
-            energy = residual if math.isfinite(residual) else None
-    return SolverResult(setting.method, setting.kind, setting.setting, evaluations, wall, final,
-                        largest, energy, closure, failure, states[-1])  # fmt: skip
+            errors = (*asdict(final).values(), *asdict(largest).values())
+            row |= dict(zip(COLUMNS[7:13], errors, strict=True))
+            energy, row["closure_residual"] = problem.residuals(states[-1])
+            row["energy_residual_J"] = energy if math.isfinite(energy) else None
+            row["below_floor"] = largest.orientation < ABOVE_REFERENCE * truth.own.orientation
+    return row | {"failure": failure}, states[-1]
 
 
 def _timed(run: Callable[[], object]) -> tuple[float, float]:
@@ -249,46 +239,31 @@ def _measured(
     return problem.errors(states, truth.states)[1].orientation, time.perf_counter() - began
 
 
-def _formulation(problem: InitialValueProblem, truth: ReferenceSolution) -> float | None:
-    """Compare the kernel with the paper's equations along the reference; loads are left out."""
-    bare = Scene(**{name: getattr(problem.scene, name) for name in formulation.PAPER})
-    mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
-    differences, sizes = [], []
-    for k, state in enumerate(truth.states[:, :7].astype(float).tolist()):
-        given = problem.torque
-        torque = given(k * problem.interval) if callable(given) else given
-        try:
-            paper, _ = body_acceleration(mechanism, state, torque)
-        except (SingularConfiguration, np.linalg.LinAlgError):
-            continue
-        ours = np.array(kernel.derivative(model, tuple(state), torque)[4:7])
-        differences.append(float(np.linalg.norm(ours - paper)))
-        sizes.append(float(np.linalg.norm(paper)))
-    return max(differences) / max(sizes) if sizes and max(sizes) > 0.0 else None
-
-
 def _warnings(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
-    rows: list[SolverResult],
+    rows: Sequence[dict[str, Any]],
+    ends: Sequence[Array],
     difference: float | None,
 ) -> Iterator[str]:
     if difference is not None and difference > SAME_EQUATIONS:
         yield f"the kernel differs from the paper's equations by {difference:.1e}"
     if problem.clamped:
         yield "the torques are clamped to the actuators' limit: no fixed steps are tried"
-    best: dict[str, tuple[float, SolverResult]] = {}
-    for row in rows:
-        error = row.final.orientation if row.final else math.inf
-        if row.final and error < best.get(row.method, (math.inf,))[0]:
-            best[row.method] = error, row
-    for (error, one), (other_error, other) in itertools.combinations(best.values(), 2):
-        pair = np.stack([one.end, other.end])[:, :7]
+    best: dict[str, tuple[float, Array]] = {}
+    for row, end in zip(rows, ends, strict=True):
+        error = row.get("final_orientation_rad", math.inf)
+        if error < best.get(row["method"], (math.inf,))[0]:
+            best[row["method"]] = error, end
+    for (one, (error, end)), (two, (other_error, other_end)) in itertools.combinations(
+        best.items(), 2
+    ):
+        pair = np.stack([end, other_end])[:, :7]
         apart = problem.errors(pair[:1], pair[1:].astype(np.longdouble))[0].orientation
         least = min(error, other_error)
         if least > 100.0 * max(apart, 10.0 * truth.own.orientation, 1e-13):
             yield (
-                f"{one.method} and {other.method} agree to {apart:.1e} rad, but are {least:.1e} "
+                f"{one} and {two} agree to {apart:.1e} rad, but are {least:.1e} "
                 "rad off the reference: they do not solve what the reference solves"
             )
             return

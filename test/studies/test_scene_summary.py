@@ -63,6 +63,12 @@ def test_absent_terms_cost_nothing_and_present_ones_something(name):
         assert cost.adds >= 0
 
 
+@every_scene
+def test_operations_are_counted_in_the_generated_source(name):
+    scene = load(name)
+    assert operations(scene) == Dynamics.of(scene).program.operations.total()
+
+
 def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
     scene = everything()
     for term in TERMS:

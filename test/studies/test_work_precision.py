@@ -14,14 +14,26 @@ from matplotlib import image
 from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.plot.style import save_figure
+from sst_ros.plot.work_precision import draw_summary
 from sst_ros.scene.bodies import Inertia
-from sst_ros.studies.accuracy_report import COLUMNS, documents, fastest, figure, frame, page, text
-from sst_ros.studies.high_precision import EXTENDED, MPMATH, HighPrecisionDop853
-from sst_ros.studies.initial_value_problem import InitialValueProblem, StateError
-from sst_ros.studies.results import write
+from sst_ros.studies.accuracy_report import (
+    documents,
+    fastest,
+    figure,
+    frame,
+    page,
+    text,
+)
+from sst_ros.studies.accuracy_report import (
+    summary as summary_of,
+)
+from sst_ros.studies.initial_value_problem import InitialValueProblem
+from sst_ros.studies.reference_solution import EXTENDED, MPMATH, HighPrecisionDop853
+from sst_ros.studies.results import table, write
 from sst_ros.studies.scene_summary import summary
 from sst_ros.studies.solver_grid import FIXED, TOLERANCE
-from sst_ros.studies.work_precision import ABOVE_REFERENCE, SolverResult, work_precision
+from sst_ros.studies.term_costs import cost_table, operations
+from sst_ros.studies.work_precision import ABOVE_REFERENCE, COLUMNS, ERROR, work_precision
 
 SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
@@ -35,7 +47,8 @@ def short():
 
 
 def _rows(found, method, kind=FIXED):
-    return [row for row in found.rows if (row.method, row.kind) == (method, kind)]
+    rows = found.rows
+    return list(rows[(rows.method == method) & (rows.kind == kind)].itertuples())
 
 
 @pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
@@ -60,25 +73,25 @@ def test_the_reference_is_what_mpmath_finds():
 
 def test_methods_show_their_order(short):
     for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas4", 4)):
-        rows = [row for row in _rows(short, method) if 1e-12 < row.final.orientation < 1e-4]
+        rows = [row for row in _rows(short, method) if 1e-12 < row.final_orientation_rad < 1e-4]
         assert len(rows) > 1 or method == "dop853"
         slopes = [
-            np.log(a.final.orientation / b.final.orientation) / np.log(a.setting / b.setting)
+            np.log(a.final_orientation_rad / b.final_orientation_rad)
+            / np.log(a.setting / b.setting)
             for a, b in itertools.pairwise(rows)
         ]
         assert not slopes or max(slopes) == pytest.approx(order, abs=1.0), method
 
 
 def test_every_row_is_whole(short):
-    assert {row.kind for row in short.rows} == {FIXED, TOLERANCE}
-    assert not _rows(short, "rk4", TOLERANCE)
-    for row in short.rows:
-        assert not row.failure and 0.0 < row.wall_s[0] <= row.wall_s[1]
-        assert row.final.orientation <= row.largest.orientation
-        assert row.closure < 1e-14 and row.evaluations > 0
-    assert min(abs(row.energy) for row in short.rows) < 1e-14
-    best = short.best(1e-9)
-    assert best.largest.orientation <= 1e-9
+    rows = short.rows
+    assert set(rows.kind) == {FIXED, TOLERANCE} and not _rows(short, "rk4", TOLERANCE)
+    assert (rows.failure == "").all()
+    assert (rows.wall_min_s > 0.0).all() and (rows.wall_min_s <= rows.wall_median_s).all()
+    assert (rows.final_orientation_rad <= rows[ERROR]).all()
+    assert rows.closure_residual.max() < 1e-14 and rows.evaluations.min() > 0
+    assert rows.energy_residual_J.abs().min() < 1e-14
+    assert short.best(1e-9)[ERROR] <= 1e-9
     assert not short.warnings and short.formulation < 1e-13
 
 
@@ -90,7 +103,7 @@ def test_what_it_writes_can_be_read(short, tmp_path):
           page=page([short]), figures={"picture": figure(short)})  # fmt: skip
     rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
-    assert [float(row["wall_min_s"]) for row in rows] == [row.wall_s[0] for row in short.rows]
+    assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
     document = json.loads((tmp_path / "accuracy.json").read_text())
     assert document["studies"][0]["rows"][0]["method"] == "rk4" and "date" in document["report"]
     assert "accuracy_example2_heavy.png" in (tmp_path / "accuracy.md").read_text()
@@ -98,18 +111,24 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
 
 
+def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
+    found = summary_of([short])
+    assert found.target.tolist() == [1e-6, 1e-9, 1e-12]
+    save_figure(draw_summary(found, "made today"), tmp_path / "summary.png")
+    terms = cost_table(SHORT, compiled=False)
+    assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51, 0]
+    assert terms[0]["ns"] > terms[2]["ns"] and terms[3]["term"].startswith("absent")
+    assert "| example2_heavy | intermediate links | 51 |" in page([short], terms)
+
+
 def graded(*errors):
     """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
     rows = [
-        SolverResult(
-            "dop853", FIXED, 0.5**k, 1, (1e-3 * (k + 1),) * 2, None,
-            StateError(error, 0.0, 0.0) if error else None, None, None, "", np.zeros(7),
-        )
-        for k, error in enumerate(errors)
+        {"method": "dop853", "kind": FIXED, "setting": 0.5**k, "wall_min_s": 1e-3 * (k + 1),
+         ERROR: error} for k, error in enumerate(errors)
     ]  # fmt: skip
-    return dataclasses.replace(
-        work_precision(BRIEF, compiled=False, longest_s=0.0), rows=tuple(rows)
-    )
+    found = work_precision(BRIEF, compiled=False, longest_s=0.0)
+    return dataclasses.replace(found, rows=table(rows, COLUMNS))
 
 
 @pytest.mark.parametrize(
@@ -140,7 +159,7 @@ def test_another_inertia_in_the_runs_is_seen():
     star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
     solved = dataclasses.replace(BRIEF, star=star)
     found = work_precision(BRIEF, solved=solved, compiled=False, longest_s=0.005)
-    least = min(row.largest.orientation for row in found.rows if row.largest)
+    least = found.rows[ERROR].min()
     assert 1e-10 < least < 1e-6
     assert any("do not solve what the reference solves" in words for words in found.warnings)
     assert "WARNING" in text(found)
@@ -158,8 +177,8 @@ def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
     found = work_precision(stiff, compiled=False, longest_s=0.005)
     assert not any(row.failure for row in _rows(found, "rodas4"))
-    failed = [row for row in found.rows if row.failure]
-    assert failed and all(row.largest is None for row in failed)
+    failed = found.rows[found.rows.failure != ""]
+    assert len(failed) and failed[ERROR].isna().all()
     assert text(found).count("FAILED") == len(failed)
     assert frame([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
     save_figure(figure(found), tmp_path / "picture.png")
@@ -170,7 +189,7 @@ def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
     found = work_precision(resting, compiled=False, longest_s=0.002)
     assert found.reference.own.gamma_dot == 0.0
-    assert any(row.largest and row.largest.gamma_dot == 0.0 for row in found.rows)
+    assert (found.rows.largest_gamma_dot_rad_per_s == 0.0).any()
     save_figure(figure(found), tmp_path / "picture.png")
 
 
