@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`identify`: constants of a scene from a recorded run."""
+"""`identify`: constants of a scene from a recorded run, and motions that show them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ import argparse
 from pathlib import Path
 
 from sst_ros.cli.parsing import Commands, add_scene
-from sst_ros.output_folder import require_free
+from sst_ros.errors import InputError, Problem
+from sst_ros.output_folder import require_free, writing
+
+DESIGN = "design"
 
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
     identify = commands.add_parser(
         "identify",
-        help="inertias, friction and more from a recorded run",
-        description="Fit the torques of a recorded run by weighted least squares: what the motion "
-        "determines, with standard deviations, and the nearest scene whose bodies can exist.",
+        help="inertias, friction and more from a recorded run; motions that show them",
+        description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
+        "what the motion determines, with standard deviations, and the nearest scene whose bodies "
+        "can exist. `identify design SCENE` makes a motion that determines the parameters well, "
+        "within stroke, workspace and the limits of the actuators.",
     )
-    identify.add_argument("bag", type=Path, help="folder of the bag")
+    identify.add_argument("bag", metavar="BAG", help="folder of the bag, or the word design")
+    add_scene(
+        identify, "designed", nargs="?", metavar="SCENE",
+        help="after design: the scene to make a motion for, about its initial pose",
+    )  # fmt: skip
     add_scene(
         identify, "--scene", metavar="S",
         help="what is known, and the values to start from; default: the recorded scene",
@@ -33,24 +42,52 @@ def add(commands: Commands) -> None:
         help="of the zero-phase filter of measured angles; default: none, rates as recorded",
     )  # fmt: skip
     identify.add_argument(
-        "--delay", type=float, default=0.0, metavar="SECONDS",
+        "--delay", type=float, metavar="SECONDS",
         help="by which measured torques come late; default: 0",
     )  # fmt: skip
+    identify.add_argument("--duration", type=float, help="of a designed motion [s]; default: 6")
+    identify.add_argument("--harmonics", type=int, help="of a designed motion; default: 5")
+    identify.add_argument("--seed", type=int, help="of a designed motion; default: 0")
     identify.add_argument("--out", type=Path, metavar="SCENE.yaml", help="write the scene")
     identify.add_argument("--force", action="store_true", help="overwrite the file of --out")
     identify.set_defaults(run=_identify)
 
 
 def _identify(options: argparse.Namespace) -> None:
+    designing = options.bag == DESIGN
+    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene")
+    wrong = [
+        Problem(f"--{name}", getattr(options, name), f"is no option of identify {form}")
+        for name in (others if designing else ours)
+        if (form := DESIGN if designing else "BAG") and getattr(options, name) is not None
+    ]
+    if designing != (options.designed is not None):
+        allowed = "must be given after design, and only there"
+        wrong.append(Problem("SCENE", options.designed, allowed))
+    if wrong:
+        raise InputError("identify", wrong)
     if options.out is not None:
         require_free(options.out, "identify", force=options.force)
-    from sst_ros.identification.identify import identify
+    from sst_ros.scene.scene import load
     from sst_ros.scene.yaml_document import dump
 
-    found = identify(
-        options.bag, options.scene, options.parameters, cutoff=options.cutoff, delay=options.delay
-    )
-    print(found.table(), end="")
+    if designing:
+        from sst_ros.identification.excitation import design
+
+        given = {name: getattr(options, name) for name in ours}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        motion = design(load(options.designed), options.parameters, **chosen)
+        table, scene = motion.table(), motion.scene
+    else:
+        from sst_ros.identification.identify import identify
+
+        found = identify(
+            options.bag, options.scene, options.parameters,
+            cutoff=options.cutoff, delay=options.delay or 0.0,
+        )  # fmt: skip
+        table, scene = found.table(), found.scene
+    print(table, end="")
     if options.out is not None:
-        options.out.write_text(dump(found.scene), encoding="utf-8")
+        with writing(options.out.parent, "identify"):
+            options.out.write_text(dump(scene), encoding="utf-8")
         print(f"wrote {options.out}")

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `identify`: a recording to a scene, a scene to a motion, and refusals."""
+
+import pytest
+from identification import manipulators
+
+from sst_ros import load_scene
+from sst_ros.cli.main import run
+
+
+def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
+    bag = written(example2)
+    out = tmp_path / "identified.yaml"
+    words = ["identify", str(bag), "--parameters", "star", "--out", str(out)]
+    assert run(words) == 0
+    printed = capsys.readouterr().out
+    assert "star.inertia.zz" in printed and f"wrote {out}" in printed
+    found, given = load_scene(out), load_scene("example2")
+    for part in ("xx", "yy", "zz"):
+        expected = getattr(given.star.inertia, part)
+        assert getattr(found.star.inertia, part) == pytest.approx(expected, rel=1e-3)
+    assert dict(found.provenance)["star"].startswith("identified")
+    assert run(words) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_a_scene_becomes_a_motion(tmp_path, capsys):
+    out = tmp_path / "exciting.yaml"
+    words = ["identify", "design", "example2", "--duration", "3", "--harmonics", "3"]
+    assert run([*words, "--parameters", "star", "--out", str(out)]) == 0
+    assert "condition number" in capsys.readouterr().out
+    assert load_scene(out).motion.kind == "waypoints"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["design"], "must be given after design"),
+        (["bag", "reach"], "only there"),
+        (["design", "reach", "--cutoff", "3"], "is no option of identify design"),
+        (["bag", "--seed", "3"], "is no option of identify BAG"),
+        (["nowhere"], "nowhere"),
+    ],
+)
+def test_what_does_not_fit_is_refused(words, message, capsys):
+    assert run(["identify", *words]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_recording_of_another_manipulator_is_refused(written, example2, tmp_path, capsys):
+    from sst_ros.scene.yaml_document import dump
+
+    other = tmp_path / "other.yaml"
+    other.write_text(dump(manipulators.general()), encoding="utf-8")
+    assert run(["identify", str(written(example2)), "--scene", str(other)]) == 1
+    assert "must be angles of this manipulator" in capsys.readouterr().err

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification from encoder counts and noisy torques: coverage, bias, delay, filters."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from identification import manipulators
+
+from sst_ros import InverseDynamics, load_scene, reference_motion
+from sst_ros.errors import InputError
+from sst_ros.identification import parameters
+from sst_ros.identification.derivatives import bandwidth, filtered
+from sst_ros.identification.identify import identify
+
+COUNT = 2.0 * np.pi / 65536
+NOISE = 0.01
+NORMAL_95 = 1.96
+
+
+class Measured:
+    """Torques and angles of a motion of `reach`, exact, and as encoders and sensors give them."""
+
+    def __init__(self, seconds, rate):
+        self.plant = manipulators.sweeping(load_scene("reach"), seconds, speed=1.0)
+        self.model = manipulators.wrong(self.plant)
+        motion, inverse = reference_motion(self.plant), InverseDynamics(self.plant)
+        self.t = np.arange(0.0, seconds, 1.0 / rate)
+        references = [motion.at(t) for t in self.t.tolist()]
+        self.gamma = np.array([one.gamma for one in references])
+        self.torque = np.array([inverse.reference_torque(one) for one in references])
+
+    def recording(self, seed):
+        """One measurement: the encoders' zeros are anywhere, noise is a share of the peak."""
+        rng = np.random.default_rng(seed)
+        zero = rng.uniform(0.0, COUNT, 3)
+        gamma = COUNT * (np.floor((self.gamma + zero) / COUNT) + 0.5) - zero
+        noise = rng.normal(size=self.torque.shape) * NOISE * np.abs(self.torque).max(axis=0)
+        return {"t": self.t, "gamma": gamma, "torque": self.torque + noise}
+
+
+@cache
+def measured(seconds=6.0, rate=1000.0):
+    return Measured(seconds, rate)
+
+
+def errors(case, seeds):
+    """Estimates less truth, in standard deviations, shape (recordings, b)."""
+    rows = []
+    for seed in seeds:
+        found = identify(case.recording(seed), case.model)
+        true = found.base.transform @ parameters.values(case.plant, found.names)
+        rows.append((found.estimate - true) / found.deviation)
+    return np.array(rows)
+
+
+def improvement(case, seed):
+    """Error of the feedforward on `reach` by the wrong model over that by the identified one."""
+    found = identify(case.recording(seed), case.model)
+    motion = reference_motion(load_scene("reach"))
+    references = [motion.at(t) for t in np.linspace(0.0, motion.duration, 60).tolist()]
+    exact, wrong, right = (
+        np.array([InverseDynamics(scene).reference_torque(one) for one in references])
+        for scene in (case.plant, case.model, found.scene)
+    )
+    return np.linalg.norm(wrong - exact) / np.linalg.norm(right - exact)
+
+
+def test_ten_recordings_are_within_their_standard_deviations():
+    z = errors(measured(), range(10))
+    assert 0.9 < np.mean(np.abs(z) < NORMAL_95) < 0.99
+    assert np.abs(z.mean(axis=0)).max() < 4.0 / np.sqrt(len(z))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_200_recordings_are_covered_by_their_95_percent_intervals():
+    """Each base parameter in 90 to 99 % of the recordings; its bias is below its deviation."""
+    z = errors(measured(), range(200))
+    covered = np.mean(np.abs(z) < NORMAL_95, axis=0)
+    assert covered.min() >= 0.90 and covered.max() <= 0.99
+    assert np.abs(z.mean(axis=0)).max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_feedforward_errs_twenty_times_less_than_with_the_wrong_model(seed):
+    assert improvement(measured(), seed) > 20.0
+
+
+def test_noise_is_found_and_may_be_given():
+    case = measured()
+    found = identify(case.recording(0), case.model)
+    true = NOISE * np.abs(case.torque).max(axis=0)
+    assert found.fit.noise == pytest.approx(true, rel=0.1)  # and some of the angles
+    given = identify(case.recording(0), case.model, noise=2.0 * true)
+    assert given.deviation == pytest.approx(2.0 * found.deviation, rel=0.05)
+    assert found.consistent
+    assert np.all(np.abs(np.diag(found.correlation) - 1.0) < 1e-12)
+
+
+def test_a_known_delay_of_the_torques_is_taken_out():
+    case = measured()
+    late, exact = 5, {"t": case.t, "gamma": case.gamma, "torque": case.torque}
+    delayed = np.vstack([np.repeat(case.torque[:1], late, axis=0), case.torque[:-late]])
+    errors = []
+    for torque, delay in ((case.torque, 0.0), (delayed, 0.0), (delayed, late * 1e-3)):
+        found = identify(exact | {"torque": torque}, case.model, cutoff=30.0, delay=delay)
+        true = found.base.transform @ parameters.values(case.plant, found.names)
+        errors.append(np.linalg.norm(found.estimate - true) / np.linalg.norm(true))
+    assert errors[0] < 1e-3 and errors[2] < 1e-3
+    assert errors[1] > 5.0 * errors[2]
+
+
+def test_the_filter_has_no_phase_and_leaves_the_motion():
+    t = np.arange(2000) * 1e-3
+    gamma = np.stack([np.sin(2 * np.pi * f * t) for f in (1.0, 2.0, 3.0)], axis=1)
+    smooth, settled = filtered(t, gamma, 30.0)
+    inside = slice(settled, -settled)
+    # |H|^2 = 1 / (1 + (f / cutoff)^8), forwards and backwards; the ends fade slowly.
+    assert np.abs(smooth - gamma)[inside].max() < 1e-5
+    assert bandwidth(1e-3, gamma) == pytest.approx(3.0, abs=1.0)
+
+
+def test_angles_to_be_filtered_must_be_evenly_spaced_and_long_enough():
+    case = measured()
+    uneven = case.recording(0) | {"t": case.t + 4e-4 * np.sin(np.arange(len(case.t)))}
+    with pytest.raises(InputError, match="must be evenly spaced"):
+        identify(uneven, case.model)
+    short = {name: rows[:60] for name, rows in case.recording(0).items()}
+    with pytest.raises(InputError, match="must last"):
+        identify(short, case.model, cutoff=20.0)
