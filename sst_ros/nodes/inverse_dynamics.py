@@ -8,7 +8,6 @@ from array import array
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
@@ -55,11 +54,9 @@ class InverseDynamicsController:
         self._seen: Measurement | None = None
         self._places: tuple[list[str], list[int]] = ([], [])
         self._began = self._finished = False
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(String, f"{given.simulator}/phase", self._hear, latched)
-        self.node.create_subscription(JointState, "joint_states", self._answer, 1)
-        taken = topics.JOINT_TRAJECTORY
-        self.node.create_subscription(taken.kind, taken.name, self._take, taken.depth)
+        topics.CONTROLLER_PHASE.subscription(self.node, self._hear, simulator=given.simulator)
+        topics.CONTROLLED.subscription(self.node, self._answer)
+        topics.JOINT_TRAJECTORY.subscription(self.node, self._take)
         self.node.create_timer(0.5, self._watch, clock=STEADY)
         self.node.create_timer(1.0, self._report, clock=STEADY)
 

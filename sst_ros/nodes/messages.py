@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from sst_ros.description.frame_ids import BASE_FRAME
@@ -160,8 +159,3 @@ def diagnostics(
     message = DiagnosticArray(status=[status])
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
     return message
-
-
-def nanoseconds(stamp: Time) -> int:
-    """Return a message's time as integer nanoseconds."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

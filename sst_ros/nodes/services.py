@@ -26,8 +26,7 @@ class Services:
         ):
             qos = topics.SERVICE_QOS
             node.create_service(endpoint.kind, endpoint.name, answer, qos_profile=qos)
-        topic = topics.SET_STATE
-        node.create_subscription(topic.kind, topic.name, self._set_state, topic.depth)
+        topics.SET_STATE.subscription(node, self._set_state)
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         reply = self._loop.ask(partial(self._loop.pause, request.data))

@@ -6,6 +6,7 @@ In names ~ stands for the name of the node.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from geometry_msgs.msg import QuaternionStamped, Vector3Stamped, WrenchStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -61,11 +63,25 @@ class Endpoint:
         name = self.name.replace("~", node)
         return name if name.startswith("/") else f"{node.rpartition('/')[0]}/{name}"
 
-    def publisher(self, node: Node, depth: int = 0) -> Publisher[Any]:
+    def publisher(self, node: Node, depth: int = 0, *, simulator: str = "") -> Publisher[Any]:
         """Create its publisher."""
+        return node.create_publisher(self.kind, self.resolved(simulator), self._qos(depth))
+
+    def subscription(
+        self, node: Node, callback: Callable[[Any], None], *, simulator: str = ""
+    ) -> Subscription[Any]:
+        """Create its subscription."""
+        return node.create_subscription(
+            self.kind, self.resolved(simulator), callback, self._qos(self.depth)
+        )
+
+    def resolved(self, simulator: str) -> str:
+        """Return its name with that of the simulator's node."""
+        return self.name.replace("{simulator}", simulator)
+
+    def _qos(self, depth: int) -> QoSProfile:
         durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=self.depth or depth, durability=durability)
-        return node.create_publisher(self.kind, self.name, qos)
+        return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
 JOINT_STATES = Endpoint(
@@ -186,28 +202,40 @@ PLAYED = Endpoint(
     "samples that are answered, from the first on",
     depth=1000,
 )
+PLAYER_PHASE = Endpoint(
+    SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True
+)
 PLAYER = (
     *_torques("the profile's torques [N m] for the hold that each joint_states begins"),
     PLAYED,
-    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True),
+    PLAYER_PHASE,
 )
 
-VIEWER = (
-    Endpoint(SUBSCRIBES, "joint_states", JointState, "states that are shown", depth=64),
-    Endpoint(SUBSCRIBES, "{simulator}/scene", String, "manipulator that is drawn", 1, True),
-    Endpoint(SUBSCRIBES, "{simulator}/phase", String, "phase of the run", 1, True),
-    Endpoint(SUBSCRIBES, "/diagnostics", DiagnosticArray, "diagnostics of the run"),
-    Endpoint(
-        PUBLISHES,
-        "{simulator}/commands",
-        Float64MultiArray,
-        "torques of the page's sliders [N m], 20 times a second",
-        when="a slider was moved and no other node publishes commands",
-    ),
-    Endpoint(CALLS, "{simulator}/pause", SetBool, "the button Pause, or Resume"),
-    Endpoint(CALLS, "{simulator}/step", Trigger, "the button Step"),
-    Endpoint(CALLS, "{simulator}/reset", Trigger, "the button Reset"),
+VIEWED = tuple(
+    Endpoint(SUBSCRIBES, *declared)
+    for declared in (
+        ("joint_states", JointState, "states that are shown", 64),
+        ("{simulator}/scene", String, "manipulator that is drawn", 1, True),
+        ("{simulator}/phase", String, "phase of the run", 1, True),
+        ("/diagnostics", DiagnosticArray, "diagnostics of the run"),
+    )
 )
+VIEWER_COMMANDS = Endpoint(
+    PUBLISHES,
+    "{simulator}/commands",
+    Float64MultiArray,
+    "torques of the page's sliders [N m], 20 times a second",
+    when="a slider was moved and no other node publishes commands",
+)
+CALLED = tuple(
+    Endpoint(CALLS, f"{{simulator}}/{name}", kind, doc)
+    for name, kind, doc in (
+        ("pause", SetBool, "the button Pause, or Resume"),
+        ("step", Trigger, "the button Step"),
+        ("reset", Trigger, "the button Reset"),
+    )
+)
+VIEWER = (*VIEWED, VIEWER_COMMANDS, *CALLED)
 
 REFERENCE = Endpoint(
     PUBLISHES,
@@ -232,22 +260,24 @@ JOINT_TRAJECTORY = Endpoint(
     "cannot be followed, and where motion is not topic",
 )
 
+CONTROLLED = Endpoint(
+    SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1
+)
+CONTROLLER_PHASE = Endpoint(
+    SUBSCRIBES,
+    "{simulator}/phase",
+    String,
+    "begins anew at a reset, ends at a fault and at the end of the run",
+    10,
+    True,
+)
 INVERSE_DYNAMICS = (
     *_torques("torques [N m] that answer each joint_states"),
     REFERENCE,
     TRACKING_ERROR,
     Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the control, at 1 Hz"),
-    Endpoint(
-        SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1
-    ),
-    Endpoint(
-        SUBSCRIBES,
-        "{simulator}/phase",
-        String,
-        "begins anew at a reset, ends at a fault and at the end of the run",
-        10,
-        True,
-    ),
+    CONTROLLED,
+    CONTROLLER_PHASE,
     JOINT_TRAJECTORY,
 )
 

@@ -11,7 +11,6 @@ import threading
 from pathlib import Path
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -38,11 +37,10 @@ class TorquePlayer:
         self._start_ns: int | None = None
         self._last_ns = 0
         self._warned = False
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        phase = f"{self._parameters.simulator}/phase"
-        self.node.create_subscription(String, phase, self._hear, latched)
-        played = topics.PLAYED
-        self.node.create_subscription(played.kind, played.name, self._answer, played.depth)
+        topics.PLAYER_PHASE.subscription(
+            self.node, self._hear, simulator=self._parameters.simulator
+        )
+        topics.PLAYED.subscription(self.node, self._answer)
         self.node.create_timer(0.5, self._commands.watch, clock=STEADY)
 
     def close(self) -> None:

@@ -14,22 +14,21 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.description.frame_ids import is_idle
 from sst_ros.errors import InputError
-from sst_ros.nodes import parameters, topics
+from sst_ros.nodes import graph, parameters, topics
 from sst_ros.nodes.clocks import STEADY
-from sst_ros.nodes.messages import nanoseconds
 from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Triple
+from sst_ros.state import nanoseconds
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 
@@ -37,7 +36,7 @@ _REPLY_S = 5.0
 _REPEAT_S = 0.05
 """Period of manual commands; the simulator drops commands older than half a second."""
 _LOOK_S = 0.5
-_QUEUE = 64
+_QUEUE = topics.VIEWED[0].depth
 
 
 class Viewer:
@@ -54,18 +53,15 @@ class Viewer:
         self._torque: Triple = ZERO
         self._controller, self._driving = "", False
         self._commands: Publisher[Float64MultiArray] | None = None
-        self._clients: dict[topics.Endpoint, Client[Any, Any]] = {
-            one: self.node.create_client(one.kind, self._name(one), qos_profile=topics.SERVICE_QOS)
-            for one in (topics.PAUSE, topics.STEP, topics.RESET)
+        self._clients: dict[str, Client[Any, Any]] = {
+            one.name.rpartition("/")[2]: self.node.create_client(
+                one.kind, one.resolved(given.simulator), qos_profile=topics.SERVICE_QOS
+            )
+            for one in topics.CALLED
         }
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for kind, name, callback, qos in (
-            (String, self._name(topics.SCENE), self._take_scene, latched),
-            (String, self._name(topics.PHASE), self._take_phase, latched),
-            (DiagnosticArray, "/diagnostics", self._take_diagnostics, 10),
-            (JointState, topics.JOINT_STATES.name, self._take_state, _QUEUE),
-        ):
-            self.node.create_subscription(kind, name, callback, qos)
+        takers = self._take_state, self._take_scene, self._take_phase, self._take_diagnostics
+        for topic, taker in zip(topics.VIEWED, takers, strict=True):
+            topic.subscription(self.node, taker, simulator=given.simulator)
         self.node.create_timer(_REPEAT_S, self._repeat, clock=STEADY)
         self.node.create_timer(_LOOK_S, self._look, clock=STEADY)
         self._page = Page(self, given.host, given.port)
@@ -92,15 +88,15 @@ class Viewer:
 
     def pause(self, paused: bool) -> tuple[bool, str]:
         """Pause or resume the run."""
-        return self._call(topics.PAUSE, SetBool.Request(data=paused))
+        return self._call("pause", SetBool.Request(data=paused))
 
     def step(self) -> tuple[bool, str]:
         """Advance a paused run by one sample."""
-        return self._call(topics.STEP, Trigger.Request())
+        return self._call("step", Trigger.Request())
 
     def reset(self) -> tuple[bool, str]:
         """Return to the initial state."""
-        reply = self._call(topics.RESET, Trigger.Request())
+        reply = self._call("reset", Trigger.Request())
         if reply[0]:
             self._restart()
         return reply
@@ -112,9 +108,6 @@ class Viewer:
     def controller(self) -> str:
         """Name of another node that publishes commands; empty if there is none."""
         return self._controller
-
-    def _name(self, one: topics.Endpoint) -> str:
-        return one.name.replace("~", self._parameters.simulator)
 
     def _take_state(self, message: JointState) -> None:
         """Queue a state; one that is idle keeps the time of the last sample."""
@@ -150,12 +143,12 @@ class Viewer:
 
     def _look(self) -> None:
         """Look for another node that publishes commands, and leave the run to it."""
-        own = self.node.get_fully_qualified_name()
+        own, node = self.node.get_fully_qualified_name(), self._parameters.simulator
         names = (
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            name
             for one in (topics.COMMANDS, topics.COMMANDS_STAMPED)
-            for info in self.node.get_publishers_info_by_topic(
-                self.node.resolve_topic_name(self._name(one))
+            for name in graph.publishers(
+                self.node, self.node.resolve_topic_name(one.name.replace("~", node))
             )
         )
         self._controller = next((name for name in names if name != own), "")
@@ -172,15 +165,16 @@ class Viewer:
         if not self._driving:
             return
         if self._commands is None:
-            name = self._name(topics.COMMANDS)
-            self._commands = self.node.create_publisher(Float64MultiArray, name, 10)
+            self._commands = topics.VIEWER_COMMANDS.publisher(
+                self.node, simulator=self._parameters.simulator
+            )
         self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
 
-    def _call(self, one: topics.Endpoint, request: Any) -> tuple[bool, str]:
+    def _call(self, service: str, request: Any) -> tuple[bool, str]:
         """Call a service from a thread of the page; the node's thread takes the reply."""
-        client, answered = self._clients[one], threading.Event()
+        client, answered = self._clients[service], threading.Event()
         if not client.service_is_ready():
-            return False, f"no service {self._name(one)}: is the simulator running?"
+            return False, f"no service {client.srv_name}: is the simulator running?"
         future = client.call_async(request)
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(_REPLY_S):

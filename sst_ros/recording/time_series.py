@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.mechanism.geometry import Array
+from sst_ros.state import NANOSECONDS as NANOSECONDS
 
 Integers: TypeAlias = NDArray[np.int64]
-
-NANOSECONDS = 1_000_000_000
 
 
 def aligned(wanted_ns: Integers, stamps_ns: Integers, rows: Array) -> Array:

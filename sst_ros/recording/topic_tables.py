@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_ros.description.frame_ids import is_idle
 from sst_ros.recording.bag_reader import Topic
-from sst_ros.recording.time_series import NANOSECONDS
+from sst_ros.state import nanoseconds
 
 KINDS = ("gamma", "mu", "beta")
 JOINTS = tuple(f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3))
@@ -158,11 +158,6 @@ def places_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
     if absent:
         raise InvalidMessage(list(names), "joints are missing: " + ", ".join(absent))
     return [list(names).index(name) for name in wanted]
-
-
-def nanoseconds(stamp: Any) -> int:
-    """Return a Time or Duration as one number [ns]."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def _table(

@@ -11,7 +11,7 @@ from sst_ros.control.waypoints import waypoints
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.state import NANOSECONDS, nanoseconds
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
@@ -37,7 +37,7 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
     return waypoints(
         geometry,
         begin.quaternion,
-        [_ns(point.time_from_start) / NANOSECONDS for point in points],
+        [nanoseconds(point.time_from_start) / NANOSECONDS for point in points],
         [_sorted(point.positions, places) for point in points],
         [_sorted(point.velocities, places) for point in points],
         [_sorted(point.accelerations, places) for point in points],
@@ -49,7 +49,7 @@ def _faults(message: Any) -> Iterator[Problem]:
     names = list(message.joint_names)
     if sorted(names) != list(ACTUATORS):
         yield Problem("joint_names", names, f"must be {', '.join(ACTUATORS)}, each once")
-    if stamp := _ns(message.header.stamp):
+    if stamp := nanoseconds(message.header.stamp):
         yield Problem("header.stamp", stamp, "must be zero: a trajectory begins immediately")
     for index, point in enumerate(message.points):
         if len(point.effort):
@@ -59,7 +59,7 @@ def _faults(message: Any) -> Iterator[Problem]:
 
 def _jump(message: Any, begin: Reference) -> Iterator[Problem]:
     moving = any(begin.gamma_dot)
-    if moving and message.points and not _ns(message.points[0].time_from_start):
+    if moving and message.points and not nanoseconds(message.points[0].time_from_start):
         allowed = "must be > 0 s while the reference is moving"
         yield Problem("points[0].time_from_start", 0.0, allowed)
 
@@ -67,7 +67,3 @@ def _jump(message: Any, begin: Reference) -> Iterator[Problem]:
 def _sorted(values: Sequence[float], places: Sequence[int]) -> list[float]:
     """Sort by leg what is whole; what is not is refused as it is."""
     return [float(values[k]) for k in places] if len(values) == len(places) else list(values)
-
-
-def _ns(stamp: Any) -> int:
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -5,13 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS, NANOSECONDS
+
+
+def _seconds(doc: str, default: float, *, least: float = 0.0, most: float = 1e6) -> Any:
+    return number(doc, "s", default=default, least=least, most=most)
+
+
+def _rate(doc: str, default: int) -> Any:
+    return integer(doc, "Hz", default=default, least=1, most=100000)
 
 
 @dataclass(frozen=True)
@@ -25,27 +33,15 @@ class SimulatorParameters(Section):
     )
 
     scene: str = text("scene, by name or by path of a .yaml file", default="example2")
-    rate: int = integer(
-        "steps per second of simulated time, a divisor of 1e9",
-        "Hz",
-        default=1000,
-        least=1,
-        most=100000,
-    )
-    publish_rate: int = integer(
-        "published samples per second of simulated time, a divisor of rate",
-        "Hz",
-        default=500,
-        least=1,
-        most=100000,
+    rate: int = _rate("steps per second of simulated time, a divisor of 1e9", 1000)
+    publish_rate: int = _rate(
+        "published samples per second of simulated time, a divisor of rate", 500
     )
     wait_for_command: bool = flag("start the run at the first command, not at once", default=False)
-    duration: float = number(
+    duration: float = _seconds(
         "length of the run, after which the node ends, by default the duration of the scene; 0 for "
         "no end",
-        "s",
-        default=0.0,
-        least=0.0,
+        0.0,
         most=1e9,
     )
     real_time_factor: float = number(
@@ -64,31 +60,19 @@ class SimulatorParameters(Section):
         "before the run starts",
         default=(),
     )
-    subscriber_timeout: float = number(
-        "longest wait for them, after which the node ends with an error",
-        "s",
-        default=10.0,
-        least=0.0,
-        most=1e6,
+    subscriber_timeout: float = _seconds(
+        "longest wait for them, after which the node ends with an error", 10.0
     )
     sync: str = choice(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
         ("free", "lockstep"),
         default="free",
     )
-    lockstep_timeout: float = number(
-        "longest wait for the answer to a sample, then fault; 0 for no end",
-        "s",
-        default=10.0,
-        least=0.0,
-        most=1e6,
+    lockstep_timeout: float = _seconds(
+        "longest wait for the answer to a sample, then fault; 0 for no end", 10.0
     )
-    command_timeout: float = number(
-        "age at which a command is no longer held (steady clock); 0 for never",
-        "s",
-        default=0.5,
-        least=0.0,
-        most=1e6,
+    command_timeout: float = _seconds(
+        "age at which a command is no longer held (steady clock); 0 for never", 0.5
     )
     integrator: str = choice("method of integration", INTEGRATORS, default="auto")
     tolerance: float = number(
@@ -148,12 +132,9 @@ class SimulatorParameters(Section):
 class AnsweringParameters(Section):
     """Parameters of the nodes that answer joint states with torques."""
 
-    rate: int = integer(
+    rate: int = _rate(
         "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
-        "Hz",
-        default=500,
-        least=1,
-        most=100000,
+        500,
     )
     simulator: str = text("name of the simulator's node", default="sst_simulator")
     stamped: bool = flag(
@@ -166,9 +147,7 @@ class AnsweringParameters(Section):
         least=1,
         most=100,
     )
-    timeout: float = number(
-        "longest silence of joint_states", "s", default=10.0, least=0.1, most=1e6
-    )
+    timeout: float = _seconds("longest silence of joint_states", 10.0, least=0.1)
 
     def check(self) -> Iterator[Problem]:
         """Refuse a rate without a whole period."""
@@ -207,13 +186,7 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         ("scene", "topic"),
         default="scene",
     )
-    hold: float = number(
-        "time for which the end of the scene's motion is held",
-        "s",
-        default=0.0,
-        least=0.0,
-        most=1e6,
-    )
+    hold: float = _seconds("time for which the end of the scene's motion is held", 0.0)
     start_tolerance: float = number(
         "largest distance of gamma from the start of the motion",
         "rad",
@@ -240,13 +213,10 @@ class RecorderParameters(Section):
         "folder of the bag, which must not exist yet; - for a dated name", default="-"
     )
     topics: tuple[str, ...] = texts("topics to record", default=default_topics())
-    timeout: float = number(
+    timeout: float = _seconds(
         "longest wait until they are recorded, after which the node ends with an error; 0 for no "
         "end",
-        "s",
-        default=60.0,
-        least=0.0,
-        most=1e6,
+        60.0,
     )
 
 

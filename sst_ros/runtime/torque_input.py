@@ -12,7 +12,8 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.simulation.simulation import NANOSECONDS, Triple
+from sst_ros.simulation.simulation import Triple
+from sst_ros.state import nanoseconds
 
 ZERO: Triple = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
@@ -129,7 +130,7 @@ class TorqueInput:
         for _ in _arrived(self._commands):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
         for message in _arrived(self._stamped):
-            stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+            stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             try:
                 if found is None and (to_idle if stamp_ns is None else stamp == stamp_ns):
