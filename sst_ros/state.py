@@ -5,19 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
 """Of a second: time is integer nanoseconds."""
-
-
-def nanoseconds(stamp: Any) -> int:
-    """Return a Time or Duration of ROS as one number [ns]."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
-
 
 Vector3: TypeAlias = tuple[float, float, float]
 TorqueFunction: TypeAlias = Callable[[float], Vector3]

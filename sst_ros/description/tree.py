@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.description.frame_ids import BASE_FRAME
+from sst_ros.description.headers import BASE_FRAME
 from sst_ros.mechanism.geometry import Array, Geometry
 
 BASE, STAR = BASE_FRAME, "star"

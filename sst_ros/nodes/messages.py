@@ -1,22 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the simulator, allocated once; afterwards only their numbers are written."""
+"""Messages of the simulator, allocated once; afterwards only their numbers are written.
+
+They are bytes, which `Publisher.publish` takes: CDR, little-endian (OMG DDS-XTypes, XCDR1). To
+convert a message object each time costs three times as much as the rest of publishing it
+(docs/nodes.md has the figures).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from sst_ros.description.frame_ids import BASE_FRAME
+from sst_ros.description.headers import BASE_FRAME
 from sst_ros.errors import SstError
-from sst_ros.nodes.cdr import CdrMessage, Write
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import NANOSECONDS, State
 
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+_STAMP = struct.Struct("<iI")
 MOMENTS = ("moment_x", "moment_y", "moment_z")
 _ZEROS = (0.0,) * len(JOINTS)
+
+
+Write = Callable[..., None]
+"""Writes numbers into their place in the message."""
+
+
+class CdrMessage:
+    """Bytes of a message; the methods append its fields in the order of its definition.
+
+    Alignment counts from the end of the encapsulation header: numbers lie at multiples of their
+    size.
+    """
+
+    def __init__(self) -> None:
+        self._data = bytearray(_ENCAPSULATION)
+
+    def header(self, frame_id: str) -> None:
+        """Append a std_msgs/Header, whose stamp `stamped` writes."""
+        self.time(0)
+        self.string(frame_id)
+
+    def time(self, nanoseconds: int) -> None:
+        """Append a builtin_interfaces Time or Duration."""
+        self._align(4)
+        self._data += _STAMP.pack(*divmod(nanoseconds, NANOSECONDS))
+
+    def length(self, count: int) -> None:
+        """Append the length of a sequence."""
+        self._align(4)
+        self._data += struct.pack("<I", count)
+
+    def string(self, text: str) -> None:
+        """Append a string: its length with the closing zero, the characters, zero."""
+        encoded = text.encode() + b"\x00"
+        self.length(len(encoded))
+        self._data += encoded
+
+    def strings(self, texts: Iterable[str]) -> None:
+        """Append a sequence of strings."""
+        listed = [*texts]
+        self.length(len(listed))
+        for text in listed:
+            self.string(text)
+
+    def doubles(self, count: int) -> Write:
+        """Append `count` doubles, zero; the function writes their values."""
+        self._align(8)
+        place = len(self._data)
+        self._data += bytes(8 * count)
+        return partial(struct.Struct(f"<{count}d").pack_into, self._data, place)
+
+    def double_sequence(self, count: int) -> Write:
+        """Append a sequence of `count` doubles, zero; the function writes their values."""
+        self.length(count)
+        return self.doubles(count) if count else _nothing
+
+    def stamped(self, nanoseconds: int) -> bytes:
+        """Return the message with this stamp [ns] in the header that it begins with."""
+        _STAMP.pack_into(self._data, len(_ENCAPSULATION), *divmod(nanoseconds, NANOSECONDS))
+        return bytes(self._data)
+
+    def _align(self, size: int) -> None:
+        self._data += bytes(-(len(self._data) - len(_ENCAPSULATION)) % size)
+
+
+def _nothing() -> None:
+    """Write no value."""
 
 
 class NotFinite(SstError):

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from sst_ros.description.frame_ids import IDLE_FRAME_ID
+from sst_ros.description.headers import IDLE_FRAME_ID
 from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import middleware, topics

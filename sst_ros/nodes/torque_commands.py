@@ -11,13 +11,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from sst_ros.description.frame_ids import is_idle
+from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.errors import SstError
 from sst_ros.mechanism.vec3 import ZERO
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation.simulation import Triple
-from sst_ros.state import nanoseconds
 
 
 class TorqueCommands:

@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sst_ros.description.frame_ids import is_idle
+from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.errors import InputError
 from sst_ros.nodes import graph, parameters, topics
 from sst_ros.nodes.clocks import STEADY
@@ -28,7 +28,6 @@ from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Triple
-from sst_ros.state import nanoseconds
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 

@@ -8,10 +8,11 @@ from typing import Any
 
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.waypoints import waypoints
+from sst_ros.description.headers import nanoseconds
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.state import NANOSECONDS, nanoseconds
+from sst_ros.state import NANOSECONDS
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:

@@ -16,11 +16,10 @@ from collections import deque
 from collections.abc import Callable
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.counters import Counters
 from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_types import PendingReply, Phase, Reply, RunOutput
-from sst_ros.runtime.tick_loop import NoAnswer, TickLoop
+from sst_ros.runtime.tick_loop import Counters, NoAnswer, TickLoop
 from sst_ros.runtime.torque_input import HasParameters, TorqueInput
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation.simulation import Simulation, Triple

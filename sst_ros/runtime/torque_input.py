@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
+from sst_ros.description.headers import nanoseconds
 from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
 from sst_ros.simulation.simulation import Triple
-from sst_ros.state import nanoseconds
 
 ZERO: Triple = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]

@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
 from sst_ros import child_process  # noqa: E402
 from sst_ros.__main__ import main  # noqa: E402
-from sst_ros.description.frame_ids import IDLE_FRAME_ID  # noqa: E402
+from sst_ros.description.headers import IDLE_FRAME_ID  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
 
 DOMAINS = itertools.cycle(range(1, 101))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sst_ros.description.frame_ids import BASE_FRAME
+from sst_ros.description.headers import BASE_FRAME
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
 from sst_ros.scene.scene import load, names

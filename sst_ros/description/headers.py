@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of frames in messages: the root of the robot, and the mark of a state that is no sample."""
+"""Headers of messages: names of frames, the mark of a state that is no sample, stamps."""
 
 from __future__ import annotations
+
+from typing import Any
+
+from sst_ros.state import NANOSECONDS
 
 BASE_FRAME = "base_link"
 """Root of the robot (REP 105): frame {B} of the paper."""
@@ -16,3 +20,8 @@ def is_idle(stamp_ns: int, frame_id: str) -> bool:
     Recordings of version 0.1 mark such messages by the stamp zero.
     """
     return stamp_ns == 0 or frame_id == IDLE_FRAME_ID
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a Time or Duration as one number [ns]."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
