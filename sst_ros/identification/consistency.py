@@ -42,7 +42,7 @@ CENTRED = 1e-2
 
 _NEWTON_STEPS = 100
 _CLOSE = 0.95
-"""Share of the way to the boundary that a step may go."""
+"""Share of the distance to the boundary that a step may cover."""
 
 
 class Cone(NamedTuple):

@@ -2,7 +2,7 @@
 """Measured actuator angles and torques, as identification takes them.
 
 Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are. Rates and accelerations follow in one of two ways (`derivatives`).
+are. Rates and accelerations follow by one of two methods (`derivatives`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from sst_ros.dynamics import energy as physics
 from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.style import BLUE, GREY, lines, span, stack
+from sst_ros.plot.style import BLUE, GREY, lines, scaled, span, stack
 from sst_ros.recording.body_rates import body_rates
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import Integers
@@ -31,14 +31,15 @@ def energy(run: Signals, scene: Scene) -> Figure:
     seconds, kinetic, potential = run.seconds(), *energies(run, scene)
     done = work(run)
     gained = kinetic + potential - _first(kinetic + potential)
-    figure, panels = stack(["energy [J]", "energy gained − work [J]"], 2.8)
-    columns = np.stack([kinetic, potential - _first(potential), done.sum(axis=1)], axis=1)
-    lines(panels[0], seconds, columns, ("kinetic", "potential, gained", "work of the actuators"))
-    panels[1].plot(seconds, gained - done.sum(axis=1), color=BLUE, linewidth=1.4)
+    residual, unit = scaled(gained - done.sum(axis=1))
+    figure, panels = stack(["energy [J]", f"energy gained − work [{unit}J]"], 2.8)
+    curves = {"kinetic": kinetic, "potential, gained": potential - _first(potential),
+              "work of the actuators": done.sum(axis=1)}  # fmt: skip
+    if not np.nanmax(np.abs(curves["potential, gained"]), initial=0.0):
+        del curves["potential, gained"]  # no gravity, no springs
+    lines(panels[0], seconds, np.stack(list(curves.values()), axis=1), list(curves))
+    panels[1].plot(seconds, residual, color=BLUE, linewidth=1.4)
     panels[1].axhline(0.0, color=GREY, linewidth=0.8)
-    least = max(1e-3 * float(np.nanmax(kinetic, initial=0.0)), 1e-12)
-    if np.nanmax(np.abs(gained - done.sum(axis=1)), initial=0.0) < least:
-        panels[1].set_ylim(-least, least)
     span(panels, seconds)
     return figure
 

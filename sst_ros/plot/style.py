@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -149,6 +150,15 @@ def note(figure: Figure, text: str, width: int) -> None:
     """Write a note of `width` letters a line at the foot of a figure."""
     lines = [part for line in text.splitlines() for part in textwrap.wrap(line, width)]
     figure.text(0.01, 0.01, "\n".join(lines), fontsize=6.5, color="#555555", va="bottom")
+
+
+def scaled(values: Array) -> tuple[Array, str]:
+    """Return small values in a power of ten, and that power for the unit of the axis ("1e-14 ")."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if not 0.0 < largest < 1e-3:
+        return values, ""
+    exponent = math.floor(math.log10(largest))
+    return values / 10.0**exponent, f"1e{exponent} "
 
 
 def positive(values: Array) -> Array:

@@ -13,14 +13,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.run_overview import ErrorCurves, Overview, draw_overview
+from sst_ros.plot.run_figures import ErrorCurves
+from sst_ros.plot.run_overview import Overview, draw_overview
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.table import made_line, table
 from sst_ros.report.timing import Timing
 
 ESTIMATES = (
-    "integration error so far", "its estimate by the simulator",
+    "integration error", "its estimate by the simulator",
     "hold error if torques are those of the start", "the same, of the middle",
 )  # fmt: skip
 

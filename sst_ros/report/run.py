@@ -13,7 +13,7 @@ from sst_ros.plot import paper_figures
 from sst_ros.plot.downsampling import envelope
 from sst_ros.plot.paper_figures import Solution
 from sst_ros.plot.pictures import PICTURES, save
-from sst_ros.plot.run_overview import draw_errors, draw_torques
+from sst_ros.plot.run_figures import draw_errors, draw_torques
 from sst_ros.plot.style import save_figure, styled
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording

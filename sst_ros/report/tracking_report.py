@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sst_ros.control.tracking import table
-from sst_ros.plot.run_overview import draw_tracking
+from sst_ros.plot.run_figures import draw_tracking
 from sst_ros.plot.style import save_figure
 from sst_ros.report import tracking
 

@@ -77,7 +77,7 @@ class RunLoop:
 
     @property
     def held(self) -> HeldTorques:
-        """Torques of the run so far."""
+        """Torques since the start of the run."""
         return self._ticks.held
 
     @property

@@ -93,7 +93,7 @@ class TickLoop:
         simulation: what is run; its `state` may be read by any thread.
         begun: the first sample has been published.
         counters: counters of the run.
-        held: torques so far, for the estimate of the hold error.
+        held: torques since the start, for the estimate of the hold error.
         step_since: time.perf_counter at which the step in progress began; 0 between steps.
         requested, stopped: set by others to interrupt a wait, or to end.
 
