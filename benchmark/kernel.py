@@ -21,12 +21,12 @@ import numpy as np
 
 from benchmark import c_floor, machine
 from benchmark.timing import interleaved, ratio
-from sst_ros import scene as scenes
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
 from sst_ros.integration.ode import ODE
+from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 
 METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}

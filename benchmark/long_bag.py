@@ -27,13 +27,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from benchmark import machine
-from sst_ros import scene as scenes
+from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.recording.recording import JOINTS
-from sst_ros.report.fixed_step_motion import FixedStepMotion, TickSequence
 from sst_ros.report.states import by_columns, initial
+from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring
 from sst_ros.scene.scene import Scene
@@ -103,8 +103,8 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
     """Solve the scene; yield rows of samples in turn, and what the messages of each hold."""
     torque = scene.torque
     assert torque is not None
-    motion = FixedStepMotion(scene, None, compiled=True)
-    y = initial(scene)
+    motion = TickPropagator(scene, None, compiled=True)
+    y = np.array(initial(scene))
     for rows in slices(samples + 1, _CHUNK, "writing a run", shown):
         number = np.arange(rows.start, rows.stop)
         # Each sample is answered by a torque, which is held until the next one.
@@ -116,11 +116,13 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
         ticks_of_part = TickSequence(
             start, start + TICK_NS, np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
         )
-        reached = motion.follow(y, ticks_of_part, np.ones(len(start), dtype=np.int64))
+        starts = np.full((len(start), len(y)), np.nan)
+        starts[:1] = y
+        reached = motion.follow(ticks_of_part, starts)[:, 0, :-1]
         state = reached[TICKS_A_SAMPLE - 1 :: TICKS_A_SAMPLE]
         if not rows.start:
             state = np.vstack([y, state])
-        y = tuple(state[-1].tolist())
+        y = state[-1]
         angles = by_columns(motion.dynamics.joints_program, state)
         effort = np.zeros((len(state), 9))
         effort[:, :3] = held * (number > 0)[:, None]

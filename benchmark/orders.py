@@ -17,14 +17,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from benchmark import machine
-from sst_ros import scene as scenes
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, RODAS4
 from sst_ros.integration.ode import ODE
+from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 
 SPAN = 0.4
@@ -49,7 +48,7 @@ def _orders() -> None:
     """Truth: SciPy's DOP853 at its tightest, in short steps, on the kernel before tracing."""
     scene = scenes.load("example2_heavy")
     assert scene.torque is not None
-    model, torque = kernel.model_of(scene), sine(scene.torque)
+    model, torque = kernel.model_of(scene), scene.torque.at
     state = Simulation(scene).state
     start = [*state.quaternion, *state.body_rate]
     truth = solve_ivp(

@@ -14,12 +14,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sst_ros import child_process, scene
+from sst_ros import child_process
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.report import tracking_report
 from sst_ros.report.run import report
 from sst_ros.report.verdict import text
+from sst_ros.scene import scene
 
 EXAMPLES = ("example1", "example2")
 FOLLOWED = "reach"

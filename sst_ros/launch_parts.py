@@ -26,10 +26,11 @@ from launch.launch_description import LaunchDescription
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from sst_ros import child_process, scene
+from sst_ros import child_process
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
+from sst_ros.scene import scene
 from sst_ros.scene.scene import share_directory
 
 Given = Mapping[str, str]

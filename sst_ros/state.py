@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,30 @@ NANOSECONDS = 1_000_000_000
 Vector3: TypeAlias = tuple[float, float, float]
 TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
+
+
+def clamped(torque: Vector3, limit: float | None) -> Vector3:
+    """Clamp torques [N m] to the limit of the actuators, where they have one."""
+    if limit is None:
+        return torque
+    first, second, third = torque
+    return (
+        min(max(first, -limit), limit),
+        min(max(second, -limit), limit),
+        min(max(third, -limit), limit),
+    )
+
+
+def finite_vector(value: Any) -> Vector3 | None:
+    """Return three finite numbers as floats; None where `value` is something else."""
+    if isinstance(value, (str, bytes)):
+        return None
+    try:
+        first, second, third = map(float, value)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
+    return (first, second, third) if finite else None
 
 
 class Joints(NamedTuple):
@@ -47,6 +72,15 @@ class State:
     body_rate: Vector3
     joints: Joints
     torque: Vector3
+
+    @classmethod
+    def of(
+        cls, time_ns: int, y: Sequence[float], joints: Sequence[float], torque: Vector3
+    ) -> State:
+        """Collect a state: quaternion and body rate begin y, 18 angles and rates are the joints."""
+        x, y_, z, w, wx, wy, wz = y[:7]
+        j = [(joints[i], joints[i + 1], joints[i + 2]) for i in range(0, 18, 3)]
+        return cls(time_ns, (x, y_, z, w), (wx, wy, wz), Joints(*j), torque)
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sst_ros import scene as scenes
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.recording.bag_writer import BagWriter
+from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.simulation.simulation import Simulation
 
@@ -131,7 +130,7 @@ def diagnostics_entry(received_ns: int, **values: object) -> Entry:
 
 def simulated(scene, seconds: float) -> list[Entry]:
     """Messages of a run with the scene's sines held over each tick, as the nodes send them."""
-    simulation, profile = Simulation(scene), sine(scene.torque)
+    simulation, profile = Simulation(scene), scene.torque.at
     begun = START_NS - 300_000_000
     text = make("std_msgs/String", data=yaml_document.dump(scene))
     entries = [Entry(SCENE, begun, text)]

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from sst_ros.cli.scene_check import check
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.scene.scene import load, names
@@ -29,7 +28,7 @@ def run(name):
     """A scene at every step of its whole duration: the simulation, its states, what ended it."""
     scene = load(name)
     simulation = Simulation(scene)
-    torque = sine(scene.torque) if scene.torque else REST
+    torque = scene.torque.at if scene.torque else REST
     states, step = [simulation.state], STEPS.get(name, STEP_NS)
     try:
         for _ in range(round(scene.duration * 1e9 / step)):
@@ -107,7 +106,7 @@ def test_friction_keeps_the_kinetic_energy_below_that_of_the_frictionless_scene(
     simulation, states, _ = run("friction")
     free, torque = (
         Simulation(replace(simulation.scene, friction=None)),
-        sine(load("friction").torque),
+        load("friction").torque.at,
     )
     freely = [free.step(torque, STEP_NS) for _ in range(450)]
     rubbed, unrubbed = (

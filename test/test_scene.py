@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from sst_ros import scene as scenes
 from sst_ros.errors import InputError
+from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Inertia, Scene, load, names
 from sst_ros.scene.yaml_document import dump, read
 

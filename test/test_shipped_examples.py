@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.errors import StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
@@ -40,7 +39,7 @@ def swung(simulation, home):
 
 def test_example_1_follows_its_closed_form():
     """Both integrators err below 1e-12 in 0.3 s; E is off the centre by rounding only."""
-    simulation, torque = Simulation(EXAMPLE1), sine(EXAMPLE1.torque)
+    simulation, torque = Simulation(EXAMPLE1), EXAMPLE1.torque.at
     home = simulation.state.quaternion
     for k in range(1, 301):
         simulation.step(torque, MILLISECOND)
@@ -56,7 +55,7 @@ def test_example_1_follows_its_closed_form():
 
 def test_example_1_returns_after_one_period():
     """gamma_dot(0) is known to 15 digits, the period is rounded to 1 ns at 0.4 rad/s: 4e-10."""
-    simulation, torque = Simulation(EXAMPLE1), sine(EXAMPLE1.torque)
+    simulation, torque = Simulation(EXAMPLE1), EXAMPLE1.torque.at
     home, rate = simulation.state.quaternion, simulation.state.joints.gamma_dot
     steps, rest = divmod(round(np.pi / 6 * 1e9), MILLISECOND)
     largest = 0.0
@@ -71,7 +70,7 @@ def test_example_1_returns_after_one_period():
 
 def by_scipy(scene, end, events=None):
     """The same motion by SciPy's DOP853 at its tightest tolerance."""
-    simulation, torque = Simulation(scene), sine(scene.torque)
+    simulation, torque = Simulation(scene), scene.torque.at
     model = kernel.model_of(scene)
     start = (*simulation.state.quaternion, *simulation.state.body_rate)
 
@@ -85,7 +84,7 @@ def by_scipy(scene, end, events=None):
 
 def test_heavy_example_2_stays_inside_for_its_second():
     """Dormand-Prince at 1 ms errs by 1e-13, SciPy's reference by 1e-14."""
-    simulation, torque = Simulation(EXAMPLE2), sine(EXAMPLE2.torque)
+    simulation, torque = Simulation(EXAMPLE2), EXAMPLE2.torque.at
     for _ in range(1000):
         simulation.step(torque, MILLISECOND)
     truth = by_scipy(EXAMPLE2, 1.0).y[:, -1]
@@ -109,7 +108,7 @@ def time_of_the_end():
 
 
 def test_thin_example_2_stops_at_the_end_of_the_first_stroke():
-    simulation, torque = Simulation(THIN), sine(THIN.torque)
+    simulation, torque = Simulation(THIN), THIN.torque.at
     with pytest.raises(StrokeExceeded, match=r"gamma_1 > 1\.570796 rad") as caught:
         for _ in range(1000):
             simulation.step(torque, MILLISECOND)

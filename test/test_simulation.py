@@ -12,7 +12,6 @@ import pytest
 import yaml
 from models import seeded_samples
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.energy import kinetic
 from sst_ros.errors import (
@@ -126,7 +125,7 @@ def test_a_constant_and_a_constant_function_move_alike():
 
 
 def test_runs_repeat_bit_by_bit():
-    torque, states = sine(EXAMPLE2.torque), []
+    torque, states = EXAMPLE2.torque.at, []
     for _ in range(2):
         simulation = Simulation(EXAMPLE2)
         for _ in range(20):
@@ -136,14 +135,14 @@ def test_runs_repeat_bit_by_bit():
 
 
 def test_the_quaternion_stays_of_unit_length():
-    simulation, torque = Simulation(EXAMPLE2, "rk4"), sine(EXAMPLE2.torque)
+    simulation, torque = Simulation(EXAMPLE2, "rk4"), EXAMPLE2.torque.at
     for _ in range(100):
         simulation.step(torque, 5 * MILLISECOND)
     assert np.linalg.norm(simulation.state.quaternion) == pytest.approx(1.0, abs=1e-15)
 
 
 def test_error_estimates_add_up():
-    simulation, torque = Simulation(EXAMPLE2), sine(EXAMPLE2.torque)
+    simulation, torque = Simulation(EXAMPLE2), EXAMPLE2.torque.at
     sums = []
     for _ in range(5):
         simulation.step(torque, 10 * MILLISECOND)
@@ -152,7 +151,7 @@ def test_error_estimates_add_up():
 
 
 def test_the_stroke_may_be_ignored():
-    simulation, torque = Simulation(replace(THIN, **IGNORE)), sine(THIN.torque)
+    simulation, torque = Simulation(replace(THIN, **IGNORE)), THIN.torque.at
     for _ in range(1000):
         simulation.step(torque, MILLISECOND)
     assert simulation.state.time_ns == 1000 * MILLISECOND
@@ -176,7 +175,7 @@ def test_each_end_of_each_stroke_stops_the_run(leg, sign):
 def test_the_largest_beta_stops_the_run():
     scene = replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0))
     simulation = Simulation(scene)
-    error, before = run_until_stopped(simulation, sine(scene.torque), 1000)
+    error, before = run_until_stopped(simulation, scene.torque.at, 1000)
     assert isinstance(error, WorkspaceLeft)
     assert error.reason.endswith("> 0.698132 rad")
     assert error.reason.startswith("beta_")
@@ -249,7 +248,7 @@ def test_a_start_without_admissible_assembly_is_refused():
 @pytest.mark.parametrize("name", ["example2_heavy", "impacts", "friction"])
 def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
     scene = load(name)
-    torque = sine(scene.torque)
+    torque = scene.torque.at
     simulation, other = Simulation(scene), Simulation(scene)
     for _ in range(9):
         simulation.step(torque, 100 * MILLISECOND)
@@ -321,7 +320,7 @@ def sine_runs(scene, compiled, torque, count=100):
 def test_a_sine_torque_moves_as_its_function_does(name):
     scene = load(name)
     one = sine_runs(scene, False, scene.torque, 50)
-    other = sine_runs(scene, False, sine(scene.torque), 50)
+    other = sine_runs(scene, False, scene.torque.at, 50)
     assert one.state.torque == pytest.approx(other.state.torque, abs=1e-13)
     assert one.state.quaternion == pytest.approx(other.state.quaternion, abs=3e-10)
     assert one.error_estimate < 1e-8
@@ -332,7 +331,7 @@ def test_a_sine_torque_moves_as_its_function_does(name):
 
 def test_a_sine_torque_that_the_actuators_clamp_moves_as_its_function_does():
     scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=2.0))
-    one, other = (sine_runs(scene, False, t, 20) for t in (scene.torque, sine(scene.torque)))
+    one, other = (sine_runs(scene, False, t, 20) for t in (scene.torque, scene.torque.at))
     assert one.state == other.state and max(map(abs, one.state.torque)) <= 2.0
 
 

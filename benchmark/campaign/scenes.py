@@ -16,7 +16,7 @@ import yaml
 from benchmark.campaign.ledger import Budget, Ledger
 from sst_ros import Simulation
 from sst_ros.errors import InputError, SstError
-from sst_ros.scene import Scene, names, text_of
+from sst_ros.scene.scene import Scene, names, text_of
 from sst_ros.scene.yaml_document import read
 
 NUMBERS = (0, -1, 5e-324, 1e-320, 1e-12, 1e-9, 1e9, 1e18, 1e308, -1e308, 10**400, math.nan,

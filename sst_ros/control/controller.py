@@ -39,7 +39,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import State
+from sst_ros.state import State, clamped
 
 __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
@@ -183,8 +183,7 @@ class Controller:
     ) -> Command:
         total = added(feedforward, feedback)
         _require_finite(total, "torque")
-        first, second, third = (min(max(tau, -self._limit), self._limit) for tau in total)
-        torque = (first, second, third)
+        torque = clamped(total, self._limit)
         if dot(axpy(1.0, total, -1.0, torque), error) <= 0.0:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
         return Command(torque, feedforward, feedback, desired, torque != total)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -226,6 +226,17 @@ class AdaptiveStepper:
                 self._h = max(self._h, h * self._factor(float(size) / self.tolerance))
         if implicit:
             self._since_look += done
+        return done, end
+
+    def step_sequence(
+        self, first: int, periods: tuple[Any, Any, Any], at: StepPoint, reached: Any
+    ) -> tuple[int, StepPoint]:
+        """Advance through periods that take one pair of steps each, from the first on.
+
+        Arguments and results are those of `CompiledMethod.step_sequence`.
+        """
+        done, end = self._current.step_sequence(first, periods, self.tolerance, at, reached)
+        self.budget.spent += (done - first) * self.pair_cost
         return done, end
 
     def repeat(

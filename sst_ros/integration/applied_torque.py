@@ -10,21 +10,7 @@ from typing import Any
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, compiled
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.loads import SineTorque
-from sst_ros.state import NANOSECONDS, Joints, State, TorqueFunction, Vector3
-
-
-def state_of(dynamics: Dynamics, t: float, y: Sequence[float], torque: Sequence[float]) -> State:
-    """Put a state together from its numbers."""
-    j = dynamics.joints(*y[:7])
-    joints = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])  # type: ignore[arg-type]
-    first, second, third = torque
-    return State(
-        round(t * NANOSECONDS),
-        (y[0], y[1], y[2], y[3]),
-        (y[4], y[5], y[6]),
-        joints,
-        (first, second, third),
-    )
+from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamped
 
 
 class StateFeedback:
@@ -45,8 +31,9 @@ class StateFeedback:
 
     def __call__(self, t: float, y: Sequence[float]) -> Vector3:
         """Torques [N m] at a time [s] and the numbers of a state."""
-        lagged = y[7:10] if self._lag else (0.0, 0.0, 0.0)
-        first, second, third = self._function(t, state_of(self._dynamics, t, y, lagged))
+        lagged = (y[7], y[8], y[9]) if self._lag else (0.0, 0.0, 0.0)
+        state = State.of(round(t * NANOSECONDS), y, self._dynamics.joints(*y[:7]), lagged)
+        first, second, third = self._function(t, state)
         return first, second, third
 
 
@@ -64,24 +51,9 @@ class AppliedTorque:
     """
 
     def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
-        self._ode = ode
-        self._limit = limit
-        self._rhs = rhs
-        self._untraced = rhs is not None
+        self._ode, self._limit, self._rhs = ode, limit, rhs
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
-
-    def traced(self, torque: Torque) -> Torque:
-        """Return a sine torque that cannot be traced as a function; all others as they are.
-
-        The limit of the actuators clamps it, or the derivative was given.
-        """
-        if not isinstance(torque, SineTorque):
-            return torque
-        if self._untraced:
-            return sine_function(torque)
-        clamped = self._limit is not None and max(map(abs, torque.amplitude)) > self._limit
-        return sine_function(torque) if clamped else torque
 
     def begin(self, torque: Torque, start: float) -> Vector3:
         """Take the torques of a period that begins at `start` [s].
@@ -90,32 +62,22 @@ class AppliedTorque:
             Three numbers of the drive: torques [N m], phases of a sine [rad], zero for a function.
 
         """
-        self._start = start
         if isinstance(torque, SineTorque):
             rows = zip(torque.frequency, torque.phase, strict=True)
             first, second, third = (math.fmod(f * start + p, math.tau) for f, p in rows)
             return first, second, third
-        self._torque = torque if callable(torque) else None
-        return (0.0, 0.0, 0.0) if callable(torque) else self.limited(torque)
+        if callable(torque):
+            self._torque, self._start = torque, start
+            return (0.0, 0.0, 0.0)
+        return clamped(torque, self._limit)
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""
         if isinstance(torque, StateFeedback):
-            return self.limited(torque(time, y))
-        if isinstance(torque, SineTorque):
-            torque = sine_function(torque)
-        return self.limited(torque(time) if callable(torque) else torque)
-
-    def limited(self, torque: Vector3) -> Vector3:
-        """Clamp torques [N m] to the limit of the actuators."""
-        if self._limit is None:
-            return torque
-        limit, (first, second, third) = self._limit, torque
-        return (
-            min(max(first, -limit), limit),
-            min(max(second, -limit), limit),
-            min(max(third, -limit), limit),
-        )
+            torque = torque(time, y)
+        elif isinstance(torque, SineTorque):
+            torque = torque.at(time)
+        return clamped(torque(time) if callable(torque) else torque, self._limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
@@ -123,20 +85,5 @@ class AppliedTorque:
             self._rhs = compiled(self._ode.program)
         assert self._torque is not None
         size = len(self._ode.state)
-        time, function = self._start + t, self._torque
-        if isinstance(function, StateFeedback):
-            torque = self.limited(function(time, inputs[:size]))
-        else:
-            torque = self.limited(function(time))
+        torque = self.at(self._torque, self._start + t, inputs[:size])
         return self._rhs(t, *inputs[:size], *torque, *inputs[size + 3 :])
-
-
-def sine_function(torque: SineTorque) -> TorqueFunction:
-    """Return the torques as a function of the time [s]."""
-    rows = tuple(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
-
-    def at(time: float) -> Vector3:
-        first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
-        return first, second, third
-
-    return at

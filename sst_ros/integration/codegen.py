@@ -36,6 +36,7 @@ _EXPLICIT = (
     step_loops.step_fixed,
     step_loops.all_far,
     step_loops.step_many,
+    step_loops.step_sequence,
 )
 _IMPLICIT = (
     step_loops.factorise,

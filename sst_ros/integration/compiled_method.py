@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import is_
@@ -111,6 +112,38 @@ class CompiledMethod:
             done = sum(size >= 0.0 for size in self.sizes)
         self._at = (self._listed(y), self._listed(z), tuple(self._listed(joints)))
         return done, self._at
+
+    def step_sequence(
+        self,
+        first: int,
+        periods: tuple[Any, Any, Any],
+        tolerance: float,
+        at: StepPoint,
+        reached: Any,
+    ) -> tuple[int, StepPoint]:
+        """Go on from period `first` by a pair of steps a period; stop before what asks more.
+
+        Args:
+            first: number of the period that begins.
+            periods: of n periods the lengths [s], shape (n,), the drives, (n, m), and the states
+                (n, size) at which they begin, NaN where they go on; lists in plain Python.
+            tolerance: largest local error estimate of a period.
+            at: where the period begins.
+            reached: takes solution and coarse solution at the ends, shape (n, 2, size).
+
+        Returns:
+            The first period that was not done, and where it begins.
+
+        """
+        y, z, joints = (self._vector(part) for part in at)
+        lengths, drives, starts = periods
+        try:
+            done = self._module.step_sequence(
+                first, lengths, drives, tolerance, starts, y, z, self._ranges, joints, reached
+            )
+        except (ArithmeticError, ValueError):  # plain Python, of a number without a value
+            done = next(k for k in range(first, len(lengths)) if math.isnan(reached[k][0][0]))
+        return done, (self._listed(y), self._listed(z), tuple(self._listed(joints)))
 
     def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.

@@ -8,7 +8,7 @@ from typing import Any
 
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Program, trace, with_jacobian
-from sst_ros.dynamics.math_functions import sin
+from sst_ros.dynamics.math_functions import positive, sin
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.scene.scene import SineTorque
 
@@ -20,6 +20,7 @@ class ODE:
         dynamics: the scene.
         torque: torques over time that replace those of the drive; the drive is then what else
             acts from outside, or nothing.
+        limit: of the actuators, which clamps `torque` [N m].
         phases: the drive keeps three numbers for the torques: the phases [rad] of `torque`.
         work: append to the state the work [J] that actuators and moments have put in, less what
             friction has taken out.
@@ -35,11 +36,13 @@ class ODE:
         dynamics: Dynamics,
         torque: SineTorque | None = None,
         *,
+        limit: float | None = None,
         work: bool = False,
         phases: bool = False,
     ) -> None:
         self._dynamics = dynamics
         self._torque = torque
+        self._limit = limit
         self._work = work
         self._phases = phases
         self.state = (*dynamics.state, *(("work",) if work else ()))
@@ -73,6 +76,8 @@ class ODE:
             phase = torque if self._phases else self._torque.phase
             rows = zip(self._torque.amplitude, self._torque.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
+            if self._limit is not None:
+                torque = tuple(_clamped(tau, self._limit) for tau in torque)
             rest = rest if self._phases else drive
         moment = (rest[0], rest[1], rest[2]) if rest else None
         model = self._dynamics.model
@@ -80,6 +85,11 @@ class ODE:
         if not self._work:
             return slope
         return (*slope, energy.power(model, state, torque, moment))
+
+
+def _clamped(torque: Any, limit: float) -> Any:
+    """Clamp a torque, of any kind of number."""
+    return limit - positive(2.0 * limit - positive(torque + limit))
 
 
 @lru_cache(maxsize=32)

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Propagation of a scene's state through one period: steps, limits, contact at compliant stops."""
+"""Propagation of a scene's state through periods: steps, limits, contact at compliant stops."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+import numpy as np
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function
-from sst_ros.integration import coarse_solution, step_loops
+from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
     AdaptiveStepper,
@@ -18,6 +19,7 @@ from sst_ros.integration.adaptive_stepper import (
     StepperCheckpoint,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
+from sst_ros.integration.coarse_solution import ErrorGrowth, Point, coulomb_joints
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,
@@ -29,24 +31,23 @@ from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.ode import ODE, ode_with_work
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.state import State, Vector3
-
-Checkpoint = tuple[
-    int, tuple[float, float], AdaptiveStepper, dict[AdaptiveStepper, StepperCheckpoint]
-]
-
-_SHARP, _SLIDING = 10.0, 5.0
-"""A step loses its order where a rate changes by 10 times the smoothing of a Coulomb torque, at
-rates below 5 times; RK4 resolves less sharp ones within the accuracy of the estimate."""
+from sst_ros.state import Vector3
 
 
-class Point(NamedTuple):
-    """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
+class LimitReached(Exception):
+    """A limit of the scene ends the motion at a time [s]."""
 
-    y: list[float]
-    z: list[float]
-    joints: tuple[float, ...]
-    order: int
+    def __init__(self, limit: Limit, time: float) -> None:
+        self.limit, self.time = limit, time
+        super().__init__(limit.reason)
+
+
+class Checkpoint(NamedTuple):
+    """All that the next steps depend on beside the point at which they begin."""
+
+    growth: ErrorGrowth
+    stepper: AdaptiveStepper
+    steppers: dict[AdaptiveStepper, StepperCheckpoint]
 
 
 class Propagator:
@@ -54,36 +55,37 @@ class Propagator:
 
     Args:
         scene: what is simulated.
-        geometry, dynamics: of the scene.
         integrator: a method of `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step.
         compiled: by numba.
         budget: evaluations that a period may take.
         derivative: derivative of the state in plain Python, in place of the traced one and with
-            its inputs; for explicit methods.
+            its inputs; for explicit methods, and for torques that are numbers or functions.
+        limits: whether the limits of the scene end the motion.
 
     """
 
     def __init__(
         self,
         scene: Scene,
-        geometry: Geometry,
-        dynamics: Dynamics,
         integrator: str,
         tolerance: float,
         *,
         compiled: bool,
         budget: EvaluationBudget,
         derivative: Function | None = None,
+        limits: bool = True,
     ) -> None:
-        self._dynamics = dynamics
-        self._ode = ode_with_work(dynamics)
-        self._limits = tuple(limits_of(scene, geometry))
+        geometry = Geometry.of(scene)
+        self.dynamics = Dynamics.of(scene)
+        self.ode = ode_with_work(self.dynamics)
+        self.budget = budget
+        self._untraced = derivative is not None
+        self._limits = tuple(limits_of(scene, geometry)) if limits else ()
         self._contacts = tuple(contact_events_of(scene, geometry))
         self._ranges = ranges_of([*self._limits, *free_range(self._contacts)])
-        limit = scene.actuators.torque_limit if scene.actuators else None
-        self._torque = AppliedTorque(self._ode, limit, derivative)
-        self._budget = budget
+        self._torque_limit = scene.actuators.torque_limit if scene.actuators else None
+        self._torque = AppliedTorque(self.ode, self._torque_limit, derivative)
         self._new_stepper = partial(
             AdaptiveStepper,
             method=integrator,
@@ -92,42 +94,19 @@ class Propagator:
             ranges=self._ranges,
             budget=budget,
         )
-        self._constant = self._stepper = self._new_stepper(self._ode, derivative=derivative)
+        self._constant = self._stepper = self._new_stepper(self.ode, derivative=derivative)
         self._sines: dict[SineTorque, AdaptiveStepper] = {}
         # Torque functions are evaluated in Python, and have no Jacobian.
         self._function = AdaptiveStepper(
-            self._ode,
+            self.ode,
             "auto" if isinstance(METHODS.get(integrator), Rosenbrock) else integrator,
             tolerance,
             compiled=False,
             derivative=self._torque.derivative,
             budget=budget,
         )
-        self._coulomb = tuple(_coulomb_joints(scene)) if integrator == RK4.name else ()
-        self.accepted_steps, self._growth = 0, (0.0, 0.0)
+        self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
         self._first = self._before = self._checkpoint()
-
-    def reset(self) -> None:
-        """Forget what has happened."""
-        self._restore(self._first)
-        self._before = self._first
-
-    def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
-        """Have the code loaded that periods of h [s] under constant torques may need."""
-        self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
-
-    def _checkpoint(self) -> Checkpoint:
-        """All that the next steps depend on beside the point at which they begin."""
-        steppers = {
-            x: x.checkpoint() for x in (self._constant, self._function, *self._sines.values())
-        }
-        return self.accepted_steps, self._growth, self._stepper, steppers
-
-    def _restore(self, checkpoint: Checkpoint) -> None:
-        self.accepted_steps, self._growth, self._stepper, steppers = checkpoint
-        self._sines = {sine: x for sine, x in self._sines.items() if x in steppers}
-        for stepper, kept in steppers.items():
-            stepper.restore(kept)
 
     @property
     def method(self) -> str:
@@ -139,120 +118,154 @@ class Propagator:
         """Changes of method."""
         return self._stepper.history
 
+    @property
+    def accepted_steps(self) -> int:
+        """Number of accepted steps since the start."""
+        return self._growth.steps
+
     def begin(self, y: list[float]) -> Point:
-        """Complete quaternion and body rate to a state; no torque yet, no work done."""
-        full = [*y, *(0.0,) * (len(self._ode.state) - 7)]
-        return Point(full, list(full), self._dynamics.joints(*full[:7]), self._stepper.method.order)
+        """Complete quaternion, body rate and lagged torques, zero by default, to a state."""
+        full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
+        return Point(full, list(full), self.dynamics.joints(*full[:7]), self._stepper.method.order)
 
     def traced(self, torque: Torque) -> Torque:
-        """Return a sine torque that the actuators clamp as a function; all others as they are."""
-        return self._torque.traced(torque)
+        """Return a sine that is no part of the program as a function; all others as they are.
 
-    def torque_at(self, torque: Torque, time: float, y: list[float]) -> Vector3:
-        """Torques that act at a time [s] and a state, within the limit of the actuators [N m]."""
-        return self._torque.at(torque, time, y)
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the derivative since the start; a Jacobian counts as `JACOBIAN_COST`."""
-        return self._budget.spent
-
-    def errors(self, at: Point) -> tuple[float, float]:
-        """Estimated global errors of orientation [rad] and body rate [rad/s]."""
-        lost, total = self._growth
-        part = lost / total if lost else 0.0
-        return coarse_solution.errors(at.y, at.z, at.order, self.accepted_steps, part)
-
-    def step_many(
-        self, at: Point, h: float, count: int, torque: Torque, moment: tuple[float, ...]
-    ) -> tuple[Point, int]:
-        """Do what `advance` does for up to `count` periods of h [s] that take one step each.
-
-        Returns where the last period ended that was done, and how many were.
+        The actuators clamp it, or the derivative was given.
         """
-        if callable(torque) or isinstance(torque, SineTorque):
-            return at, 0
-        if self._coulomb:  # the joints are looked at after each period
-            count = 1
-        before, drive = self._checkpoint(), (*self._torque.limited(torque), *moment)
-        self._stepper = self._constant
-        done, (y, z, joints) = self._stepper.step_many(
-            h, count, (at.y, at.z, at.joints), drive, at.order
-        )
-        if done == 0:
-            return at, 0
-        self._before = before
-        self.accepted_steps += done
-        end = Point(y, z, joints, self._stepper.method.order)
-        self._note_lost_order(at, end)
-        return end, done
+        if isinstance(torque, SineTorque) and (self._untraced or self._limit_of(torque)):
+            return torque.at
+        return torque
 
     def advance(
         self,
         at: Point,
         start: float,
         h: float,
+        count: int,
         torque: Torque,
         moment: tuple[float, ...],
-        state: State,
-    ) -> Point:
-        """Go on from `at` by h [s]; steps end where contact with a stop begins or ends.
+    ) -> tuple[Point, int]:
+        """Advance by `count` periods of h [s] from `start` [s], or by fewer, but by one at least.
+
+        Periods that take one pair of steps each are one call; another period is done by itself.
+
+        Returns:
+            Where the last period ended that was done, and how many were.
 
         Raises:
-            RunStopped: a limit was reached; it carries `state`, and nothing has changed.
-            CannotStep: no step resolves the motion, or the budget is spent.
+            LimitReached, CannotStep, ArithmeticError, ValueError: the first period is not done,
+                and nothing has changed.
 
         """
         before = self._before = self._checkpoint()
         drive = (*self._torque.begin(torque, start), *moment)
-        self._budget.begin()
         self._stepper = self._stepper_for(torque)
-        self._stepper.origin = start
         try:
-            x = 0.0
-            while x < h:
-                at, x, event = self._until_event(at, x, h, drive)
-                if event is not None and event.error is not None:
-                    raise event.error(event.reason, start + x, state)
-            return at
+            if self._stepper is self._constant:
+                end, done = self._step_many(at, h, count, drive)
+                if done:
+                    return end, done
+            return self._adaptive(at, start, h, drive), 1
         except Exception:
             self._restore(before)
             raise
 
-    def repeat_part(self, *arguments: Any) -> Point:
-        """`advance` through a part of the last period again, and leave everything as it is now."""
+    def within(
+        self, at: Point, start: float, h: float, torque: Torque, moment: tuple[float, ...]
+    ) -> Point:
+        """Advance through a part of the last period again, and leave everything as it is now."""
         now, before = self._checkpoint(), self._before
         stepper, history = self._stepper, list(self._stepper.history)
         self._restore(before)
         try:
-            return self.advance(*arguments)
+            return self.advance(at, start, h, 1, torque, moment)[0]
         finally:
             stepper.history[:] = history
             self._restore(now)
             self._before = before
 
+    def reset(self) -> None:
+        """Forget what has happened."""
+        self._restore(self._first)
+        self._before = self._first
+
+    def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
+        """Have the code loaded that periods of h [s] under constant torques may need."""
+        self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
+
+    def torque_at(self, torque: Torque, time: float, y: list[float]) -> Vector3:
+        """Torques that act at a time [s] and a state, within the limit of the actuators [N m]."""
+        return self._torque.at(torque, time, y)
+
+    def errors(self, at: Point) -> tuple[float, float]:
+        """Estimated global errors of orientation [rad] and body rate [rad/s]."""
+        return self._growth.errors(at)
+
+    def _checkpoint(self) -> Checkpoint:
+        every = (self._constant, self._function, *self._sines.values())
+        steppers = {stepper: stepper.checkpoint() for stepper in every}
+        return Checkpoint(self._growth, self._stepper, steppers)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        self._growth, self._stepper, steppers = checkpoint
+        self._sines = {sine: x for sine, x in self._sines.items() if x in steppers}
+        for stepper, kept in steppers.items():
+            stepper.restore(kept)
+
     def _stepper_for(self, torque: Torque) -> AdaptiveStepper:
         """Return the stepper of constant torques, of a function, or of a sine, which is traced."""
         if isinstance(torque, SineTorque):
             if torque not in self._sines:
-                ode = ODE(self._dynamics, torque, work=True, phases=True)
+                ode = ODE(
+                    self.dynamics, torque, limit=self._limit_of(torque), work=True, phases=True
+                )
                 self._sines[torque] = self._new_stepper(ode)
             return self._sines[torque]
         return self._function if callable(torque) else self._constant
+
+    def _limit_of(self, torque: SineTorque) -> float | None:
+        """Return the limit of the actuators where it clamps a sine."""
+        limit = self._torque_limit
+        return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
+
+    def _step_many(
+        self, at: Point, h: float, count: int, drive: tuple[float, ...]
+    ) -> tuple[Point, int]:
+        """Advance by up to `count` periods of h [s] that take one pair of steps each."""
+        if self._growth.coulomb:  # the joints are looked at after each period
+            count = 1
+        done, (y, z, joints) = self._stepper.step_many(
+            h, count, (at.y, at.z, at.joints), drive, at.order
+        )
+        end = Point(y, z, joints, self._stepper.method.order)
+        if done:
+            self._growth = self._growth.after(at, end, done)
+        return end, done
+
+    def _adaptive(self, at: Point, start: float, h: float, drive: tuple[float, ...]) -> Point:
+        """Advance by h [s]; steps end where contact with a stop begins or ends."""
+        self.budget.begin()
+        self._stepper.origin = start
+        x = 0.0
+        with np.errstate(all="ignore"):
+            while x < h:
+                at, x, event = self._until_event(at, x, h, drive)
+                if event is not None and event.error is not None:
+                    raise LimitReached(event, start + x)
+        return at
 
     def _until_event(
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
         """Go on from x to h, or to the first limit or contact event before."""
-        stepper = self._stepper
-        for step in stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
-            self.accepted_steps += 1
+        for step in self._stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
             end = self._point(step.y, step.z, step.order)
-            self._note_lost_order(at, end)
+            self._growth = self._growth.after(at, end)
             if step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
                 at = end
                 continue
-            part = cache(partial(self._part, stepper, step, at, end, drive))
+            part = cache(partial(self._part, self._stepper, step, at, end, drive))
             found = first_event(self._near(at, end), lambda x: part(x).joints, step.h)  # noqa: B023
             if found is not None:
                 x, event = found
@@ -261,23 +274,6 @@ class Propagator:
                 return part(x), step.t + x, event
             at = end
         return at, h, None
-
-    def _note_lost_order(self, at: Point, end: Point) -> None:
-        """Add up the growth of the difference to the coarse solution, and the part of order 1.
-
-        That is the part of fixed steps over an unresolved sign change of a Coulomb torque.
-        """
-        if not self._coulomb:
-            return
-        lost, total = self._growth
-        grown = coarse_solution.rate_growth((at.y, at.z), (end.y, end.z))
-        for joint, smoothing in self._coulomb:
-            v, w = at.joints[joint + 9], end.joints[joint + 9]
-            nearest = 0.0 if v * w < 0.0 else min(abs(v), abs(w))
-            if abs(w - v) > _SHARP * smoothing and nearest < _SLIDING * smoothing:
-                lost += grown
-                break
-        self._growth = lost, total + grown
 
     def _near(self, at: Point, end: Point) -> list[Limit]:
         """Limits and contact events that may lie inside a step."""
@@ -299,13 +295,4 @@ class Propagator:
         return self._point(*stepper.repeat(step.t, x, at.y, at.z, drive, at.order))
 
     def _point(self, y: list[float], z: list[float], order: int) -> Point:
-        return Point(y, z, self._dynamics.joints(*y[:7]), order)
-
-
-def _coulomb_joints(scene: Scene) -> Iterator[tuple[int, float]]:
-    """Yield joints with Coulomb friction (0 to 8, by kind and leg), and its smoothing [rad/s]."""
-    if scene.friction is not None:
-        kinds = scene.friction.gamma, scene.friction.mu, scene.friction.beta
-        for kind, friction in enumerate(kinds):
-            if friction is not None and (friction.coulomb or friction.static):
-                yield from ((3 * kind + k, friction.smoothing) for k in range(3))
+        return Point(y, z, self.dynamics.joints(*y[:7]), order)

@@ -98,6 +98,27 @@ def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
     return count
 
 
+def step_sequence(first, lengths, drives, tolerance, starts, y, z, ranges, joints, reached):
+    """Do what `step_many` does for periods of their own lengths and drives, from the first on.
+
+    Where starts[k] has numbers and not NaN, period k begins there. reached[k] becomes the solution
+    and the coarse solution at its end. Returns the period that asks for more than a pair of steps.
+    """
+    size = vector(1)
+    for k in range(first, len(lengths)):
+        if starts[k][0] == starts[k][0]:
+            for i in range(SIZE):
+                y[i] = starts[k][i]
+                z[i] = starts[k][i]
+            joints_of(y, joints)
+        if step_many(1, lengths[k], tolerance, y, z, drives[k], ranges, joints, size) == 0:
+            return k
+        for i in range(SIZE):
+            reached[k][0][i] = y[i]
+            reached[k][1][i] = z[i]
+    return len(lengths)
+
+
 def all_far(ranges, begin, end, h):
     """Test quickly that no limit may have been crossed in h.
 

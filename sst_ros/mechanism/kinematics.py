@@ -55,6 +55,12 @@ def carriage_directions(geometry: Geometry, gamma: ArrayLike) -> Array:
     return np.asarray(np.cos(angles) * geometry.v + np.sin(angles) * across)
 
 
+def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
+    """Products r_k . R e_k of gamma (..., 3) [rad] and R (..., 3, 3), zero in closed loops."""
+    t = geometry.e @ np.swapaxes(np.asarray(rotation, dtype=float), -1, -2)
+    return _dot(carriage_directions(geometry, gamma), t)
+
+
 def inverse(
     geometry: Geometry, rotation: ArrayLike, signs: Sequence[int] = (1, 1, 1)
 ) -> tuple[Array, Array, Array]:

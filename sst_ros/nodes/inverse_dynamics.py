@@ -12,7 +12,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from sst_ros import scene
 from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
@@ -24,6 +23,7 @@ from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
+from sst_ros.scene import scene
 
 KEYS = {
     "stage": "stage of the motion",

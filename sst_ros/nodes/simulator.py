@@ -10,7 +10,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from sst_ros import scene
 from sst_ros.errors import InputError, SstError
 from sst_ros.nodes import graph, parameters, simulation_interfaces, topics
 from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
@@ -26,6 +25,7 @@ from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.scene import scene
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 

@@ -8,21 +8,20 @@ the period, that of its start first order only.
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from sst_ros import scene
-from sst_ros.control import torque_profiles
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.vec3 import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
-from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.scene import scene
+from sst_ros.simulation.torque import TorqueTable
+from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 
 class TorquePlayer:
@@ -48,14 +47,15 @@ class TorquePlayer:
         if self._start_ns is not None and not self.done.is_set():
             self._commands.send(ZERO)
 
-    def _load(self) -> tuple[torque_profiles.Profile, float]:
+    def _load(self) -> tuple[TorqueFunction, float]:
         if self._parameters.csv != "-":
-            return torque_profiles.table(Path(self._parameters.csv))
+            table = TorqueTable.read(self._parameters.csv)
+            return table, float(table.times[-1])
         played = scene.load(self._parameters.scene)
         if played.torque is None or played.duration is None:
             allowed = "must have torque and duration to be played, or csv must name a file"
             raise InputError("torque_player", [Problem("scene", played.name, allowed)])
-        return torque_profiles.sine(played.torque), played.duration
+        return played.torque.at, played.duration
 
     def _hear(self, phase: String) -> None:
         if self._start_ns is not None and phase.data.startswith("fault"):
@@ -83,7 +83,7 @@ class TorquePlayer:
             self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
             self.done.set()
 
-    def _held(self, elapsed_ns: int) -> torque_profiles.Torque:
+    def _held(self, elapsed_ns: int) -> Vector3:
         """Torques [N m] from this time of the profile [ns] until the next sample or its end."""
         given = self._parameters
         end_ns = round(self._duration * NANOSECONDS)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Integration error of a recorded run: its states against a reference integrated anew.
 
-The method is DOP853 with two or more steps a tick, on the kernel's equations. Every comparison
-integrates twice, with different step sizes; the difference of the two estimates the reference's own
-error. Long runs are compiled; without numba only their first minute or so is compared, and
-`Comparison.reasons` reports that.
+The reference is propagated by DOP853 with a tight tolerance, two or more steps a tick. Its distance
+from a coarse solution of steps twice as long bounds its own error. Long runs are compiled; without
+numba only their first minute or so is compared, and `Comparison.reasons` reports that.
 
 Actuators that lag are part of the state, and torques are held to the scene's limit. A moment from a
 topic must be recorded; without it there is nothing to compare with.
@@ -13,28 +12,22 @@ topic must be recorded; without it there is nothing to compare with.
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration.tick_propagator import LONGEST_NS, TickPropagator, TickSequence
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.report import states
-from sst_ros.report.fixed_step_motion import (
-    COMPILED_FROM,
-    FixedStepMotion,
-    TickSequence,
-    recorded_ticks,
-)
 from sst_ros.report.states import Vector
 
-LONGEST_STEP_NS, LONGEST_IDEAL_STEP_NS = 500_000, 1_000_000
-"""The coarse steps of the reference are not longer than this [ns]. What hold and transport cost is
-larger than the error of an integrator, and resolved by longer steps."""
+COMPILED_FROM = 10_000
+"""From this number of ticks on compilation costs less than it saves."""
 
 PLAIN_TICKS = 60_000
 """So many ticks are compared in plain Python, a minute's work."""
@@ -73,7 +66,7 @@ class Comparison:
         own: the reference's own error.
         restarts_ns: instants at which the reference had to begin again from a recorded sample,
             because torques before it were lost [ns].
-        steps: steps a tick of the reference.
+        steps: least number of steps a tick of the reference.
         reasons: why samples are not compared; empty where all are, or only torques are missing.
 
     """
@@ -107,9 +100,8 @@ def integration(recording: Recording) -> Comparison:
         return Comparison(Deviation.none(count), Deviation.none(count), (), 0, (reason,))
     start = states.initial(recording.scene) if states.begins(recording) else None
     ticks = recorded_ticks(recording)
-    motion = FixedStepMotion(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
-    reference = _Reference(recording, motion, ticks, LONGEST_STEP_NS)
-    return reference.compare(start, restart=True)
+    motion = TickPropagator(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
+    return _Reference(recording, motion, ticks).compare(start, restart=True)
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -128,29 +120,33 @@ def ideal(recording: Recording) -> Comparison | None:
     time = recording.time_ns
     between = TickSequence(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
     many = len(recording.ticks.start_ns) > COMPILED_FROM
-    motion = FixedStepMotion(recording.scene, torque, compiled=many)
-    reference = _Reference(recording, motion, between, LONGEST_IDEAL_STEP_NS)
+    reference = _Reference(
+        recording, TickPropagator(recording.scene, torque, compiled=many), between
+    )
     return reference.compare(states.initial(recording.scene), restart=False)
 
 
+def recorded_ticks(recording: Recording) -> TickSequence:
+    """Return the recorded ticks."""
+    ticks, torque = recording.ticks, recording.ticks.torque
+    if Dynamics.of(recording.scene).moved and ticks.moment is not None:
+        torque = np.hstack([torque, ticks.moment])
+    return TickSequence(ticks.start_ns, ticks.end_ns, torque)
+
+
 class _Reference:
-    """A run integrated in fine and in coarse steps, compared at its samples.
+    """A run propagated with a coarse solution, compared at its samples.
 
     Args:
         recording: what is compared.
-        motion: the equations of motion.
+        motion: propagates it.
         ticks: what acts, tick by tick.
-        longest_ns: longest coarse step [ns].
 
     """
 
-    def __init__(
-        self, recording: Recording, motion: FixedStepMotion, ticks: TickSequence, longest_ns: int
-    ) -> None:
+    def __init__(self, recording: Recording, motion: TickPropagator, ticks: TickSequence) -> None:
         self._recording, self._motion, self._ticks = recording, motion, ticks
         self._tick_ns = recording.ticks.period_ns
-        coarse = math.ceil(self._tick_ns / longest_ns)
-        self._steps = max(coarse + 1, math.ceil(1.5 * coarse)), coarse
         self._error, self._own = (Deviation.none(len(recording.time_ns)) for _ in range(2))
 
     def compare(self, start: Vector | None, *, restart: bool) -> Comparison:
@@ -167,7 +163,7 @@ class _Reference:
         bounds = [0, *gaps[gaps < count].tolist(), count]
         restarts: list[int] = []
         if start is not None:
-            self._note(np.array([0]), [np.array([start])] * 2)
+            self._note(np.array([0]), np.array([[start, start]]))
             if ticks.start_ns[0] != 0:
                 start = None
         for first, stop in itertools.pairwise(bounds):
@@ -186,7 +182,8 @@ class _Reference:
         if count < len(ticks.start_ns):
             until = ticks.end_ns[count - 1] / NANOSECONDS
             reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
-        return Comparison(self._error, self._own, tuple(restarts), self._steps[0], tuple(reasons))
+        steps = 2 * -(-self._tick_ns // LONGEST_NS)
+        return Comparison(self._error, self._own, tuple(restarts), steps, tuple(reasons))
 
     def _count(self) -> int:
         """Return the number of ticks that are integrated."""
@@ -212,26 +209,24 @@ class _Reference:
 
     def _integrate(self, start: Vector, first: int, stop: int) -> int:
         """Integrate ticks without gaps between them; return the first that was not reached."""
-        now = [start, start]
+        state = np.array(start)
         for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):
             ticks = self._ticks.part(slice(first + part.start, first + part.stop))
-            counts = np.ceil((ticks.end_ns - ticks.start_ns) / self._tick_ns).astype(np.int64)
-            reached = [
-                self._motion.follow(y, ticks, counts * steps)
-                for y, steps in zip(now, self._steps, strict=True)
-            ]
-            done = min(map(len, reached))
+            starts = np.full((len(ticks.start_ns), len(start)), np.nan)
+            starts[0] = state
+            reached = self._motion.follow(ticks, starts)[..., :-1]
+            done = int(np.isfinite(reached[:, 0, 0]).sum())
             rows = places(self._recording.time_ns, ticks.end_ns[:done])
-            self._note(rows[rows >= 0], [one[:done][rows >= 0] for one in reached])
-            if done < len(counts):
+            self._note(rows[rows >= 0], reached[:done][rows >= 0])
+            if done < len(starts):
                 return int(first + part.start + done + 1)
-            now = [tuple(one[-1].tolist()) for one in reached]
+            state = reached[-1, 0]
         return stop
 
-    def _note(self, rows: Integers, reached: list[Array]) -> None:
-        """Write down how far samples are from the states of the fine and the coarse steps."""
-        recording = self._recording
-        fine, coarse = (states.outputs(self._motion.dynamics, one) for one in reached)
+    def _note(self, rows: Integers, reached: Array) -> None:
+        """Write down how far samples are from the solution, and the coarse solution, (n, 2, m)."""
+        recording, dynamics = self._recording, self._motion.dynamics
+        fine, coarse = (states.outputs(dynamics, reached[:, i]) for i in range(2))
         sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
         for deviation, one in ((self._error, sampled), (self._own, coarse)):
             found = _deviation(one, fine)

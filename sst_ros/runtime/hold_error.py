@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 
+from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulation import Simulation, Triple
 
 
@@ -31,8 +32,10 @@ class HeldTorques:
         self._impulse = [0.0, 0.0, 0.0]
         self._seconds, self._changes = 0.0, 0
 
-    def add(self, torque: Triple, seconds: float) -> None:
-        """Add torques [N m] that were held for some time [s]."""
+    def add(self, torque: Triple | SineTorque, seconds: float) -> None:
+        """Add torques [N m] that were held for some time [s]; a sine is not held."""
+        if isinstance(torque, SineTorque):
+            return
         if torque != self._last:
             self._changes += 1
             self._last = torque

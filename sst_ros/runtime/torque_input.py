@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -13,9 +12,9 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.simulation.simulation import Triple
+from sst_ros.state import Vector3, clamped, finite_vector
 
-ZERO: Triple = (0.0, 0.0, 0.0)
+ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
 
 _MESSAGES_PER_TICK = 10
@@ -61,7 +60,7 @@ class TorqueInput:
         moments: Take | None = None,
     ) -> None:
         self._owner = owner
-        self._limit = (actuators.torque_limit if actuators else None) or math.inf
+        self._limit = actuators.torque_limit if actuators else None
         self._damping = actuators.idle_damping if actuators else 0.0
         self._commands, self._stamped, self._moments = commands, stamped, moments
         self._lockstep = owner.parameters.sync == "lockstep"
@@ -109,7 +108,7 @@ class TorqueInput:
             self._take()
         return self.begun
 
-    def torque(self, simulation: HasState) -> Triple:
+    def torque(self, simulation: HasState) -> Vector3:
         """Return the torques of the tick that begins now [N m]."""
         self._take()
         if not self._expired():
@@ -118,15 +117,15 @@ class TorqueInput:
             return ZERO
         first, second, third = simulation.state.joints.gamma_dot
         damping = -self._damping
-        return self._limited((damping * first, damping * second, damping * third))
+        return clamped((damping * first, damping * second, damping * third), self._limit)
 
-    def answer(self, stamp_ns: int | None) -> Triple | None:
+    def answer(self, stamp_ns: int | None) -> Vector3 | None:
         """Return the torques that answer the sample of this stamp [N m], None without an answer.
 
         With None an answer to a state shown before the run is looked for. In a run such answers are
         ignored, because they may arrive late.
         """
-        found: Triple | None = None
+        found: Vector3 | None = None
         for _ in _arrived(self._commands):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
         for message in _arrived(self._stamped):
@@ -164,14 +163,14 @@ class TorqueInput:
         if timeout and not self._lockstep and time.monotonic() - self._moment_since > timeout:
             self.moment = ZERO
 
-    def _use(self, check: Callable[[Any], Triple], content: Any) -> None:
+    def _use(self, check: Callable[[Any], Vector3], content: Any) -> None:
         try:
             self._accept(check(content))
         except MessageRefused as refused:
             self._drop(refused)
 
-    def _accept(self, torque: Triple) -> Triple:
-        self._held = self._limited(torque)
+    def _accept(self, torque: Vector3) -> Vector3:
+        self._held = clamped(torque, self._limit)
         self.clamped += self._held != torque
         self.received += 1
         self._since, self.begun = time.monotonic(), True
@@ -189,11 +188,6 @@ class TorqueInput:
         self.stale = old
         return old
 
-    def _limited(self, torque: Triple) -> Triple:
-        limit = self._limit
-        first, second, third = (min(max(tau, -limit), limit) for tau in torque)
-        return (first, second, third)
-
 
 def _arrived(take: Take) -> Iterator[Any]:
     """Yield what has arrived, within bounds."""
@@ -203,26 +197,25 @@ def _arrived(take: Take) -> Iterator[Any]:
         yield message
 
 
-def three(data: Sequence[float], what: str = "torques [N m]") -> Triple:
+def three(data: Sequence[float], what: str = "torques [N m]") -> Vector3:
     """Return three finite numbers.
 
     Raises:
         MessageRefused: there are not three, or one is not finite.
 
     """
-    complete = len(data) == 3
-    if not complete or not all(map(math.isfinite, data)):
-        kind = "not finite" if complete else "wrong size"
+    if (vector := finite_vector(data)) is None:
+        kind = "not finite" if len(data) == 3 else "wrong size"
         raise MessageRefused(kind, f"{list(data)[:6]} must be 3 finite {what}")
-    return (float(data[0]), float(data[1]), float(data[2]))
+    return vector
 
 
-def torque_by_name(message: Any) -> Triple:
+def torque_by_name(message: Any) -> Vector3:
     """Return the efforts of a JointState [N m]; the joints may come in any order."""
     return by_name(message.name, message.effort, "torques [N m] in effort")
 
 
-def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Triple:
+def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
     """Return one value for each actuator, gamma_1 to gamma_3.
 
     Raises:

@@ -6,6 +6,7 @@ A term that a scene does not name has no operation in its dynamics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -232,3 +233,9 @@ class SineTorque(Section):
     amplitude: Vector = number("amplitudes", "N m", shape=(3,))
     frequency: Vector = number("angular frequencies", "rad/s", shape=(3,), least=0.0)
     phase: Vector = number("phases", "rad", shape=(3,), default=(0.0, 0.0, 0.0))
+
+    def at(self, time: float) -> Vector:
+        """Torques [N m] at a time [s]."""
+        rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
+        first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
+        return first, second, third

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism import frames
+from sst_ros.mechanism import frames, kinematics
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile
 
@@ -164,13 +165,8 @@ class SampledMotion:
     @cached_property
     def closure_error(self) -> float:
         """Largest abs(r_k . t_k) of all samples: how far the loops are from closed; 0 if exact."""
-        rotation, worst = frames.rotation_matrix(self.quaternion), 0.0
-        for k, leg in enumerate(self._dynamics.model.legs):
-            angle = self.gamma[:, k, None]
-            r = np.cos(angle) * np.array(leg.v) + np.sin(angle) * np.array(leg.across)
-            t = rotation @ np.array((leg.e0, leg.e1, 0.0))
-            worst = max(worst, float(np.abs(np.einsum("ni,ni->n", r, t)).max(initial=0.0)))
-        return worst
+        rotation, geometry = frames.rotation_matrix(self.quaternion), Geometry.of(self.scene)
+        return float(np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0))
 
     @property
     def _dynamics(self) -> Dynamics:

@@ -14,9 +14,10 @@ from sst_ros.integration.applied_torque import StateFeedback
 from sst_ros.integration.methods import RK4
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation, State
-from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile, TorqueTable, Triple, three
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile, TorqueTable, three
 from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.state import NANOSECONDS, State, Vector3, clamped
 
 SAMPLES = 200
 """Intervals of a motion without `t_eval`."""
@@ -85,7 +86,7 @@ class SteppedMotion:
         if not isinstance(law, TorqueProfile):
             self._feedback = StateFeedback(_checked(law), self._simulation.dynamics)
         self._samples: list[State] = []
-        self._held: list[tuple[int, Triple]] = []
+        self._held: list[tuple[int, Vector3]] = []
 
     def run(self, times: np.ndarray | None, progress: bool) -> Trajectory:
         """Go to the end or a limit; times [ns] of the samples, None for the ends of all steps."""
@@ -185,11 +186,11 @@ class SteppedMotion:
         scene, lag = self._scene.actuators, 0.0
         if scene is not None and scene.time_constant is not None:
             return (lag,) * 3
-        limit = math.inf if scene is None or scene.torque_limit is None else scene.torque_limit
         known = isinstance(law, TorqueProfile)
-        return np.clip(law(0.0) if known else law(0.0, self._samples[0]), -limit, limit)
+        torque = law(0.0) if known else law(0.0, self._samples[0])
+        return clamped(torque, scene.torque_limit if scene else None)
 
 
-def _checked(function: FeedbackFunction) -> Callable[[float, State], Triple]:
+def _checked(function: FeedbackFunction) -> Callable[[float, State], Vector3]:
     """Refuse anything but three finite torques by the time of the call."""
     return lambda t, state: three(function(t, state), f"torque({t:g})")

@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation.simulation import State
+from sst_ros.state import State, Vector3, finite_vector
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
 
@@ -34,7 +33,7 @@ class TorqueProfile:
         """Return the times [s] at which the torques or their derivatives jump, ascending."""
         return np.empty(0)
 
-    def between(self, begin: float, end: float) -> Callable[[float], Triple]:
+    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
         """Torques [N m] on [begin, end], between which no break lies; ends belong to it."""
         return self
 
@@ -42,7 +41,7 @@ class TorqueProfile:
         """Numbers from which `profile_from` builds the same profile; None for a function."""
         raise NotImplementedError
 
-    def __call__(self, t: float) -> Triple:
+    def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
         first, second, third = self.values(np.array([t]))[0].tolist()
         return first, second, third
@@ -52,13 +51,13 @@ class TorqueProfile:
 class ConstantTorque(TorqueProfile):
     """The same three torques [N m] at all times."""
 
-    torque: Triple
+    torque: Vector3
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def __call__(self, t: float) -> Triple:
+    def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
         return self.torque
 
@@ -84,16 +83,12 @@ class SineProfile(TorqueProfile):
         amplitude, frequency, phase = self._parts()
         return {"kind": "sine", "amplitude": amplitude, "frequency": frequency, "phase": phase}
 
-    def _parts(self) -> tuple[Triple, Triple, Triple]:
+    def _parts(self) -> tuple[Vector3, Vector3, Vector3]:
         return self.sine.amplitude, self.sine.frequency, self.sine.phase
 
-    def __call__(self, t: float) -> Triple:
+    def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s], by the sine of the C library."""
-        from math import sin
-
-        rows = zip(*self._parts(), strict=True)
-        first, second, third = (a * sin(f * t + p) for a, f, p in rows)
-        return first, second, third
+        return self.sine.at(t)
 
 
 class TorqueTable(TorqueProfile):
@@ -184,7 +179,7 @@ class PolynomialTorque(TorqueProfile):
         """See `TorqueProfile`."""
         return self.x
 
-    def between(self, begin: float, end: float) -> Callable[[float], Triple]:
+    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
         if not 0 <= piece < self.c.shape[1]:
@@ -218,7 +213,7 @@ class FunctionTorque(TorqueProfile):
     def __init__(self, function: TorqueFunction) -> None:
         self._function = function
 
-    def __call__(self, t: float) -> Triple:
+    def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
         return three(self._function(t), f"torque({t:g})")
 
@@ -264,19 +259,15 @@ def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
     return PolynomialTorque(more["c"], more["x"])
 
 
-def three(value: Any, name: str) -> Triple:
+def three(value: Any, name: str) -> Vector3:
     """Return three finite numbers as floats.
 
     Raises:
         InputError: `value` is something else.
 
     """
-    try:
-        first, second, third = (float(number) for number in value)
-        if np.all(np.isfinite((first, second, third))):
-            return first, second, third
-    except (TypeError, ValueError):
-        pass
+    if (vector := finite_vector(value)) is not None:
+        return vector
     allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
     raise InputError("simulate", [Problem(name, value, allowed)])
 

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
@@ -89,7 +88,7 @@ class ProfileInput(TorqueInput):
     def __init__(self, owner: Any, scene: Scene, hold: str, period_ns: int) -> None:
         super().__init__(owner, scene.actuators, lambda: None, lambda: None)
         assert scene.torque is not None
-        self._profile, self._sine = sine(scene.torque), scene.torque
+        self._profile, self._sine = scene.torque.at, scene.torque
         self._exact = hold == EXACT
         self._shift_ns = period_ns // 2 if hold == MIDDLE else 0
 
@@ -98,7 +97,7 @@ class ProfileInput(TorqueInput):
         if self._exact:
             return self._sine
         time_ns = simulation.state.time_ns + self._shift_ns
-        return self._limited(self._profile(time_ns / NANOSECONDS))
+        return self._profile(time_ns / NANOSECONDS)  # the simulation clamps it
 
 
 class _Output:

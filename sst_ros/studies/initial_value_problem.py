@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, RunStopped
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -74,9 +73,7 @@ class InitialValueProblem:
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)
-        self.torque: Vector3 | TorqueFunction = (
-            sine(scene.torque) if scene.torque else (0.0, 0.0, 0.0)
-        )
+        self.torque: Vector3 | TorqueFunction = scene.torque.at if scene.torque else (0.0, 0.0, 0.0)
         limit = scene.actuators.torque_limit if scene.actuators else None
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit

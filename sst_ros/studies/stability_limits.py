@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros import scene as scenes
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper
@@ -27,6 +26,7 @@ from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
 from sst_ros.studies.parallel import run_jobs

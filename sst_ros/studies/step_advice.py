@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import SstError
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
@@ -88,7 +87,7 @@ def step_advice(scene: Scene) -> StepAdvice:
 
 def _stiff(simulation: Simulation, scene: Scene) -> bool:
     """Return whether `auto` changes to the implicit method in a short run."""
-    profile = sine(scene.torque) if scene.torque else lambda _: (0.0, 0.0, 0.0)
+    profile = scene.torque.at if scene.torque else lambda _: (0.0, 0.0, 0.0)
     try:
         for period in range(PERIODS):
             simulation.step(profile(period * PERIOD_NS / NANOSECONDS), PERIOD_NS)

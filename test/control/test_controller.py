@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sst_ros import scene
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import MODES, Controller, ControlStopped, Measurement
 from sst_ros.control.controller_settings import ControllerSettings
@@ -17,6 +16,7 @@ from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene import scene
 from sst_ros.scene.scene import Actuators, Initial, Moment
 from sst_ros.simulation.simulation import Simulation
 from test.models import seeded_samples

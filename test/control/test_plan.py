@@ -22,7 +22,6 @@ from sst_ros.control.plan import check, examine
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.star_motions import GeodesicMotion
 from sst_ros.control.time_scaling import time_scaling
-from sst_ros.control.torque_profiles import table
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
@@ -41,6 +40,7 @@ from sst_ros.scene.scene import (
     text_of,
 )
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.simulation.torque import TorqueTable
 
 HOME = (math.pi / 4,) * 3
 EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))
@@ -320,7 +320,8 @@ def test_written_torques_do_the_motion(tmp_path):
         assert cli.main(
             ["plan", "check", "point_to_point", "--csv", str(path), "--period", f"{period_ns}e-9"]
         ) == 0  # fmt: skip
-        profile, last = table(path)
+        profile = TorqueTable.read(path)
+        last = profile.times[-1]
         assert last == pytest.approx(1.0, abs=1e-12)
         simulation = Simulation(scene)
         for k in range(1_000_000_000 // period_ns):

@@ -10,11 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST
 
-from sst_ros.control.torque_profiles import sine, table
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import SineTorque, load
+from sst_ros.simulation.torque import TorqueTable
 
 HEADER = "time,tau_1,tau_2,tau_3\n"
+
+
+def table(path):
+    read = TorqueTable.read(path)
+    return read, read.times[-1]
 
 
 def written(folder, text, encoding="utf-8"):
@@ -27,7 +32,7 @@ def written(folder, text, encoding="utf-8"):
 @given(st.floats(0.0, 10.0))
 def test_torques_of_example_2_are_the_printed_ones(t):
     """4 sin 18t, 5 cos 12t, 3 cos 24t; phases of pi/2 cost rounding of angles up to 240."""
-    first, second, third = sine(load("example2_heavy").torque)(t)
+    first, second, third = load("example2_heavy").torque.at(t)
     assert first == pytest.approx(4.0 * math.sin(18.0 * t), abs=1e-13)
     assert second == pytest.approx(5.0 * math.cos(12.0 * t), abs=5e-13)
     assert third == pytest.approx(3.0 * math.cos(24.0 * t), abs=5e-13)
@@ -35,7 +40,7 @@ def test_torques_of_example_2_are_the_printed_ones(t):
 
 def test_a_sine_starts_at_its_phase():
     torque = SineTorque(amplitude=[1, 2, 3], frequency=[0, 0, 0], phase=[0, math.pi / 2, -1])
-    assert sine(torque)(123.0) == (0.0, 2.0, 3.0 * math.sin(-1.0))
+    assert torque.at(123.0) == (0.0, 2.0, 3.0 * math.sin(-1.0))
 
 
 def test_rows_hold_until_the_next(tmp_path):

@@ -14,7 +14,6 @@ import pytest
 from docs.blocks import ROOT
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import read
@@ -96,7 +95,7 @@ def test_a_recording_as_a_table(run, tmp_path):
 
 def test_the_examples_geometry_stays_inside_for_its_whole_run():
     scene = load_scene(EXAMPLES / "my_geometry.yaml")
-    simulation, torque, reach = Simulation(scene), sine(scene.torque), Geometry.of(scene).arc
+    simulation, torque, reach = Simulation(scene), scene.torque.at, Geometry.of(scene).arc
     least = np.inf
     for tick in range(round(scene.duration * 500)):
         gamma = simulation.step(torque(tick * 2e-3), 2_000_000).joints.gamma

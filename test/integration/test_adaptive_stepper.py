@@ -11,7 +11,6 @@ import pytest
 from loaded_scenes import IGNORE, REST, run, viscous
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.errors import Diverged, StepBudgetExceeded, StrokeExceeded, WorkspaceLeft
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -114,7 +113,7 @@ def test_a_budget_of_evaluations_ends_what_would_not_end():
 
 def independent(scene, joint, end, span, torque=None):
     """Time at which a joint's angle reaches `end`: SciPy at its tightest, on the kernel."""
-    model, profile = kernel.model_of(scene), torque or sine(scene.torque)
+    model, profile = kernel.model_of(scene), torque or scene.torque.at
     state = Simulation(scene).state
 
     def angle(t, y):
@@ -158,7 +157,7 @@ def stopped(simulation, torque, error, limit=2000):
 @pytest.mark.parametrize("method", ["dop853", "auto"])
 def test_the_end_of_a_stroke_is_met_within_a_picosecond(method):
     scene = load("example2_stroke")
-    error = stopped(Simulation(scene, method, tolerance=1e-14), sine(scene.torque), StrokeExceeded)
+    error = stopped(Simulation(scene, method, tolerance=1e-14), scene.torque.at, StrokeExceeded)
     assert abs(error.time - independent(scene, 0, math.pi / 2, 0.95)) < 1e-12
 
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from sst_ros import Simulation, load_scene, simulate
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
@@ -43,7 +42,7 @@ def result(batch, gamma):
 
 def single(gamma):
     simulation = Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))), "dop853")
-    torque = sine(EXAMPLE2.torque)
+    torque = EXAMPLE2.torque.at
     try:
         for _ in range(100):
             simulation.step(torque, 10_000_000)

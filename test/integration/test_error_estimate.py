@@ -14,7 +14,6 @@ from dataclasses import replace
 import pytest
 from loaded_scenes import REST, apart, run
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
@@ -37,7 +36,7 @@ SPANS = {
 
 def travelled(name, method, tolerance):
     scene = load(name)
-    torque = sine(scene.torque) if scene.torque else REST
+    torque = scene.torque.at if scene.torque else REST
     return run(
         Simulation(scene, method, tolerance=tolerance, step_budget=10**6),
         SPANS[name],
@@ -132,7 +131,7 @@ def test_fixed_steps_over_sharp_friction_are_estimated_by_the_order_that_is_left
 ):
     friction = JointFriction(gamma=Friction(coulomb=coulomb, smoothing=smoothing))
     scene = replace(load(name), friction=friction)
-    torque = sine(scene.torque)
+    torque = scene.torque.at
     fixed = Simulation(scene, "rk4")
     truth = Simulation(scene, tolerance=1e-11, step_budget=10**6)
     for k in range(50):

@@ -15,7 +15,6 @@ import pytest
 from integration.explicit_method import ExplicitMethod
 from scipy.integrate import solve_ivp
 
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
 from sst_ros.scene.scene import load
@@ -112,7 +111,7 @@ def test_error_weights_vanish_up_to_the_embedded_order_and_no_further(weights, t
 
 SCENE = load("example2_heavy")
 MODEL = kernel.model_of(SCENE)
-TORQUE = sine(SCENE.torque)
+TORQUE = SCENE.torque.at
 SPAN = 0.4
 
 

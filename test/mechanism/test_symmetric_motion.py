@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import InputError
 from sst_ros.mechanism.symmetric_motion import HOME, drift_free_rate, inertia, inertia_slope
 
@@ -64,7 +63,7 @@ def test_example_1_starts_with_the_rate_without_drift():
 def test_the_heavier_star_returns_after_one_period():
     rate = drift_free_rate(HEAVY)
     scene = HEAVY.with_values({"initial.gamma_dot": [rate] * 3})
-    simulation, torque = Simulation(scene, tolerance=1e-13), sine(scene.torque)
+    simulation, torque = Simulation(scene, tolerance=1e-13), scene.torque.at
     steps = 500
     dt_ns = round(np.pi / 6 * 1e9 / steps)
     for _ in range(steps):

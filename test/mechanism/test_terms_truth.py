@@ -16,7 +16,6 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
@@ -121,7 +120,7 @@ def resistance(friction, v):
 
 def test_work_becomes_kinetic_energy_and_heat_by_scipys_integrator():
     """Work and heat are integrated beside the motion; 1e-9 of the work is asked for."""
-    scene, torque = load_scene("friction"), sine(load_scene("friction").torque)
+    scene, torque = load_scene("friction"), load_scene("friction").torque.at
     dynamics = Dynamics.of(scene)
     kinds = (scene.friction.gamma, scene.friction.mu, scene.friction.beta)
 

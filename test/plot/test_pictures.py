@@ -9,11 +9,11 @@ import pytest
 from matplotlib import image
 
 from sst_ros import __main__ as cli
-from sst_ros import scene
 from sst_ros.plot import energy, pictures
 from sst_ros.plot.pictures import PICTURES, draw
 from sst_ros.recording import recording, signals
 from sst_ros.report import energy_balance
+from sst_ros.scene import scene
 from sst_ros.simulation.simulation import Simulation
 
 GAMMA = math.pi / 4

@@ -11,7 +11,6 @@ import pytest
 from sst_ros import __main__ as cli
 from sst_ros.control.plan import examine
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.torque_profiles import sine
 from sst_ros.errors import InputError
 from sst_ros.recording.recorded_motion import samples
 from sst_ros.recording.recording import read
@@ -39,7 +38,7 @@ def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag)
         assert at.gamma == pytest.approx(recording.gamma[row], abs=1e-13)
         assert at.gamma_dot == pytest.approx(recording.gamma_dot[row], abs=1e-11)
         assert at.quaternion == pytest.approx(recording.quaternion[row], abs=1e-12)
-    torque = sine(held.torque)
+    torque = held.torque.at
     # What is held since the last millisecond lags behind the sine by half of one.
     expected = np.array([torque(time - 0.0005) for time in plan.times.tolist()])
     inside = (plan.times > 0.02) & (plan.times < plan.motion.duration - 0.02)

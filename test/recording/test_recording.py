@@ -10,9 +10,9 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 import sst_ros
-from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
+from sst_ros.scene import scene
 
 
 def test_a_run_comes_back_as_it_was_written(written, bags, example2):

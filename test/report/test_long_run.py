@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sst_ros.integration.tick_propagator import TickPropagator
 from sst_ros.recording import recording
-from sst_ros.report import energy_balance, fixed_step_motion, reference
+from sst_ros.report import energy_balance, reference
 from sst_ros.report.run import report
 
 ROOT = str(Path(__file__).parents[2])
@@ -30,20 +31,20 @@ def written(long_bag, tmp_path_factory):
 
 
 def test_a_long_run_is_integrated_compiled(written, monkeypatch):
-    rides = 0
-    follow = fixed_step_motion.FixedStepMotion.follow
+    calls = 0
+    follow = TickPropagator.follow
 
     def counted(*given):
-        nonlocal rides
-        rides += 1
+        nonlocal calls
+        calls += 1
         return follow(*given)
 
     run = recording.read(written)
     assert len(run.time_ns) == 10_001 and len(run.ticks.start_ns) == 20_000
-    monkeypatch.setattr(fixed_step_motion.FixedStepMotion, "follow", counted)
+    monkeypatch.setattr(TickPropagator, "follow", counted)
     integration, ideal = reference.integration(run), reference.ideal(run)
     energy = energy_balance.residual(run, [])
-    assert rides == 4  # fine and coarse steps of both, in one call each
+    assert calls == 3  # both references and the energy, in one call each
     assert integration.compared == 10_001 and integration.error.gamma.max() < 1e-12
     assert integration.own.gamma.max() < 1e-13 and ideal.error.gamma.max() < 1e-2
     assert np.abs(energy).max() < 1e-11

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros import scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.recording import recording
 from sst_ros.report import page, reference, timing
 from sst_ros.report.run import evaluate, report
 from sst_ros.report.table import table
+from sst_ros.scene import scene
 
 LATENCY_NS = 400_000
 SENT_NS = 50_000
@@ -27,7 +26,7 @@ def lively(bags, example2):
     for entry in example2:
         late = 30_000 if entry.sample > 0 and entry.sample % 10 == 0 else 0
         entries.append(dataclasses.replace(entry, received_ns=entry.received_ns + late))
-    profile = sine(scene.load("example2").torque)
+    profile = scene.load("example2").torque.at
     for tick in range(300):
         command = bags.make(
             "std_msgs/Float64MultiArray",
@@ -132,7 +131,7 @@ def test_stamps_of_another_clock_do_not_matter(tmp_path, bags, lively):
 
 def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(tmp_path, bags, example2):
     """The torque of every other tick answers the sample of two milliseconds before it."""
-    profile, entries = sine(scene.load("example2").torque), list(example2)
+    profile, entries = scene.load("example2").torque.at, list(example2)
     for tick in range(2, 300, 2):
         command = bags.make(
             "sensor_msgs/JointState",

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sst_ros import scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.recording import recording
 from sst_ros.report import formulation, reference, states
+from sst_ros.scene import scene
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +131,7 @@ def test_states_of_samples_are_whole(run):
 
 def test_the_ideal_is_the_motion_under_continuous_torques(run):
     found = reference.ideal(run)
-    model, profile = kernel.model_of(run.scene), sine(run.scene.torque)
+    model, profile = kernel.model_of(run.scene), run.scene.torque.at
     solution = solve_ivp(
         lambda t, y: kernel.derivative(model, tuple(y), profile(t)),
         (0.0, 0.3), states.initial(run.scene), "DOP853", rtol=1e-13, atol=1e-15,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
 from sst_ros.report.run import evaluate, report
 from sst_ros.report.table import table
+from sst_ros.scene import scene
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import bags
 import numpy as np
 import pytest
 
-from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import tracking, tracking_report
+from sst_ros.scene import scene
 
 HOME = np.array(scene.load("example2").initial.gamma)
 OFF = np.array([0.01, -0.02, 0.03])

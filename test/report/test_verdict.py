@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from sst_ros import __main__ as cli
-from sst_ros import scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.recording import recording
 from sst_ros.report.run import evaluate
 from sst_ros.report.verdict import text
+from sst_ros.scene import scene
 
 
 def commands(bags, period, received_ns):
     """A command every `period` ticks with the torque of the tick, received so much after it."""
-    profile = sine(scene.load("example2").torque)
+    profile = scene.load("example2").torque.at
     for tick in range(0, 300, period):
         content = bags.make(
             "std_msgs/Float64MultiArray",

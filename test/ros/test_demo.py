@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.control import torque_profiles
 from sst_ros.demo import demo
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.recording.recording import read
@@ -53,7 +52,7 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
 def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
     recording = read(out / "bag")
     played = load_scene("example2")
-    profile = torque_profiles.sine(played.torque)
+    profile = played.torque.at
     simulation = Simulation(played)
     expected = [simulation.state.joints.gamma]
     for sample in range(500):

@@ -6,7 +6,6 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from sst_ros import Simulation, load_scene
-from sst_ros.control.torque_profiles import sine
 
 pytestmark = pytest.mark.ros
 PERIOD_NS = 2_000_000
@@ -25,7 +24,7 @@ def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
     assert simulator.returncode == 0
     samples = [np.array(state.position) for state in states if observer.stamp(state)]
     assert len(samples) == 26
-    simulation, profile = Simulation(name), sine(load_scene(name).torque)
+    simulation, profile = Simulation(name), load_scene(name).torque.at
     for k, sample in enumerate(samples):
         expected = simulation.state.joints
         np.testing.assert_allclose(

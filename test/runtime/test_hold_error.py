@@ -6,7 +6,6 @@ import dataclasses
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.control.torque_profiles import sine
 from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.scene.scene import Actuators
 from sst_ros.simulation.simulation import Simulation
@@ -16,7 +15,7 @@ from sst_ros.studies.extreme_scenes import apart
 def held(scene, rate, shift, seconds):
     """Hold the torques of a scene at a rate [Hz], those at `shift` of each hold."""
     simulation, torques = Simulation(scene, "dop853"), HeldTorques()
-    profile = sine(scene.torque)
+    profile = scene.torque.at
     for k in range(round(seconds * rate)):
         torque = profile((k + shift) / rate)
         simulation.step(torque, 10**9 // rate)

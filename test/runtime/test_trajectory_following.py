@@ -6,12 +6,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sst_ros import scene
 from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
+from sst_ros.scene import scene
 from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Initial
 from sst_ros.simulation.simulation import Simulation

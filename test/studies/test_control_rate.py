@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sst_ros import scene
 from sst_ros.errors import InputError
+from sst_ros.scene import scene
 from sst_ros.studies import control_rate
 from sst_ros.studies.control_rate import (
     EXACT,

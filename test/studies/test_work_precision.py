@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros import scene
 from sst_ros.errors import InputError
 from sst_ros.plot.style import save_figure
 from sst_ros.plot.work_precision import draw_summary
+from sst_ros.scene import scene
 from sst_ros.scene.bodies import Inertia
 from sst_ros.studies.accuracy_report import (
     documents,
