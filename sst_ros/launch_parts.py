@@ -12,9 +12,10 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import yaml
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
@@ -27,6 +28,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from sst_ros import child_process
+from sst_ros.description.ros2_control import urdf_with_ros2_control
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
@@ -157,25 +159,61 @@ def recorder(given: Given) -> Action:
 def rviz(given: Given, scene_name: str) -> list[Action]:
     """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout."""
     require("robot_state_publisher", "rviz2")
-    model = ParameterValue(urdf(scene.load(scene_name)), value_type=str)
+    layout = str(share_directory() / "config" / "sst_ros.rviz")
     return [
-        Node(
-            package="robot_state_publisher",
-            executable="robot_state_publisher",
-            namespace=given["namespace"],
-            output="screen",
-            parameters=[{"robot_description": model}],
-            on_exit=_exit_handler("robot_state_publisher", True),
-        ),
-        Node(
-            package="rviz2",
-            executable="rviz2",
-            namespace=given["namespace"],
-            output="screen",
-            arguments=["-d", str(share_directory() / "config" / "sst_ros.rviz")],
-            on_exit=_exit_handler("rviz2", True),
-        ),
+        _state_publisher(given, urdf(scene.load(scene_name))),
+        _foreign(given, "rviz2", "rviz2", ["-d", layout]),
     ]
+
+
+def ros2_control(given: Given, controller: str, controllers: str) -> list[Action]:
+    """Describe a controller manager whose hardware is the simulator, and the controllers.
+
+    Args:
+        given: the launch arguments.
+        controller: name of the controller that is started beside joint_state_broadcaster.
+        controllers: file of parameters; config/controllers.yaml where empty.
+
+    """
+    require("robot_state_publisher", "controller_manager", "joint_state_broadcaster",
+            "joint_state_topic_hardware_interface")  # fmt: skip
+    space = ("/" + given["namespace"].strip("/")).rstrip("/")
+    names = f"{space}/sst_simulator/commands_stamped", f"{space}/joint_states"
+    document = urdf_with_ros2_control(scene.load(given["scene"]), *names)
+    path = controllers or str(share_directory() / "config" / "controllers.yaml")
+    spawned = ["joint_state_broadcaster", controller, "--param-file", path]
+    return [
+        _state_publisher(given, document),
+        _foreign(given, "controller_manager", "ros2_control_node", parameters=[path]),
+        _foreign(given, "controller_manager", "spawner", spawned, ends=False),
+    ]
+
+
+def _state_publisher(given: Given, document: str) -> Node:
+    model = ParameterValue(document, value_type=str)
+    package = "robot_state_publisher"
+    return _foreign(given, package, package, parameters=[{"robot_description": model}])
+
+
+def _foreign(
+    given: Given,
+    package: str,
+    executable: str,
+    arguments: Sequence[str] = (),
+    parameters: Sequence[Any] = (),
+    *,
+    ends: bool = True,
+) -> Node:
+    """Describe a node of another package."""
+    return Node(
+        package=package,
+        executable=executable,
+        namespace=given["namespace"],
+        output="screen",
+        arguments=[*arguments],
+        parameters=[*parameters],
+        on_exit=_exit_handler(executable, ends),
+    )
 
 
 def require(*packages: str) -> None:

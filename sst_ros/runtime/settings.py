@@ -74,6 +74,11 @@ class SimulatorParameters(Section):
     command_timeout: float = _seconds(
         "age at which a command is no longer held (steady clock); 0 for never", 0.5
     )
+    partial_commands: bool = flag(
+        "an effort of commands_stamped that is nan means that the actuator is not commanded, as "
+        "ros2_control sends it: zero torque; else such a command is refused",
+        default=False,
+    )
     integrator: str = choice("method of integration", INTEGRATORS, default="auto")
     tolerance: float = number(
         "largest local error of a step of the integrator",

@@ -128,7 +128,7 @@ class TorqueInput:
         found: Vector3 | None = None
         for _ in _arrived(self._commands):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
-        for message in _arrived(self._stamped):
+        for message in self._commanded():
             stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             try:
@@ -145,9 +145,22 @@ class TorqueInput:
     def _take(self) -> None:
         for message in _arrived(self._commands):
             self._use(three, message.data)
-        for message in _arrived(self._stamped):
+        for message in self._commanded():
             self._use(torque_by_name, message)
         self._take_moments()
+
+    def _commanded(self) -> Iterator[Any]:
+        """Yield stamped commands; with partial_commands nan is no torque, all nan no command."""
+        for message in _arrived(self._stamped):
+            if self._owner.parameters.partial_commands:
+                missing = [*map(math.isnan, message.effort)]
+                if all(missing):
+                    continue
+                message.effort = [
+                    0.0 if none else torque
+                    for none, torque in zip(missing, message.effort, strict=True)
+                ]
+            yield message
 
     def _take_moments(self) -> None:
         if self._moments is None:

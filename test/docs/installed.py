@@ -81,8 +81,9 @@ def run(words):
         if name not in STANDARD:
             assert name in parameters(command), f"{command} has no parameter {name}"
             _value(parameters(command)[name], text)
-    for option, following in pairwise([*rest, "--"]):
-        if option.startswith("--") and option not in ("--", "--ros-args"):
+    plain = rest[: rest.index("--ros-args")] if "--ros-args" in rest else rest
+    for option, following in pairwise([*plain, "--"]):
+        if option.startswith("--"):
             name, given, text = option.removeprefix("--").partition("=")
             spec = parameters(command)[name.replace("-", "_")]
             if spec.kind in ("flag", "integer", "number"):

@@ -62,6 +62,19 @@ def test_bad_stamped_commands_are_dropped_by_reason(nodes, observer):
     assert torques(states)[-1] == (0.1, 0.2, 0.3)
 
 
+def test_the_messages_of_ros2_control_are_commands(nodes, observer):
+    """JointStateTopicSystem::write: a stamp of its own, effort only, nan until it is claimed."""
+    nodes.run("simulator", wait_for_command=True, partial_commands=True, command_timeout=0.0)
+    states = observer.listen(JointState, "/joint_states")
+    commands = observer.publisher(JointState, f"{NODE}/commands_stamped")
+    for effort in ([math.nan] * 3, [0.1, math.nan, 0.2]):
+        message = JointState(name=NAMES, effort=effort)
+        message.header.stamp = observer.node.get_clock().now().to_msg()
+        commands.publish(message)
+    observer.until(lambda: (0.1, 0.0, 0.2) in torques(states), "the command")
+    assert observer.told("commands_received", 1)["commands_dropped"] == "0"
+
+
 def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
     process = nodes.run("simulator")
     assert "no command yet: zero torque" in observer.told("phase", "running")["said"]

@@ -190,6 +190,14 @@ def test_rviz_without_its_packages_starts_nothing(launch, name):
     assert "process started" not in run.text
 
 
+@pytest.mark.skipif(installed("controller_manager"), reason="of a ROS installation without it")
+def test_ros2_control_without_its_packages_starts_nothing(launch):
+    run = launch("ros2_control.launch.py")
+    assert run.ended() == 1
+    assert re.search(r"needs the ROS package\(s\) controller_manager", run.text)
+    assert "process started" not in run.text
+
+
 def test_an_unknown_argument_is_refused(launch):
     run = launch("simulate.launch.py", "scen:=swing")
     assert run.ended() == 1

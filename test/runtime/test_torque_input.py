@@ -167,3 +167,18 @@ def test_moments_are_checked_and_let_go_of():
     bench.board._moment_since -= 1.0
     bench.torque()
     assert bench.board.moment == ZERO
+
+
+def test_an_effort_that_is_no_number_means_not_commanded_where_that_is_asked_for():
+    """As joint_state_topic_hardware_interface of ros2_control sends it, with a stamp of its own."""
+    bench, nan = Bench(partial_commands=True), math.nan
+    bench.stamped += [stamped(5, [nan] * 3)]
+    assert not bench.board.starts_run()
+    bench.stamped += [stamped(7, [3.0, nan, 1.0], names=["gamma_3", "gamma_2", "gamma_1"])]
+    assert bench.torque() == (1.0, 0.0, 3.0)
+    bench.stamped += [stamped(8, [nan] * 3), stamped(9, [math.inf, nan, 0.0]), stamped(9, [nan])]
+    assert bench.torque() == (1.0, 0.0, 3.0)
+    assert (bench.board.received, bench.board.reasons) == (1, {"not finite": 1})
+    plain = Bench()
+    plain.stamped += [stamped(7, [nan, 0.0, 1.0])]
+    assert plain.torque() == ZERO and plain.board.reasons == {"not finite": 1}
