@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -150,11 +151,11 @@ class TorqueInput:
         self._take_moments()
 
     def _commanded(self) -> Iterator[Any]:
-        """Yield stamped commands; with partial_commands nan is no torque, all nan no command."""
+        """Yield stamped commands; with partial_commands nan is zero torque, all nan no command."""
         for message in _arrived(self._stamped):
             if self._owner.parameters.partial_commands:
                 missing = [*map(math.isnan, message.effort)]
-                if all(missing):
+                if missing and all(missing):
                     continue
                 message.effort = [
                     0.0 if none else torque
