@@ -138,7 +138,7 @@ class SceneDrawing:
         for name, (text, position) in places.items():
             self._server.scene.add_label(
                 f"{_ROOT}/{name}", text, position=position, anchor="center-center",
-                font_screen_scale=1.4,
+                font_screen_scale=2.0,
             )  # fmt: skip
 
 
