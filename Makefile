@@ -22,6 +22,7 @@ demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results i
 docs: $(VENV)/.docs  ## build the documentation into site, in a folder named after the version
 	@site=site/$$($(RUN) -c 'print(__import__("sst_ros").__version__)') && \
 	  $(RUN) -m sphinx --fail-on-warning --keep-going --quiet --builder html docs $$site && \
+	  rm -rf site/jupyter_execute && \
 	  echo "open file://$(CURDIR)/$$site/index.html"
 
 view: $(VENV)/.view  ## show a simulation in the browser

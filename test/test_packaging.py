@@ -80,7 +80,8 @@ def check_installed(python, folder):
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_an_installation_without_extras_works(kind, tmp_path):
-    pytest.importorskip("build", reason="needs build: pip install .[test]")
+    for needed in ("build", "twine"):
+        pytest.importorskip(needed, reason=f"needs {needed}: pip install .[test]")
     source = tmp_path / "source"
     ignored = shutil.ignore_patterns(".*", "*_out", "__pycache__", "*.egg-info", "build", "site")
     shutil.copytree(ROOT, source, ignore=ignored)
@@ -89,6 +90,9 @@ def test_an_installation_without_extras_works(kind, tmp_path):
         check=True, capture_output=True, timeout=300,
     )  # fmt: skip
     (built,) = (tmp_path / "dist").iterdir()
+    check = [sys.executable, "-m", "twine", "check", "--strict", built]  # the description renders
+    checked = subprocess.run(check, capture_output=True, text=True)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
     venv.create(tmp_path / "fresh", with_pip=True)
     python = tmp_path / "fresh" / "bin" / "python"
     subprocess.run(
