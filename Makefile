@@ -8,7 +8,7 @@ EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: help demo demo-feedforward docs view test test-all test-jazzy test-ros test-slow lint format clean
+.PHONY: help demo demo-feedforward demo-sweep docs view test test-all test-jazzy test-ros test-slow lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -18,6 +18,10 @@ demo: $(VENV)/.demo  ## run the paper's examples through the nodes; results in d
 
 demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results in demo_out/feedforward
 	$(RUN) -m sst_ros demo feedforward --force
+
+demo-sweep: $(VENV)/.sweep  ## 100,000 runs with random inertias and starts: table and pictures in sweep_out
+	$(RUN) -m sst_ros sweep examples/monte_carlo.yaml --out sweep_out
+	$(RUN) -m sst_ros sweep plot sweep_out
 
 docs: $(VENV)/.docs  ## build the documentation into site, in a folder named after the version
 	@site=site/$$($(RUN) -c 'print(__import__("sst_ros").__version__)') && \
@@ -65,6 +69,10 @@ $(VENV)/.demo: $(VENV)/.python setup.py
 	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
 	@touch $@
 
+$(VENV)/.sweep: $(VENV)/.python setup.py
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[sweep,plot]"
+	@touch $@
+
 $(VENV)/.view: $(VENV)/.python setup.py
 	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(ROS),record,view]"
 	@touch $@
@@ -78,8 +86,8 @@ $(VENV)/.docs: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,docs,test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),view,engines,cluster,docs,test]"
 	@touch $@
 
 clean:  ## remove environments and results
-	rm -rf $(VENV) .venv-jazzy demo_out view_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-jazzy demo_out view_out sweep_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

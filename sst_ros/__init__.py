@@ -2,7 +2,8 @@
 """Simulator of the 3-RRP spherical star-triangle parallel manipulator.
 
 `simulate` returns a whole motion as a `Trajectory`; `Simulation` goes step by step, for control
-loops; `Batch` runs many scenarios of one scene. All names are imported when they are first used.
+loops; `sweep` runs a study of many runs, on this machine or on a cluster. All names are imported
+when they are first used.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from sst_ros.simulation.torque import PolynomialTorque, TorqueTable
     from sst_ros.simulation.trajectory import Trajectory
     from sst_ros.state import State
+    from sst_ros.sweeps.sweep import sweep
 
 __version__ = "0.1.0"
 
@@ -76,6 +78,7 @@ __all__ = [
     "read_bag",
     "reference_motion",
     "simulate",
+    "sweep",
     "workspace",
 ]
 
@@ -110,6 +113,7 @@ _MODULES = {
     "read_bag": "recording.recording:read",
     "reference_motion": "control.reference_motions",
     "simulate": "simulation.simulate",
+    "sweep": "sweeps.sweep",
     "workspace": "mechanism.workspace",
 }
 

@@ -9,6 +9,8 @@ from typing import Any
 from sst_ros.errors import SstError
 
 EXTRAS = {
+    "dask": "sweep",
+    "distributed": "cluster",
     "jinja2": "view",
     "lz4": "record",
     "matplotlib": "plot",

@@ -25,7 +25,7 @@ FLOORS = (
     {"plot", "view"},
     {"report"},
     {"runtime"},
-    {"studies", "identification"},
+    {"studies", "identification", "sweeps"},
     {"nodes"},
     {"demo", "launch_parts", "paper"},
     {"cli"},
@@ -38,7 +38,7 @@ FILES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces")
-HEAVY = ("scipy.spatial", "matplotlib", "numba", "rclpy", "pandas", "rosbags")
+HEAVY = ("scipy.spatial", "matplotlib", "numba", "rclpy", "pandas", "rosbags", "dask")
 FACE = "sst_ros"
 """The package's face imports every room: it has no floor."""
 

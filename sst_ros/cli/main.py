@@ -28,6 +28,7 @@ COMMANDS = (
     "export",
     "recover",
     "study",
+    "sweep",
     "identify",
 )
 NODES = {

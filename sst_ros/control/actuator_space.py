@@ -48,9 +48,9 @@ class ActuatorSpaceMap:
             for w, v, e in rows
         ]
         self._actuators = compiled(trace(self._of_star, (*QUATERNION, *RATE, *BODY_ACCELERATION)))
-        self._star = compiled(trace(self._of_actuators, (*QUATERNION, *_ACTUATORS)))
+        self._star = compiled(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
         self._posture = compiled(trace(self._of_posture, QUATERNION))
-        self._newton = compiled(trace(self._improved, (*QUATERNION, *_CARRIAGES)))
+        self._newton = compiled(trace(self.newton_step, (*QUATERNION, *_CARRIAGES)))
 
     def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
@@ -109,7 +109,7 @@ class ActuatorSpaceMap:
     @cached_property
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:
         """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
-        return compiled_for_arrays(trace(self._of_actuators, (*QUATERNION, *_ACTUATORS)))
+        return compiled_for_arrays(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
@@ -132,7 +132,8 @@ class ActuatorSpaceMap:
         beta = (loads.angle(at, 2, leg.across, leg.v) for leg, at in legs)
         return (*sines, *beta, dot(j2[0], cross(j2[1], j2[2])))
 
-    def _of_actuators(self, *inputs: Any) -> tuple[Any, ...]:
+    def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
+        """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot; numbers of any kind."""
         rows, gamma_dot, gamma_ddot = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
         rate = _solved(reach, gamma_dot)
@@ -141,7 +142,7 @@ class ActuatorSpaceMap:
         missing = [total - part for total, part in zip(gamma_ddot, rest, strict=True)]
         return (*rate, *_solved(reach, missing))
 
-    def _improved(self, *inputs: Any) -> tuple[Any, ...]:
+    def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
         """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
         q = inputs[:4]
         rows = rotation_rows(q)

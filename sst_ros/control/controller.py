@@ -94,6 +94,9 @@ class Controller:
         settings: scheme (`mode`) and gains.
         period_s: control period, over which a command is held [s].
 
+    Attributes:
+        inertia: M_kk at the start of the motion [kg m^2], by which gains are made.
+
     Raises:
         InputError: the integral action would be unstable.
         SingularConfiguration: the motion begins in a singularity.
@@ -113,7 +116,7 @@ class Controller:
         t1, _ = virtual_work.equation_of_motion(
             virtual_work.Mechanism.of(model), posture, (0.0, 0.0, 0.0)
         )
-        self._inertia = _three(-np.diag(t1))
+        self.inertia = _three(-np.diag(t1))
         self._kp, self._kd = self._gains()
         limits = [settings.torque_limit or math.inf]
         if model.actuators is not None:
@@ -168,7 +171,7 @@ class Controller:
         elif mode != "feedforward":
             rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
             acceleration, summed = self._feedback(error, rates)
-            feedback = _by_joint(self._inertia, acceleration)
+            feedback = _by_joint(self.inertia, acceleration)
         if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
             feedforward = self._at_desired(self._motion.at(time + 0.5 * self._period_s))
         return self._limited(feedforward, feedback, desired, error, summed)
@@ -226,7 +229,7 @@ class Controller:
 
     def _gains(self) -> tuple[Triple, Triple]:
         """Gains kp [1/s^2] and kd [1/s] of accelerations."""
-        given, of = self._settings, self._inertia
+        given, of = self._settings, self.inertia
         if given.direct:
             kp = _three(np.divide(given.stiffness, of))
             kd = _three(np.divide(given.damping, of))

@@ -47,6 +47,10 @@ class Batch:
             a scenario. A list without an index means all of its entries.
         progress: draw a bar on a terminal while scenarios are prepared.
 
+    Attributes:
+        model: the traced programs.
+        columns: the numbers of the scenarios.
+
     Raises:
         InputError: the scene has no torque to apply, or the numbers of a scenario make no scene.
         MissingDependency: numba is not installed.
@@ -77,7 +81,7 @@ class Batch:
         self._scenarios = Scenarios(scene, parameters or {})
         self._scenarios.check(progress=progress)
         self.model = ParametricModel(self._scenarios, profile=profile)
-        self._columns = self.model.columns(self._scenarios)
+        self.columns = self.model.columns(self._scenarios)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's compiled code.
@@ -87,7 +91,7 @@ class Batch:
 
         """
         other = copy.copy(self)
-        other._scenarios, other._columns = scenarios, self.model.columns(scenarios)
+        other._scenarios, other.columns = scenarios, self.model.columns(scenarios)
         return other
 
     def scenario(self, row: int) -> Scene:
@@ -139,7 +143,7 @@ class Batch:
         # A step in which a limit was passed is left out: its beginning is the last valid state.
         last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(time / step) - 1, count)) * step
         torques = given[:3].T if self.model.ode.drive[:3] == TORQUE else np.zeros((number, 3))
-        common = self.model, self._columns, torques, code >= 0
+        common = self.model, self.columns, torques, code >= 0
         samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
         trajectories = BatchStates(*common, samples, np.stack(kept)) if keep_every else None
         return BatchResult(
@@ -152,10 +156,10 @@ class Batch:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
         angles = _rows("gamma", gamma, self._scenarios.count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
-        which = np.broadcast_to(self._columns.geometry, len(angles))
+        which = np.broadcast_to(self.columns.geometry, len(angles))
         label = f"{self.scene.name}, starting"
         quaternion, rate, code = initial_states(
-            self._columns.geometries,
+            self.columns.geometries,
             which,
             angles,
             rates,
@@ -169,10 +173,10 @@ class Batch:
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""
-        drive, columns = self.model.ode.drive, self._columns.inputs
+        drive, columns = self.model.ode.drive, self.columns.inputs
         given = np.zeros((max(len(drive) + len(columns), 1), number))
         if drive[:3] == TORQUE:
-            limit = self._columns.torque_limit
+            limit = self.columns.torque_limit
             given[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
         given[len(drive) : len(drive) + len(columns)] = columns
         return given

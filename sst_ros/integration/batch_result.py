@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics.traced_dynamics import compiled_for_arrays
 from sst_ros.extras import require
 from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.initial_states import REASONS
@@ -118,7 +117,7 @@ class BatchStates:
     def _outputs(self) -> Array:
         """Angles and rates of the joints and the energy, shape (..., N, 19)."""
         program = self._model.outputs
-        function = compiled_for_arrays(program)
+        function = self._model.output_function
         found = np.full((*self.t.shape, len(program.outputs)), np.nan)
         flat = found.reshape(-1, *found.shape[-2:])
         states = self._state.reshape(-1, *self._state.shape[-2:])

@@ -8,6 +8,8 @@ continue. Lanes do not depend on each other, so threads change no bit.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.runge_kutta_source import combination
@@ -20,8 +22,35 @@ NOT_FINITE = 1000
 """Code of a scenario whose numbers are no longer finite; others are 1 + the limit's index."""
 
 
-def batch_source(program: Program, distances: Program, tableau: Tableau, size: int) -> str:
+class SampledFeedback(NamedTuple):
+    """A controller that acts every `hold` steps; its torques are held until it acts again.
+
+    Attributes:
+        program: outputs are the three torques and the new memory; inputs the references of a
+            sample, which all scenarios share, the state, the memory, the noise, the rest of the
+            drive with the parameters, and the gains.
+        references, memory, noise, gains: how many numbers each are.
+
+    """
+
+    program: Program
+    references: int
+    memory: int
+    noise: int
+    gains: int
+
+
+def batch_source(
+    program: Program,
+    distances: Program,
+    tableau: Tableau,
+    size: int,
+    feedback: SampledFeedback | None = None,
+) -> str:
     """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
+
+    With feedback it takes more: hold, references (samples, numbers), memory (numbers, N), gains
+    (numbers, N), rows (N,) and seed; `gaussian(seed, row, counter)` gives its noise.
 
     Args:
         program: derivative; inputs t, state, drive, of which the last may be parameters.
@@ -29,19 +58,22 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
             first seven, and the parameters.
         tableau: explicit method.
         size: numbers in the state.
+        feedback: gives the first three numbers of the drive; none by default.
 
     """
     drive = len(program.inputs) - 1 - size
+    more = "" if feedback is None else _MORE
     stages = len(tableau.b)
     at = Layout(
         SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
         far=len(distances.outputs), code=1, when=1, error=1,
+        **_feedback_rows(feedback),
     )  # fmt: skip
     outside = at.rows("d", drive)
     given = ["time", *at.rows("s", size), *outside]
     valid = [*at.rows("new", 7), *outside[drive - (len(distances.inputs) - 7) :]]
     lines = [
-        "def batch(h, first, count, begin, end, y, d, code, when, error):",
+        f"def batch(h, first, count, begin, end, y, d, code, when, error{more}):",
         f"    block = vector({at.numbers})",
         "    for b in range(begin, end):",
         f"        lo = b * {SIMD_WIDTH}",
@@ -52,7 +84,9 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
         *(f"            {at.lane('y', j)} = y[{j}, n]" for j in range(size)),
         *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
         *(f"            {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")),
+        *_loaded(feedback, at),
         "        for step in range(first, first + count):",
+        *_sampled(feedback, size, drive, at),
         f"            for stage in range({stages}):",
         *indented(16, _arguments(tableau, size, at)),
         *indented(16, ["time = step * h + NODES[stage] * h"]),
@@ -66,8 +100,76 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
         f"            code[lo + i] = int({at.lane('code')})",
         f"            when[lo + i] = {at.lane('when')}",
         f"            error[lo + i] = {at.lane('error')}",
+        *_stored(feedback, at),
     ]
     return "\n".join(lines) + "\n"
+
+
+_MORE = ", hold, references, memory, gains, rows, seed"
+
+
+def _feedback_rows(feedback: SampledFeedback | None) -> dict[str, int]:
+    """Rows of a block that feedback needs."""
+    if feedback is None:
+        return {}
+    return {
+        "memory": feedback.memory,
+        "noise": feedback.noise,
+        "gains": feedback.gains,
+        "command": 3 + feedback.memory,
+    }
+
+
+def _loaded(feedback: SampledFeedback | None, at: Layout) -> list[str]:
+    if feedback is None:
+        return []
+    kinds = {"memory": feedback.memory, "gains": feedback.gains}
+    lines = [f"{at.lane(name, j)} = {name}[{j}, n]" for name, m in kinds.items() for j in range(m)]
+    head = [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)"]
+    return indented(8, [*head, *indented(4, lines)])
+
+
+def _stored(feedback: SampledFeedback | None, at: Layout) -> list[str]:
+    if feedback is None:
+        return []
+    lines = [f"memory[{j}, lo + i] = {at.lane('memory', j)}" for j in range(feedback.memory)]
+    lines += [f"d[{j}, lo + i] = {at.lane('d', j)}" for j in range(3)]
+    return indented(12, lines)
+
+
+def _sampled(feedback: SampledFeedback | None, size: int, drive: int, at: Layout) -> list[str]:
+    """Evaluate the controller at the beginning of a period."""
+    if feedback is None:
+        return []
+    given = [
+        *(f"references[sample, {j}]" for j in range(feedback.references)),
+        *at.rows("y", size),
+        *at.rows("memory", feedback.memory),
+        *at.rows("noise", feedback.noise),
+        *at.rows("d", drive)[3:],
+        *at.rows("gains", feedback.gains),
+    ]
+    noise = [
+        f"{at.lane('noise', j)} = gaussian(seed, rows[n], {feedback.noise} * sample + {j})"
+        for j in range(feedback.noise)
+    ]
+    if noise:
+        noise = [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indented(4, noise)]
+    held = [at.lane("d", j) for j in range(3)] + at.rows("memory", feedback.memory)
+    accepted = [f"now = {at.lane('code')}"]
+    for j, name in enumerate(held):
+        accepted += [
+            f"old = {name}",
+            f"new = {at.lane('command', j)}",
+            f"{name} = new if now == 0.0 else old",
+        ]
+    lines = [
+        "sample = step // hold",
+        *noise,
+        *evaluated(feedback.program, given, at, "command"),
+        *loop(at, accepted),
+    ]
+    return [*indented(12, ["if step % hold == 0:"]), *indented(16, lines)]
 
 
 def _arguments(tableau: Tableau, size: int, at: Layout) -> list[str]:

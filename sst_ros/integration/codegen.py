@@ -17,7 +17,7 @@ import platform
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -245,6 +245,20 @@ def has_code(
         return False
     cached = path.parent / "__pycache__"
     return all(any(cached.glob(f"{path.stem}.{name}-*.nbi")) for name in functions)
+
+
+def store(files: Mapping[str, bytes]) -> None:
+    """Write files of compiled code, by their names in the cache folder, where they are missing."""
+    folder = cache_folder()
+    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
+    for name, data in files.items():
+        path = folder / name
+        if path.exists():
+            continue
+        with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
+            file.write(data)
+        os.utime(file.name, (0, 0))  # the stamp of `_cached_file`
+        Path(file.name).replace(path)
 
 
 def _for_numba(

@@ -8,7 +8,7 @@ there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
+from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_source import margins
 from sst_ros.integration.ode import ODE
@@ -146,6 +146,11 @@ class ParametricModel:
             return (*joints, energy.kinetic(model, state) + energy.potential(model, state))
 
         return trace(values, (*QUATERNION, *RATE, *self.names))
+
+    @cached_property
+    def output_function(self) -> Callable[..., tuple[Any, ...]]:
+        """The program `outputs` as a function of arrays."""
+        return compiled_for_arrays(self.outputs)
 
     @property
     def names(self) -> tuple[str, ...]:

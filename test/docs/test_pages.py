@@ -24,6 +24,7 @@ LONG = (
     "many",
     "plot",
     "record",
+    "sweep",
 )
 """How-to pages whose commands are those of the tutorial in another order, or that compile."""
 WITH_BLOCKS = [

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study of many runs as one document: checked before anything runs, identified by a digest."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.given import scene_of
+from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.scene.values import plain
+from sst_ros.scene.yaml_document import values_of
+from sst_ros.state import QUANTITIES
+from sst_ros.sweeps.controlled import ControlledRun, control_of
+from sst_ros.sweeps.sampling import LARGEST_HYPERCUBE, SAMPLINGS, Sampler
+from sst_ros.sweeps.variations import Target, Variation, scales_tensor, targets_of, variation
+
+FINAL = (*QUANTITIES, "energy")
+"""Quantities of the final state that `outputs` may name."""
+
+DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
+OUTPUTS = (*FINAL, "extremes")
+MOST_ROWS = 2**53
+CHUNK = 16_384
+"""Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
+
+_KEYS = (
+    "scene", "vary", "table", "n", "seed", "sampling", "duration", "tolerance", "steps", "torque",
+    "control", "outputs", "trajectory", "chunk",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SweepStudy:
+    """Many runs of a scene.
+
+    Args:
+        scene: what is simulated.
+        vary: distribution or values by key of the scene, see `variations`.
+        n: number of runs; by default that of the grid or of the table.
+        seed: of the random numbers, from 0 to 2^64 - 1.
+        sampling: random, sobol or latin_hypercube.
+        table: values by column, in place of distributions.
+        duration: length of a run [s]; by default that of the scene, or of its motion if controlled.
+        tolerance: largest error of the orientation at the end [rad], for the number of steps.
+        steps: number of steps of a run; chosen by the tolerance if not given.
+        torque: None for the scene's own torques if it has some, else zero; three constant torques
+            [N m]; or a SineTorque as a mapping.
+        control: settings of a controller and its channel, see `controlled`.
+        outputs: quantities of the final state, and `extremes` of joints at the ends of the steps.
+        trajectory: {rows: m, samples: k}: k + 1 states of each of the first m runs.
+        chunk: rows of a task and of a file.
+
+    Raises:
+        InputError: a value is not allowed; the message names its key and what is allowed.
+
+    """
+
+    scene: Scene
+    vary: Mapping[str, Any] = field(default_factory=dict)
+    n: int | None = None
+    seed: int = 0
+    sampling: str = "random"
+    table: Mapping[str, Any] | None = None
+    duration: float | None = None
+    tolerance: float = 1e-9
+    steps: int | None = None
+    torque: Any = None
+    control: Mapping[str, Any] | None = None
+    outputs: tuple[str, ...] = DEFAULT_OUTPUTS
+    trajectory: Mapping[str, int] | None = None
+    chunk: int = CHUNK
+
+    def __post_init__(self) -> None:
+        problems = list(self._problems())
+        if problems:
+            raise InputError("sweep", problems)
+        object.__setattr__(self, "outputs", tuple(self.outputs))
+        _ = self.variations, self.rows, self.length, self.controlled
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what was given, not what has been computed from it."""
+        return SweepStudy, tuple(getattr(self, one.name) for one in dataclasses.fields(self))
+
+    @classmethod
+    def read(cls, path: Path) -> SweepStudy:
+        """Read a YAML file; `scene` is a name, a path relative to the file, or a document."""
+        try:
+            values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            allowed = f"must be a readable .yaml file ({error})"
+            raise InputError("sweep", [Problem("STUDY", str(path), allowed)]) from None
+        if not isinstance(values, dict) or not isinstance(values.get("vary", {}), dict):
+            allowed = "must be a mapping with the keys scene and vary"
+            raise InputError(str(path), [Problem("", type(values).__name__, allowed)])
+        return cls.from_values(values, path.parent)
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
+        """Build a study from a mapping."""
+        for key in values:
+            if key not in _KEYS:
+                allowed = (
+                    f"unknown key; allowed are {', '.join(_KEYS)}{suggestion(str(key), _KEYS)}"
+                )
+                raise InputError("sweep", [Problem(str(key), values[key], allowed)])
+        given = dict(values)
+        scene, table = given.pop("scene", None), given.pop("table", None)
+        if isinstance(scene, str) and (folder / scene).is_file():
+            scene = folder / scene
+        if isinstance(table, str):
+            table = _read_table(folder / table)
+        return cls(scene_of(scene), table=table, **given)
+
+    @cached_property
+    def model_scene(self) -> Scene:
+        """The scene with the torques of the study: none of its own where a controller acts."""
+        if self.control is not None:
+            return dataclasses.replace(self.scene, torque=None)
+        if self.torque is None:
+            return self.scene
+        if isinstance(self.torque, SineTorque):
+            return dataclasses.replace(self.scene, torque=self.torque)
+        if isinstance(self.torque, Mapping):
+            return self.scene.with_values({"torque": dict(self.torque)})
+        constant = {
+            "amplitude": list(self.torque),
+            "frequency": [0.0] * 3,
+            "phase": [math.pi / 2] * 3,
+        }
+        return self.scene.with_values({"torque": constant})
+
+    @cached_property
+    def controlled(self) -> ControlledRun | None:
+        """The control loop; None without one."""
+        return None if self.control is None else control_of(self.scene, self.control)
+
+    @cached_property
+    def length(self) -> float:
+        """Length of a run [s]."""
+        duration = self.duration
+        if duration is None and self.controlled is not None:
+            duration = self.controlled.motion.duration
+        duration = duration or self.scene.duration
+        if duration is None:
+            allowed = "must be given [s]: the scene has none"
+            raise InputError("sweep", [Problem("duration", None, allowed)])
+        return duration
+
+    @cached_property
+    def variations(self) -> tuple[Variation, ...]:
+        """What varies, key by key."""
+        found, problems = [], []
+        for key, given in self.vary.items():
+            try:
+                found.append(variation(self.model_scene, key, given, self._targets(key)))
+            except (ValueError, TypeError, OverflowError) as error:
+                problems.append(Problem(f"vary.{key}", given, str(error)))
+        columns = [name for one in found for name in one.columns]
+        for key, names in _keys_of(self.table or {}).items():
+            try:
+                targets = self._targets(key)
+                if key in self.vary or set(names) & set(columns):
+                    raise ValueError("is given in vary, too")
+                factor = scales_tensor(self.scene, key)
+                found.append(_tabulated(key, names, targets, factor))
+            except ValueError as error:
+                problems.append(Problem(f"table.{key}", "given", str(error)))
+        if not found:
+            problems.append(Problem("vary", None, "must name at least one key of the scene"))
+        if problems:
+            raise InputError("sweep", problems)
+        return tuple(found)
+
+    @cached_property
+    def rows(self) -> int:
+        """Number of runs."""
+        grid = math.prod(len(one.numbers) for one in self.variations if one.kind == "grid")
+        lengths = {len(values) for values in (self.table or {}).values()}
+        drawn = any(one.kind in ("uniform", "normal") for one in self.variations)
+        natural = min(lengths) if lengths else grid
+        if len(lengths) > 1 or (lengths and grid > 1):
+            allowed = "must have columns of equal length, and no grid beside it"
+            raise InputError("sweep", [Problem("table", sorted(lengths), allowed)])
+        if self.n is None and drawn and not lengths and grid == 1:
+            raise InputError("sweep", [Problem("n", None, "must be given with distributions")])
+        rows = natural if self.n is None else self.n
+        if (lengths and rows > natural) or (grid > 1 and rows % grid):
+            allowed = f"must be <= {natural}, the rows of the table"
+            allowed = allowed if lengths else f"must be a multiple of {grid}, the size of the grid"
+            raise InputError("sweep", [Problem("n", rows, allowed)])
+        if self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
+            allowed = f"must be <= {LARGEST_HYPERCUBE} with latin_hypercube; use sobol"
+            raise InputError("sweep", [Problem("n", rows, allowed)])
+        return rows
+
+    @cached_property
+    def sampler(self) -> Sampler:
+        """Rows of what varies."""
+        table = {
+            name: np.asarray(values, dtype=float) for name, values in (self.table or {}).items()
+        }
+        return Sampler(self.variations, table, self.rows, self.seed, self.sampling)
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return -(-self.rows // self.chunk)
+
+    def document(self) -> dict[str, Any]:
+        """Return the study as nested dicts and lists; a table as its digest."""
+        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        values["scene"] = values_of(self.scene)
+        if isinstance(self.torque, SineTorque):
+            values["torque"] = values_of(self.torque)
+        if self.table is not None:
+            values["table"] = {key: _digest(np.asarray(x)) for key, x in self.table.items()}
+        document: dict[str, Any] = plain(values)
+        return document
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the document: two studies with the same one have the same rows."""
+        text = json.dumps(self.document(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+    def _targets(self, key: str) -> list[Target]:
+        if key.partition(".")[0] == "control":
+            if self.controlled is None:
+                raise ValueError("acts with control only")
+            return self.controlled.targets(key)
+        if key == "initial.orientation" or key.partition(".")[0] in ("motion", "duration"):
+            raise ValueError("cannot vary")
+        if key.partition(".")[0] == "torque" and self.control is not None:
+            raise ValueError("has no effect: the controller gives the torques")
+        return targets_of(self.model_scene, key)
+
+    def _problems(self) -> Any:
+        checks = {
+            "n": (self.n, 1, MOST_ROWS), "seed": (self.seed, 0, 2**64 - 1),
+            "steps": (self.steps, 1, 10_000_000), "chunk": (self.chunk, 1, 10_000_000),
+        }  # fmt: skip
+        for name, (value, least, most) in checks.items():
+            if value is None and name in ("n", "steps"):
+                continue
+            if type(value) is not int or not least <= value <= most:
+                yield Problem(name, value, f"must be a whole number from {least} to {most}")
+        for name, number in (("duration", self.duration), ("tolerance", self.tolerance)):
+            real = isinstance(number, (int, float)) and math.isfinite(number) and number > 0.0
+            if number is not None and not real:
+                yield Problem(name, number, "must be a finite number > 0")
+        if self.sampling not in SAMPLINGS:
+            yield Problem("sampling", self.sampling, f"must be one of {', '.join(SAMPLINGS)}")
+        for name in self.outputs:
+            if name not in OUTPUTS:
+                yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
+        if self.torque is not None and self.control is not None:
+            yield Problem("torque", "given", "has no effect: the controller gives the torques")
+        constant = not isinstance(self.torque, (Mapping, SineTorque, type(None)))
+        if constant and (np.shape(self.torque) != (3,) or not np.all(np.isfinite(self.torque))):
+            yield Problem("torque", self.torque, "must be three finite numbers [N m] or a mapping")
+        if self.trajectory is not None:
+            good = isinstance(self.trajectory, Mapping) and self.trajectory.keys() == {
+                "rows",
+                "samples",
+            }
+            if not good or not all(
+                type(x) is int and 1 <= x <= 100_000 for x in self.trajectory.values()
+            ):
+                allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
+                yield Problem("trajectory", self.trajectory, allowed)
+
+
+def _keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Columns of a table by key: a trailing index is that of a component."""
+    found: dict[str, list[str]] = {}
+    for name in table:
+        found.setdefault(re.sub(r"(\[\d+\])+$", "", name), []).append(name)
+    return found
+
+
+def _tabulated(key: str, names: list[str], targets: list[Target], factor: bool) -> Variation:
+    shape = () if factor else targets[0].nominal.shape
+    expected = [key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
+    if names != expected:
+        raise ValueError(f"needs the columns {', '.join(expected)}")
+    return Variation(key, "table", np.empty((0, 1)), tuple(names), tuple(targets), factor)
+
+
+def _read_table(path: Path) -> dict[str, Array]:
+    """Read the columns of a CSV or Parquet file."""
+    from sst_ros.extras import require
+
+    pandas = require("pandas")
+    try:
+        frame = pandas.read_parquet(path) if path.suffix == ".parquet" else pandas.read_csv(path)
+        return {str(name): frame[name].to_numpy(dtype=float) for name in frame}
+    except (OSError, ValueError) as error:
+        allowed = f"must be a readable .csv or .parquet file of numbers ({error})"
+        raise InputError("sweep", [Problem("table", str(path), allowed)]) from None
+
+
+def _digest(values: Array) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values, dtype=float).tobytes()).hexdigest()[:24]

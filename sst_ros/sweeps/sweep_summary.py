@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a study shows, as text: how runs ended, which inputs explain it, ranges of the outputs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SHOWN = 8
+NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
+
+
+def summary(table: pd.DataFrame) -> str:
+    """Return a text of the table of a study."""
+    counts = table["reason"].value_counts()
+    steps, length = table.attrs["steps"], table.attrs["duration"]
+    lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
+    lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
+    causes = early_end_correlations(table)
+    if len(causes):
+        lines.append("Rank correlation of inputs with an early end:")
+        lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(SHOWN).items()]
+    lines.append(f"{'output':>16} {'mean':>12} {'std':>12} {'1 %':>12} {'99 %':>12}  unit")
+    for name in output_columns(table):
+        values = table[name].to_numpy()[table["status"].to_numpy() == 0]
+        values = values[np.isfinite(values)]
+        if len(values):
+            low, high = np.quantile(values, [0.01, 0.99])
+            unit = table.attrs["units"].get(name, "")
+            lines.append(
+                f"{name:>16} {values.mean():>12.6g} {values.std():>12.4g} "
+                f"{low:>12.6g} {high:>12.6g}  {unit}"
+            )
+    return "\n".join(lines)
+
+
+def output_columns(table: pd.DataFrame) -> list[str]:
+    """Names of the outputs of a study."""
+    known = (*table.attrs["inputs"], *NOT_OUTPUTS)
+    return [name for name in table.columns if name not in known]
+
+
+def early_end_correlations(table: pd.DataFrame) -> pd.Series:
+    """Spearman's rank correlation of each input with an early end, largest first.
+
+    Empty where all runs ended alike, or no input differs.
+    """
+    early = (table["status"] != 0).astype(float)
+    inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
+    if early.nunique() < 2 or not inputs:
+        return table[[]].sum()
+    ranks = table[inputs].rank()
+    found = ranks.corrwith(early.rank())
+    return found.reindex(found.abs().sort_values(ascending=False).index)

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The schemes of `control.controller` as traced code: a torque for each sample, without branches.
+
+The controller is a function of the sampled state and of a memory: the integral, the queue of
+delayed commands, the last encoder angles, the observed orientation, and sums of tracking errors.
+What the scheme does not use has no operation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.reference import REST
+from sst_ros.control.star_motions import product
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import Expression
+from sst_ros.dynamics.math_functions import atan2, positive, sin, sqrt
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows
+from sst_ros.sweeps.controlled import ControlledRun
+
+NEWTON_STEPS = 5
+"""Of the observer at a sample. They square the error; from one sample to the next it is small."""
+
+_ROUND = 1.5 * 2.0**52
+"""Added and subtracted, it rounds to whole numbers, halves to even."""
+
+REFERENCES = (
+    ("first", 1), ("gamma", 3), ("gamma_dot", 3), ("gamma_ddot", 3), ("feedforward", 3),
+    ("held_feedforward", 3), ("quaternion", 4), ("body_rate", 3), ("body_acceleration", 3),
+)  # fmt: skip
+GAINS = (
+    ("kp", 3), ("kd", 3), ("inertia", 3), ("integral_rate", 1), ("limit", 1), ("plant_limit", 1),
+    ("angle_noise", 1), ("rate_noise", 1),
+)  # fmt: skip
+
+Group = dict[str, tuple[Any, ...]]
+
+
+class TracedController(NamedTuple):
+    """A control loop's controller and channel, as a function of expressions.
+
+    Attributes:
+        loop: settings and motion.
+        limited: whether torques have a limit.
+        memory: names and numbers of what it remembers.
+
+    """
+
+    loop: ControlledRun
+    limited: bool
+    memory: tuple[tuple[str, int], ...]
+
+    @property
+    def observes(self) -> bool:
+        """Whether the scheme needs the orientation at the measured angles."""
+        return self.loop.settings.mode in ("gravity_pd", "computed_torque")
+
+    @property
+    def noisy(self) -> bool:
+        """Whether measurements have noise."""
+        return bool(self.loop.channel.angle_noise or self.loop.channel.rate_noise)
+
+    def __call__(
+        self, model: kernel.Model, state: Sequence[Any], given: Group, memory: Group, gains: Group,
+        noise: Sequence[Any],
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """Return three torques and the new memory.
+
+        Args:
+            model: constants of the plant, for its encoders.
+            state: of the plant.
+            given: the references of the sample, by the names in REFERENCES.
+            memory: by the names in `memory`.
+            gains: by the names in GAINS.
+            noise: six standard normal numbers, or none.
+
+        """
+        joints = kernel.joints(model, tuple(state))
+        true = _three(joints.gamma)
+        gamma, gamma_dot, before = self._measured(
+            true, _three(joints.gamma_dot), memory, gains, noise
+        )
+        error = axpy(1.0, _three(given["gamma"]), -1.0, gamma)
+        rates = axpy(1.0, _three(given["gamma_dot"]), -1.0, gamma_dot)
+        observed = self._observed(gamma, memory)
+        command, limited, integral = self._command(
+            observed, gamma, gamma_dot, error, rates, given, memory, gains
+        )
+        queue = memory.get("queue", ())
+        first = given["first"][0]
+        if queue:  # until the first command arrives it acts already
+            commands = command * (len(queue) // 3)
+            pairs = zip(queue, commands, strict=True)
+            filled = [first * c + (1.0 - first) * q for q, c in pairs]
+            torque, queue = _three(filled[:3]), (*filled[3:], *command)
+        else:
+            torque = command
+        if self.limited:
+            torque = _three(_clamped(tau, gains["plant_limit"][0]) for tau in torque)
+        off = axpy(1.0, _three(given["gamma"]), -1.0, true)
+        new: Group = {
+            "integral": integral,
+            "queue": tuple(queue),
+            "before": before,
+            "observed": observed,
+            "squares": tuple(s + e * e for s, e in zip(memory["squares"], off, strict=True)),
+            "largest": tuple(
+                s + positive(_size(e) - s) for s, e in zip(memory["largest"], off, strict=True)
+            ),
+            "limited": (memory["limited"][0] + limited,),
+        }
+        return (*torque, *(number for name, _ in self.memory for number in new[name]))
+
+    def _measured(
+        self, gamma: Any, gamma_dot: Any, memory: Group, gains: Group, noise: Sequence[Any]
+    ) -> tuple[Any, Any, Any]:
+        """Angles and rates that the controller receives, and counted angles to remember."""
+        channel, before = self.loop.channel, ()
+        if channel.counts:
+            step = 2.0 * math.pi / channel.counts
+            gamma = before = _three(step * ((angle / step + _ROUND) - _ROUND) for angle in gamma)
+            pairs = zip(gamma, memory["before"], strict=True)
+            gamma_dot = _three((x - y) / channel.period for x, y in pairs)
+        if noise:
+            angle, rate = gains["angle_noise"][0], gains["rate_noise"][0]
+            gamma = _three(x + n * angle for x, n in zip(gamma, noise[:3], strict=True))
+            gamma_dot = _three(x + n * rate for x, n in zip(gamma_dot, noise[3:], strict=True))
+        return gamma, gamma_dot, before
+
+    def _observed(self, gamma: Any, memory: Group) -> tuple[Any, ...]:
+        """Quaternion at the measured angles, in the assembly mode of the last one."""
+        if not self.observes:
+            return ()
+        geometry = Geometry.of(self.loop.model)
+        space = ActuatorSpaceMap(geometry)
+        across = np.cross(geometry.w, geometry.v)
+        carriages: list[Any] = []
+        for k, angle in enumerate(gamma):
+            c, s = _cos(angle), sin(angle)
+            pairs = zip(geometry.v[k].tolist(), across[k].tolist(), strict=True)
+            carriages += [c * x + s * y for x, y in pairs]
+        q: tuple[Any, ...] = memory["observed"]
+        for _ in range(NEWTON_STEPS):
+            q = space.newton_step(*q, *carriages)[:4]
+        return q
+
+    def _command(
+        self, q: tuple[Any, ...], gamma: Any, gamma_dot: Any, error: Any, rates: Any, given: Group,
+        memory: Group, gains: Group,
+    ) -> tuple[Any, Any, Any]:  # fmt: skip
+        """Return the limited command, whether it was limited, and the new integral."""
+        settings, mode = self.loop.settings, self.loop.settings.mode
+        feedforward, feedback, summed = ZERO, ZERO, ZERO
+        model = kernel.model_of(self.loop.model)
+        if mode == "gravity_pd":
+            feedforward, _ = kernel.actuator_torque(model, _four(q), REST, REST)
+        elif mode != "pd":
+            feedforward = _three(given["feedforward"])
+        if mode == "computed_torque":
+            total, summed = self._computed(
+                model, q, gamma, gamma_dot, error, rates, given, memory, gains
+            )
+            feedback = axpy(1.0, total, -1.0, feedforward)
+        elif mode != "feedforward":
+            acceleration, summed = self._feedback(error, rates, memory, gains)
+            feedback = _three(m * a for m, a in zip(gains["inertia"], acceleration, strict=True))
+        if settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
+            feedforward = _three(given["held_feedforward"])
+        total = added(feedforward, feedback)
+        torque, limited, free = total, 0.0, 1.0
+        if self.limited:
+            torque = _three(_clamped(tau, gains["limit"][0]) for tau in total)
+            cut = axpy(1.0, total, -1.0, torque)
+            free = 1.0 - _above(dot(cut, error))
+            limited = _above(dot(cut, cut))
+        rate = free * self.loop.channel.period
+        integral = memory.get("integral", ())
+        if integral:
+            integral = tuple(s + rate * x for s, x in zip(integral, summed, strict=True))
+        return torque, limited, integral
+
+    def _computed(
+        self, model: kernel.Model, q: tuple[Any, ...], gamma: Any, gamma_dot: Any, error: Any,
+        rates: Any, given: Group, memory: Group, gains: Group,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Torque of computed_torque, and the error to integrate."""
+        acceleration, summed = self._feedback(error, rates, memory, gains)
+        wanted = added(_three(given["gamma_ddot"]), acceleration)
+        space = ActuatorSpaceMap(Geometry.of(self.loop.model))
+        now = space.star_accelerations(*q, *gamma_dot, *wanted)
+        body_rate, body_acceleration = _three(now[:3]), _three(now[3:])
+        if self.loop.settings.space == "so3":
+            x, y, z, w = q
+            between = product((-x, -y, -z, w), _four(given["quaternion"]))
+            turn = rotation_rows(_four(between))
+            rate, forward = (
+                _three(dot(row, _three(given[name])) for row in turn)
+                for name in ("body_rate", "body_acceleration")
+            )
+            moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
+            summed = _rotation_vector(between)
+            slope = axpy(1.0, rate, -1.0, body_rate)
+            acceleration, summed = self._feedback(summed, slope, memory, gains)
+            body_acceleration = added(moving, acceleration)
+        torque, _ = kernel.actuator_torque(model, _four(q), body_rate, body_acceleration)
+        return torque, summed
+
+    def _feedback(self, error: Any, rates: Any, memory: Group, gains: Group) -> tuple[Any, Any]:
+        """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
+        leaning = error
+        if memory.get("integral"):
+            leaning = axpy(1.0, error, gains["integral_rate"][0], _three(memory["integral"]))
+        proportional = _three(k * e for k, e in zip(gains["kp"], leaning, strict=True))
+        derivative = _three(k * e for k, e in zip(gains["kd"], rates, strict=True))
+        return added(proportional, derivative), error
+
+
+def reference_table(loop: ControlledRun, samples: int) -> Array:
+    """Return the references of samples 0 to `samples`, shape (samples + 1, n)."""
+    inverse, period = InverseDynamics(loop.model), loop.channel.period
+    feeding = loop.settings.mode not in ("pd", "gravity_pd")
+    middle = loop.settings.feedforward_at == "middle"
+    rows = []
+    for k in range(samples + 1):
+        at = loop.motion.at(k * round(period * 1e9) / 1e9)
+        torque = inverse.reference_torque(at) if feeding else REST
+        held = torque
+        if feeding and middle:
+            held = inverse.reference_torque(
+                loop.motion.at(k * round(period * 1e9) / 1e9 + 0.5 * period)
+            )
+        rows.append(
+            (float(k == 0), *at.gamma, *at.gamma_dot, *at.gamma_ddot, *torque, *held,
+             *at.quaternion, *at.body_rate, *at.body_acceleration)
+        )  # fmt: skip
+    return np.array(rows)
+
+
+def grouped(names: Sequence[tuple[str, int]], numbers: Sequence[Any]) -> Group:
+    """Divide numbers into groups of the sizes given."""
+    found, at = {}, 0
+    for name, size in names:
+        found[name] = tuple(numbers[at : at + size])
+        at += size
+    return found
+
+
+def _rotation_vector(q: tuple[Any, ...]) -> Any:
+    """Axis times angle of a rotation of less than half a turn; as `rotation_vector`."""
+    sign = 2.0 * _above(q[3]) - 1.0
+    x, y, z, w = (sign * part for part in q)
+    sine = sqrt(x * x + y * y + z * z + 1e-300)
+    factor = 2.0 * atan2(sine, w) / sine
+    return factor * x, factor * y, factor * z
+
+
+def _clamped(value: Any, limit: Any) -> Any:
+    return value - positive(value - limit) + positive(-limit - value)
+
+
+def _size(value: Any) -> Any:
+    return positive(value) + positive(-value)
+
+
+def _above(value: Any) -> Any:
+    """1 where a number is positive, else 0."""
+    return value.traced("step") if isinstance(value, Expression) else float(value > 0.0)
+
+
+def _cos(angle: Any) -> Any:
+    return angle.traced("cos")
+
+
+def _three(values: Any) -> Any:
+    first, second, third = values
+    return first, second, third
+
+
+def _four(values: Any) -> Any:
+    x, y, z, w = values
+    return x, y, z, w

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What varies in a study: keys of the scene, and the distribution or the values of each.
+
+A distribution is ("uniform", low, high), ("normal", mean, standard deviation[, low, high]), or a
+list of values, which spans a grid with those of other keys; in a YAML file {uniform: [low, high]},
+{normal: [...]}, {grid: [...]}, {linspace: [low, high, count]}. With `relative: true` the numbers
+are factors of the value in the scene. Components of a vector are independent. An inertia as a
+whole ("star.inertia") has one factor, so its principal moments keep their ratios.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.bodies import Inertia
+from sst_ros.scene.schema import Section, Spec, specs
+
+KINDS = ("uniform", "normal", "grid", "linspace")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A number of the scene that a variation sets: its key, value in the scene, specification."""
+
+    key: str
+    nominal: Array
+    spec: Spec
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One key of a study.
+
+    Attributes:
+        key: as given.
+        kind: uniform, normal, or grid.
+        numbers: (low, high), (mean, standard deviation, low, high), or the values of a grid, rows
+            of as many components as the key has.
+        columns: names of the columns of a table of results, one for each component.
+        targets: what it sets; several where one factor scales a tensor, or a key means a list.
+        factor: the column is a factor of the targets' values.
+
+    """
+
+    key: str
+    kind: str
+    numbers: Array
+    columns: tuple[str, ...]
+    targets: tuple[Target, ...]
+    factor: bool
+
+    @property
+    def bounded(self) -> bool:
+        """Whether all values lie between known ends."""
+        return bool(np.all(np.isfinite(self.numbers)))
+
+    def values(self, quantiles: Array) -> Array:
+        """Values, shape (n, components), at quantiles in (0, 1) of the same shape."""
+        if self.kind == "uniform":
+            low, high = self.numbers
+            return np.asarray(low + (high - low) * quantiles)
+        from scipy.special import ndtr, ndtri
+
+        mean, deviation, low, high = self.numbers
+        first, last = ndtr((low - mean) / deviation), ndtr((high - mean) / deviation)
+        return np.asarray(mean + deviation * ndtri(first + (last - first) * quantiles))
+
+    def parameters(self, values: Array) -> dict[str, Array]:
+        """Arrays (n, ...) by key of the scene for values (n, components)."""
+        found = {}
+        for target in self.targets:
+            rows = values * target.nominal.ravel() if self.factor else values
+            found[target.key] = rows.reshape(len(values), *target.nominal.shape)
+        return found
+
+
+def variation(scene: Section, key: str, given: Any, targets: Sequence[Target]) -> Variation:
+    """Read one entry of `vary`.
+
+    Args:
+        scene: for messages about what it has.
+        key: as given.
+        given: distribution or values.
+        targets: what the key names, see `targets_of`.
+
+    Raises:
+        ValueError: it is no distribution, or its numbers are not allowed.
+
+    """
+    kind, numbers, relative = _read(given)
+    factor = scales_tensor(scene, key)
+    if factor and not relative:
+        raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
+    shape = () if factor else targets[0].nominal.shape
+    size = int(np.prod(shape, dtype=int))
+    nominal = np.ones(1) if factor else targets[0].nominal.ravel()
+    if kind == "linspace":
+        low, high, count = numbers
+        kind, numbers = "grid", np.linspace(low, high, int(count))
+    if kind == "grid":
+        rows = np.array(numbers, dtype=float)
+        if rows.shape[1:] != shape or not len(rows) or not np.all(np.isfinite(rows)):
+            raise ValueError(f"must be a list of values of shape {shape}")
+        values = rows.reshape(len(rows), size)
+    else:
+        values = _distribution(kind, numbers, shape).reshape(-1, size)
+    if relative and not factor:
+        if any(not np.array_equal(one.nominal, targets[0].nominal) for one in targets):
+            raise ValueError("its entries differ in the scene: give each by its index")
+        values = values * nominal
+        if kind == "normal":
+            values[1] = np.abs(values[1])
+            values[2:] = np.sort(values[2:], axis=0)
+        if kind == "uniform":
+            values = np.sort(values, axis=0)
+    if kind == "normal" and not np.all(values[1] > 0.0):
+        raise ValueError("the standard deviation must be > 0")
+    _refuse_ends(kind, values, targets, factor)
+    columns = tuple(f"{key}{index}" for index in _indices(shape))
+    return Variation(key, kind, values, columns, tuple(targets), factor)
+
+
+def targets_of(scene: Section, key: str) -> list[Target]:
+    """Return what a key names; a list without an index means all of its entries.
+
+    Raises:
+        ValueError: it names nothing that can vary.
+
+    """
+    return _targets(scene, key.split("."), "")
+
+
+def _targets(section: Section, words: list[str], path: str) -> list[Target]:
+    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
+    name, index = parts.groups() if parts else (words[0], None)
+    known = specs(type(section))
+    if name not in known:
+        raise ValueError("unknown key; allowed are " + ", ".join(known))
+    spec, value, here = known[name], getattr(section, name), f"{path}{name}"
+    if spec.kind == "number" and len(words) == 1 and index is None:
+        if value is None:
+            raise ValueError(f"the scene has no {here}")
+        return [Target(here, np.array(value, dtype=float), spec)]
+    if isinstance(value, Inertia) and len(words) == 1:
+        inside = specs(Inertia)
+        numbers = {part: getattr(value, part) for part in inside}
+        return [
+            Target(f"{here}.{part}", np.array(number), inside[part])
+            for part, number in numbers.items()
+            if number != 0.0
+        ]
+    if spec.kind == "section" and len(words) > 1 and index is None:
+        if value is None:
+            raise ValueError(f"the scene has no {here}")
+        return _targets(value, words[1:], f"{here}.")
+    if spec.kind == "sections" and len(words) > 1:
+        chosen = range(len(value)) if index is None else [int(index)]
+        if not chosen or max(chosen) >= len(value):
+            raise ValueError(f"the scene has {len(value)} {here}")
+        lists = [_targets(value[i], words[1:], f"{here}[{i}].") for i in chosen]
+        return [target for entry in lists for target in entry]
+    raise ValueError("must name a number, as star.mass does, or an inertia, as star.inertia does")
+
+
+def scales_tensor(section: Any, key: str) -> bool:
+    """Whether a key names an inertia as a whole, which one factor scales."""
+    for word in re.findall(r"\w+", key, re.A):
+        if isinstance(section, tuple) and not word.isdigit():
+            section = section[0]
+        if not word.isdigit() and not hasattr(section, word):
+            return False
+        section = section[int(word)] if word.isdigit() else getattr(section, word)
+    return isinstance(section, Inertia)
+
+
+def _read(given: Any) -> tuple[str, Any, bool]:
+    """Kind, numbers, and whether they are relative."""
+    allowed = f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
+    if isinstance(given, Mapping):
+        words = dict(given)
+        relative = words.pop("relative", False)
+        if len(words) != 1 or next(iter(words)) not in KINDS or not isinstance(relative, bool):
+            raise ValueError(allowed)
+        ((kind, numbers),) = words.items()
+        return kind, numbers, relative
+    if isinstance(given, tuple) and given and isinstance(given[0], str):
+        relative = given[-1] == "relative"
+        if given[0] not in KINDS:
+            raise ValueError(allowed)
+        return given[0], given[1 : len(given) - relative], relative
+    if isinstance(given, str) or not np.iterable(given):
+        raise ValueError(allowed)
+    return "grid", given, False
+
+
+def _distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
+    count = len(numbers)
+    if count not in ((2,) if kind == "uniform" else (2, 4)):
+        allowed = "low, high" if kind == "uniform" else "mean, standard deviation[, low, high]"
+        raise ValueError(f"{kind} takes {allowed}")
+    more = [] if count != 2 or kind == "uniform" else [-np.inf, np.inf]
+    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in (*numbers, *more)])
+    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
+        raise ValueError("must be finite numbers")
+    ends = values if kind == "uniform" else values[2:]
+    if not np.all(ends[0] < ends[1]):
+        raise ValueError("the lower end must be less than the upper one")
+    return values
+
+
+def _refuse_ends(kind: str, values: Array, targets: Sequence[Target], factor: bool) -> None:
+    """Refuse values that the specification of a target does not allow."""
+    ends = values[2:] if kind == "normal" else values
+    for target in targets:
+        spec = target.spec
+        numbers = ends * target.nominal.ravel() if factor else ends
+        if kind == "normal":
+            numbers = np.vstack([numbers, values[:1] * (target.nominal.ravel() if factor else 1.0)])
+            numbers = numbers[np.isfinite(numbers)]
+        if not np.all((numbers > spec.above) & (numbers >= spec.least) & (numbers <= spec.most)):
+            raise ValueError(
+                f"{spec.allowed()}; it reaches from {numbers.min()} to {numbers.max()}"
+            )
+
+
+def _indices(shape: tuple[int, ...]) -> list[str]:
+    return ["".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
+
+
+def refused(origin: str, key: str, value: object, allowed: str) -> InputError:
+    """Return the error of one value of a study."""
+    return InputError(origin, [Problem(key, value, allowed)])

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feedback in the compiled loop: at each sample the torque of the Python controller."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sst_ros import load_scene
+from sst_ros.control.controller import MODES, Controller, Measurement
+from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.errors import InputError
+from sst_ros.integration import batch_source, codegen
+from sst_ros.studies.channel import Channel, ChannelState
+from sst_ros.studies.control_loop import ControlLoop, run_loop
+from sst_ros.sweeps import controlled_batch
+from sst_ros.sweeps.counter_noise import gaussian
+from sst_ros.sweeps.prepared import PreparedSweep
+from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep_study import SweepStudy
+
+for module in ("numba", "dask", "pandas", "pyarrow"):
+    pytest.importorskip(module, reason="a sweep needs it")
+
+SCENE = load_scene("reach")
+VARY = {"star.mass": ("uniform", 2.4, 2.8)}
+PERIOD, SAMPLES = 2e-3, 25
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+CASES = [
+    *({"mode": mode} for mode in MODES),
+    {"mode": "computed_torque", "space": "so3", "integral_rate": 3.0},
+    {"mode": "feedforward_pd", "feedforward_at": "middle", "delay": 2, "counts": 4096},
+    {"mode": "pd", "stiffness": (300.0, 200.0, 100.0), "damping": (10.0, 8.0, 5.0),
+     "integral_rate": 2.0, "torque_limit": 4.0, "angle_noise": 1e-4, "rate_noise": 1e-2},
+    {"mode": "computed_torque", "counts": 20_000, "delay": 1, "angle_noise": 1e-5,
+     "feedforward_at": "middle", "torque_limit": 6.0, "integral_rate": 4.0},
+]  # fmt: skip
+CHANNEL = ("delay", "counts", "angle_noise", "rate_noise")
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """The same text without a compiler, in narrow blocks: no half minute for each case."""
+
+    def load(texts, constants, **_):
+        return codegen.load(["import numpy as np", *texts], constants, numba=False)
+
+    for module in (batch_source, controlled_batch):
+        monkeypatch.setattr(module, "SIMD_WIDTH", 4)
+    monkeypatch.setattr(controlled_batch, "codegen", SimpleNamespace(load=load))
+
+
+def name_of(case):
+    return "-".join(map(str, case.values()))
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.parametrize("case", CASES, ids=name_of)
+def test_each_torque_is_that_of_the_python_controller(interpreted, case):
+    check_torques(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=name_of)
+def test_each_compiled_torque_is_that_of_the_python_controller(case):
+    check_torques(case)
+
+
+def check_torques(case):
+    study = SweepStudy(
+        SCENE, VARY, n=3, seed=11, steps=2 * SAMPLES, control={"period": PERIOD, **case},
+        duration=SAMPLES * PERIOD,
+    )  # fmt: skip
+    ready = PreparedSweep(study)
+    torques, compiled = [], ready.controlled.module
+
+    def one_period(*arguments):
+        compiled.batch(*arguments)
+        torques.append(arguments[6][:3].copy())
+
+    ready.controlled.__dict__["module"] = SimpleNamespace(batch=one_period)
+    rows = np.arange(5, 8)
+    scenarios, starts, _ = ready._scenarios(study.sampler.rows(0, 3))
+    start = study.controlled.motion.at(0.0)
+    # Off the reference, for feedback to act.
+    off = np.array([0.01, -0.02, 0.005])
+    starts["initial.gamma"] = np.tile(start.gamma + off, (3, 1))
+    result, _, _ = ready._run(scenarios, starts, rows, 2 * SAMPLES, kept=2)
+    assert result.success.all()
+    channel = {key: case[key] for key in CHANNEL if key in case}
+    settings = ControllerSettings(**{k: v for k, v in case.items() if k not in CHANNEL})
+    joints = Dynamics.of(SCENE).joints
+    for lane in range(3):
+        controller = Controller(SCENE, study.controlled.motion, settings, PERIOD)
+        encoders = ChannelState(
+            Channel(delay=channel.get("delay", 0), counts=channel.get("counts", 0)), PERIOD, 0
+        )
+        noise = channel.get("angle_noise", 0.0), channel.get("rate_noise", 0.0)
+        for k in range(SAMPLES):
+            q, rate = result.kept.quaternion[k, lane], result.kept.body_rate[k, lane]
+            at = joints(*q.tolist(), *rate.tolist())
+            gamma, gamma_dot = encoders.measure(at[0:3], at[9:12])
+            if any(noise):
+                drawn = [gaussian(11, rows[lane : lane + 1], 6 * k + j)[0] for j in range(6)]
+                gamma = tuple(np.add(gamma, noise[0] * np.array(drawn[:3])).tolist())
+                gamma_dot = tuple(np.add(gamma_dot, noise[1] * np.array(drawn[3:])).tolist())
+            command = controller.command(k * PERIOD, Measurement(gamma, gamma_dot))
+            expected = encoders.delayed(command.torque)
+            scale = max(1.0, np.abs(command.feedback).max())
+            np.testing.assert_allclose(torques[k][:, lane], expected, rtol=0, atol=1e-12 * scale)
+
+
+def test_a_closed_loop_tracks_as_that_of_the_simulation():
+    """Whole runs, each integrated by steps of its own."""
+    control = {"mode": "feedforward_pd", "bandwidth": 40.0, "period": 0.01, "delay": 1}
+    study = SweepStudy(SCENE, {"star.mass": [2.6, 2.0]}, control=control, tolerance=1e-10)
+    found = run_study(study, None)
+    for row, mass in enumerate((2.6, 2.0)):
+        loop = ControlLoop(
+            SCENE.with_values({"star.mass": mass}), SCENE, study.controlled.motion,
+            ControllerSettings(mode="feedforward_pd", bandwidth=40.0), 10_000_000,
+            Channel(delay=1),
+        )  # fmt: skip
+        track, limited, failure = run_loop(loop)
+        assert failure == ""
+        rms = np.sqrt(np.mean(track.error**2, axis=0))
+        largest = np.abs(track.error).max(axis=0)
+        for k in range(3):
+            assert found[f"error_rms_{k + 1}"][row] == pytest.approx(rms[k], abs=1e-8)
+            assert found[f"error_max_{k + 1}"][row] == pytest.approx(largest[k], abs=1e-8)
+        assert found["limited_samples"][row] == limited[:-1].sum()
+
+
+@pytest.mark.slow
+def test_gains_vary_by_row():
+    control = {"mode": "pd", "period": 0.01, "bandwidth": 30.0}
+    vary = {"control.bandwidth": [20.0, 40.0], "control.damping_ratio": [0.7, 1.0]}
+    both = run_study(SweepStudy(SCENE, vary, control=control, steps=400, duration=1.0), None)
+    alone = SweepStudy(
+        SCENE, {"star.mass": [2.6]}, steps=400, duration=1.0,
+        control=control | {"bandwidth": 40.0, "damping_ratio": 0.7},
+    )  # fmt: skip
+    expected = run_study(alone, None)
+    assert both["control.bandwidth"].tolist() == [20.0, 20.0, 40.0, 40.0]
+    assert both["error_max_1"][2] == pytest.approx(expected["error_max_1"][0], rel=1e-12)
+    assert both["error_max_1"][0] > 1.5 * both["error_max_1"][2]
+
+
+def test_noise_is_normal_and_depends_on_row_counter_and_seed_alone():
+    rows = np.arange(20_000)
+    drawn = gaussian(3, rows, 5)
+    assert stats.kstest(drawn, "norm").pvalue > 1e-3
+    others = gaussian(3, rows, 6), gaussian(4, rows, 5), gaussian(3, rows + 1, 5)
+    for other in others:
+        assert abs(np.corrcoef(drawn[:-1], other[:-1])[0, 1]) < 0.03
+    assert np.array_equal(others[2][:-1], drawn[1:])
+
+
+REFUSED = [
+    ({"mode": "lqr"}, "mode = 'lqr': must be one of feedforward"),
+    ({"gain": 3.0}, "control.gain = 3.0: unknown key; allowed are mode"),
+    ({"period": 0.3}, "duration = 1.0: must be a whole number of control periods"),
+]
+
+
+@pytest.mark.parametrize(("control", "message"), REFUSED)
+def test_bad_loops_are_refused(control, message):
+    with pytest.raises(InputError, match=message):
+        PreparedSweep(SweepStudy(SCENE, VARY, n=2, control=control, duration=1.0))

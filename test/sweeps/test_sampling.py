@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of a study: row i depends on the seed and on i alone, and has the distribution asked."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sst_ros import InputError, load_scene
+from sst_ros.sweeps.sampling import SAMPLINGS, philox
+from sst_ros.sweeps.sweep_study import SweepStudy
+
+SCENE = load_scene("example2_heavy")
+KEY = "star.inertia.zz"
+
+
+def rows(vary, n=1000, first=0, count=None, **options):
+    study = SweepStudy(SCENE, vary, n=n, **options)
+    return study.sampler.rows(first, count or n)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_row_does_not_depend_on_what_is_drawn_with_it(sampling):
+    vary = {KEY: ("normal", 0.26, 0.01), "torque.amplitude": ("uniform", 1.0, 2.0)}
+    whole = rows(vary, sampling=sampling, seed=5)
+    for first, count in ((0, 1), (17, 300), (999, 1)):
+        part = rows(vary, sampling=sampling, seed=5, first=first, count=count)
+        for key, values in part.items():
+            assert np.array_equal(values, whole[key][first : first + count])
+    other = rows(vary, sampling=sampling, seed=6)
+    assert not np.any(other[KEY] == whole[KEY])
+
+
+def test_the_generator_is_the_published_philox():
+    """The counter is the row: four numbers a value of the counter."""
+    raw = np.random.Generator(np.random.Philox(key=3)).random(40)
+    found = philox(3, 0, 5, 8).ravel()
+    np.testing.assert_allclose(found, raw, atol=2.0**-53)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (("uniform", 0.2, 0.3), stats.uniform(0.2, 0.1)),
+        (("normal", 0.26, 0.01), stats.norm(0.26, 0.01)),
+        (("normal", 0.26, 0.01, 0.255, 0.28), stats.truncnorm(-0.5, 2.0, 0.26, 0.01)),
+        (("uniform", 0.9, 1.1, "relative"), stats.uniform(0.9 * 0.26, 0.2 * 0.26)),
+        ({"normal": [1.0, 0.1], "relative": True}, stats.norm(0.26, 0.026)),
+    ],
+)
+def test_samples_have_their_distribution(given, expected):
+    found = rows({KEY: given}, n=20_000)[KEY][:, 0]
+    assert stats.kstest(found, expected.cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("sampling", ["sobol", "latin_hypercube"])
+def test_designs_fill_each_range_evenly(sampling):
+    """Of 1024 points one lies in each 1024th, which no random sample does."""
+    found = rows({KEY: ("uniform", 0.0001, 1.0001)}, n=1024, sampling=sampling)[KEY]
+    cells = np.floor((found[:, 0] - 0.0001) * 1024).astype(int)
+    assert len(set(cells.clip(0, 1023))) >= 1023
+
+
+def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
+    vary = {KEY: [0.2, 0.3], "initial.gamma": [[0.7] * 3, [0.8] * 3, [0.9] * 3]}
+    study = SweepStudy(SCENE, vary)
+    assert study.rows == 6
+    found = study.sampler.rows(0, 6)
+    assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
+    assert found["initial.gamma"][:, 1].tolist() == [0.7, 0.8, 0.9] * 2
+
+
+def test_one_factor_scales_a_whole_tensor():
+    study = SweepStudy(SCENE, {"actuated_links.inertia": ("uniform", 0.5, 2.0, "relative")}, n=9)
+    (one,) = study.variations
+    factor = study.sampler.rows(0, 9)[one.key]
+    assert one.columns == ("actuated_links.inertia",)
+    found = one.parameters(factor)
+    assert len(found) == 3 * 4
+    inertia = SCENE.actuated_links[1].inertia
+    np.testing.assert_array_equal(found["actuated_links[1].inertia.xz"], inertia.xz * factor[:, 0])
+
+
+REFUSED = [
+    ({"vary": {"star.weight": [1.0]}}, "vary.star.weight = .*: unknown key; allowed are"),
+    ({"vary": {KEY: ("uniform", 0.3, 0.2)}}, "the lower end must be less than the upper one"),
+    ({"vary": {KEY: ("gauss", 0.3, 0.2)}}, "must be a list of values, or one of uniform, normal"),
+    ({"vary": {KEY: ("normal", 0.3, -0.2)}}, "the standard deviation must be > 0"),
+    ({"vary": {KEY: ("uniform", np.nan, 1.0)}}, "must be finite numbers"),
+    ({"vary": {"star.mass": ("uniform", -1.0, 1.0)}}, r">= 0 \[kg\]; it reaches from -1.0 to 1.0"),
+    ({"vary": {"payload.mass": [1.0]}}, "the scene has no payload"),
+    ({"vary": {"star.inertia": ("uniform", 0.8, 1.2)}}, "is a tensor: vary it with relative: true"),
+    ({"vary": {"control.bandwidth": [20.0]}}, "acts with control only"),
+    ({"vary": {}}, "vary = None: must name at least one key"),
+    ({"vary": {KEY: ("uniform", 0.2, 0.3)}, "n": None}, "n = None: must be given"),
+    ({"vary": {KEY: [0.2, 0.3]}, "n": 3}, "n = 3: must be a multiple of 2"),
+    ({"seed": -1}, "seed = -1: must be a whole number from 0"),
+    ({"sampling": "halton"}, "sampling = 'halton': must be one of random, sobol"),
+    ({"outputs": ("speed",)}, "outputs = 'speed': must be of quaternion"),
+    ({"tolerance": 0.0}, "tolerance = 0.0: must be a finite number > 0"),
+    ({"torque": (1.0, 2.0)}, "torque = .*: must be three finite numbers"),
+    ({"trajectory": {"rows": 3}}, "trajectory = .*: must be {rows: m, samples: k}"),
+    ({"steps": 2.5}, "steps = 2.5: must be a whole number"),
+    ({"chunks": 5}, "chunks = 5: unknown key; .*did you mean 'chunk'"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), REFUSED)
+def test_bad_studies_are_refused_by_key(given, message):
+    values = {"scene": SCENE, "vary": {KEY: ("uniform", 0.2, 0.3)}, "n": 4} | given
+    with pytest.raises(InputError, match=f"(?s){message}"):
+        SweepStudy.from_values(values)
