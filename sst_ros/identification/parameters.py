@@ -192,6 +192,28 @@ def _body(name: str, body: Star | Link, scene: Scene) -> Iterator[str]:
         yield from (f"{name}.{part}" for part in (STANDARD if weighty else STANDARD[4:]))
 
 
+def value_of(scene: Scene, name: str) -> float | None:
+    """Return a number of a scene by its key, the first of a list; None where there is none."""
+    try:
+        value = _at(scene, re.findall(r"\w+", name))
+    except (AttributeError, IndexError, TypeError):
+        return None
+    return float(value) if isinstance(value, (int, float)) else None
+
+
+def with_numbers(scene: Scene, names: Sequence[str], numbers: Array) -> Scene:
+    """Return the scene with other numbers by key; a list without index means all its entries.
+
+    Raises:
+        InputError: the numbers make no scene.
+
+    """
+    document = values_of(scene)
+    for name, number in zip(names, numbers.tolist(), strict=True):
+        _set(document, re.findall(r"\w+", name), number)
+    return from_values(Scene, document, scene.name)
+
+
 def _value(scene: Scene, name: str) -> float:
     words = re.findall(r"\w+", name)
     if words[0] == "offset":
@@ -235,14 +257,15 @@ def _set(value: Any, words: Sequence[str], symbol: Any) -> None:
         else:
             value[int(first)] = symbol
         return
+    known = value if isinstance(value, dict) else vars(value)
     if rest:
-        if getattr(value, first) is None:
-            setattr(value, first, _absent(first))
-        _set(getattr(value, first), rest, symbol)
-    elif isinstance(getattr(value, first), list):
-        setattr(value, first, [symbol] * len(getattr(value, first)))
+        if known.get(first) is None:
+            known[first] = _absent(first)
+        _set(known[first], rest, symbol)
+    elif isinstance(known.get(first), list):
+        known[first] = [symbol] * len(known[first])
     else:
-        setattr(value, first, symbol)
+        known[first] = symbol
 
 
 def _absent(name: str) -> SimpleNamespace:

@@ -84,7 +84,7 @@ class Regressor:
         return compiled_for_arrays(self.program)
 
     def _torques(self, *inputs: Any) -> tuple[Any, ...]:
-        present = (_present(symbol) for symbol in inputs[10:])
+        present = (present(symbol) for symbol in inputs[10:])
         opened = with_symbols(
             self.scene, dict(zip(self._traced, present, strict=True)), moments=True
         )
@@ -93,6 +93,6 @@ class Regressor:
         return torque
 
 
-def _present(symbol: Expression) -> VariedNumber:
+def present(symbol: Expression) -> VariedNumber:
     """Return an expression that counts as not zero, so that no term of it is left out."""
     return VariedNumber(symbol.graph, symbol.index)

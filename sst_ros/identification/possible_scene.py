@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene with identified numbers; where its bodies cannot exist, that with the nearest ones."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sst_ros.errors import InputError
+from sst_ros.identification.base_parameters import BaseParameters
+from sst_ros.identification.consistency import consistent_values, scales
+from sst_ros.identification.least_squares import LinearFit
+from sst_ros.identification.parameters import STANDARD, value_of, with_numbers
+from sst_ros.identification.parameters import values as parameter_values
+from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.scene import Scene
+
+
+def possible_scene(
+    scene: Scene, names: Sequence[str], numbers: Array, note: str
+) -> tuple[Scene, Array, tuple[str, ...]]:
+    """Scene with other numbers by key; where its bodies cannot exist, that with the nearest ones.
+
+    Returns:
+        The scene, the values in it, and a warning where they are others.
+
+    Raises:
+        InputError: other numbers than those of inertias make no scene.
+
+    """
+    noted = {re.split(r"[.\[]", name)[0] for name in names}
+    try:
+        return _with_notes(with_numbers(scene, names, numbers), noted, note), numbers, ()
+    except InputError:
+        inertias = [i for i, name in enumerate(names) if ".inertia." in name]
+        if not inertias:
+            raise
+    changed = with_numbers(
+        scene, *_split([i for i in range(len(names)) if i not in inertias], names, numbers)
+    )
+    found = _nearest_inertias(changed, *_split(inertias, names, numbers))
+    adjusted = with_numbers(changed, list(found), np.array(list(found.values())))
+    values = np.array([value_of(adjusted, name) for name in names], dtype=float)
+    warning = "no bodies have the inertias that fit best: the scene has the nearest"
+    return _with_notes(adjusted, noted, note), values, (warning,)
+
+
+def _nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dict[str, float]:
+    """All entries of the inertias that some entries belong to, of bodies that can exist.
+
+    Args:
+        scene: the manipulator.
+        names: entries by key, as "star.inertia.zz".
+        numbers: their values [kg m^2], which are kept where that is possible.
+
+    """
+    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in names)
+    entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
+    given = parameter_values(scene, entries)
+    chosen = tuple(entries.index(name) for name in names)
+    base = BaseParameters(entries, chosen, np.eye(len(entries))[list(chosen)])
+    root = np.diag(1e6 / scales(entries, given)[list(chosen)])
+    covariance = np.asarray(np.linalg.inv(root) ** 2)
+    fit = LinearFit(numbers, covariance, root, np.ones(3), np.zeros((0, 3)), 1.0)
+    values, _ = consistent_values(entries, given, base, fit, 1.0)
+    return dict(zip(entries, values.tolist(), strict=True))
+
+
+def _split(places: list[int], names: Sequence[str], numbers: Array) -> tuple[list[str], Array]:
+    return [names[i] for i in places], numbers[places]
+
+
+def _with_notes(scene: Scene, sections: Iterable[str], note: str) -> Scene:
+    notes = dict(scene.provenance) | dict.fromkeys(sorted(sections), note)
+    return replace(scene, provenance=tuple(notes.items()))
