@@ -203,27 +203,20 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 
 def table(runs: Sequence[Signals]) -> str:
     """Write the differences as text."""
+    from pandas import DataFrame
+
     head = (
         f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
         "the start of each run\n(whole nanoseconds, nothing interpolated):\n"
     )
-    units = ("", "samples", "γ max [rad]", "γ rms [rad]", "γ̇ max [rad/s]", "γ̇ rms [rad/s]",
-             "turn max [rad]")  # fmt: skip
-    rows: list[tuple[str, ...]] = [units]
-    for found in differences(runs):
-        numbers = (
-            "-" if np.isnan(x) else f"{x:.3e}" for x in (*found.gamma, *found.gamma_dot, found.turn)
-        )
-        rows.append((found.name, f"{found.common} of {found.of}", *numbers))
-    widths = [max(_width(row[place]) for row in rows) for place in range(len(units))]
-    text = []
-    for row in rows:
-        first, *others = (" " * (w - _width(cell)) for cell, w in zip(row, widths, strict=True))
-        padded = (pad + cell for pad, cell in zip(others, row[1:], strict=True))
-        text.append("  ".join([row[0] + first, *padded]).rstrip())
-    return "\n".join([head, *text, ""])
-
-
-def _width(text: str) -> int:
-    """Columns that a text takes: the dot above a letter takes none."""
-    return len(text.replace("\u0307", ""))
+    rows = [
+        {
+            "": found.name, "samples": f"{found.common} of {found.of}",
+            "γ max [rad]": found.gamma[0], "γ rms [rad]": found.gamma[1],
+            "rate max [rad/s]": found.gamma_dot[0], "rate rms [rad/s]": found.gamma_dot[1],
+            "turn max [rad]": found.turn,
+        }
+        for found in differences(runs)
+    ]  # fmt: skip
+    text = DataFrame(rows).to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.3e}")
+    return f"{head}\n{text}\n"

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.plot.downsampling import few
 from sst_ros.plot.style import BLUE, GREEN, GREY, VERMILION, legend, lines, span, stack, three
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import NANOSECONDS, Integers
@@ -112,7 +113,7 @@ def applied(run: Signals) -> tuple[Array, Array]:
     """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held."""
     start = run.time_ns("ticks")
     length = run.take("length", table="ticks")[:, 0].astype(np.int64)
-    return held(start, start + length, run.legs("tau", "ticks"))
+    return few(*held(start, start + length, run.legs("tau", "ticks")))
 
 
 def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:

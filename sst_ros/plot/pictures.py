@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from sst_ros.errors import InputError, Problem
 from sst_ros.output_folder import writing
 from sst_ros.plot import energy, joints, paper_figures, sphere
+from sst_ros.plot.downsampling import envelope
 from sst_ros.plot.paper_figures import Solution
 from sst_ros.plot.style import save_figure, styled
 from sst_ros.recording.signals import Signals
@@ -38,8 +39,12 @@ class Picture(NamedTuple):
 
 def solution(run: Signals) -> Solution:
     """Return the recorded motion of the star."""
+    quaternion = run.take("q_x", "q_y", "q_z", "q_w")
     euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-    return Solution("run", run.seconds(), run.take("q_x", "q_y", "q_z", "q_w"), euler)
+    curves = quaternion.T if euler is None else [*quaternion.T, *euler.T]
+    rows = envelope(curves, len(quaternion))
+    shown = None if euler is None else euler[rows]
+    return Solution("run", run.seconds()[rows], quaternion[rows], shown)
 
 
 def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
@@ -77,13 +82,16 @@ PICTURES = {
 
 
 @styled
-def draw(run: Signals, out: Path, only: Sequence[str] = ()) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of a run as PDF and PNG into the folder `out`.
+def draw(
+    run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
+) -> tuple[list[Path], dict[str, str]]:
+    """Write the pictures of a run into the folder `out`.
 
     Args:
         run: the recorded topics.
         out: folder, made if it is not there.
         only: names of PICTURES; none for all that the bag allows.
+        formats: suffixes of the files.
 
     Returns:
         The paths written, and for each picture that could not be drawn what is missing.
@@ -102,7 +110,7 @@ def draw(run: Signals, out: Path, only: Sequence[str] = ()) -> tuple[list[Path],
         scene = run.scene.name if run.scene else None
         stem, title = paper_figures.caption(name, picture.title, scene)
         figure = picture.make(run, run.scene)  # type: ignore[arg-type]
-        paths += save(figure, title, out, stem)
+        paths += save(figure, title, out, stem, formats)
     return paths, missing
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the report of a run: errors over run time, torques, tracking of a reference."""
+"""Figures of the report of a run: errors over run time, tracking of a reference."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.downsampling import few
-from sst_ros.plot.joints import held
 from sst_ros.plot.style import GREY, LINES, SMALLEST_SHOWN, lines, positive, styled, three
-from sst_ros.recording.time_series import Integers
 
 
 class ErrorCurves(NamedTuple):
@@ -27,17 +25,6 @@ class ErrorCurves(NamedTuple):
     gamma_dot: Array
     orientation: Array
     floor: Array
-
-
-@styled
-def draw_torques(start_ns: Integers, end_ns: Integers, torque: Array) -> Figure:
-    """Draw the torques of ticks [N m], shape (n, 3), as they were held."""
-    figure = Figure(figsize=(7.0, 4.2))
-    axes = figure.subplots()
-    lines(axes, *few(*held(start_ns, end_ns, torque)), three("τ"), least_span=0.1)
-    axes.set_xlabel("time t [s]")
-    axes.set_ylabel("torque τ [N m]")
-    return figure
 
 
 @styled

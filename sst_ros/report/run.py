@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sst_ros.output_folder import writing
-from sst_ros.plot import paper_figures
-from sst_ros.plot.downsampling import envelope
-from sst_ros.plot.paper_figures import Solution
-from sst_ros.plot.pictures import PICTURES, save
-from sst_ros.plot.run_figures import draw_errors, draw_torques
-from sst_ros.plot.style import save_figure, styled
+from sst_ros.plot import pictures
+from sst_ros.plot.run_figures import draw_errors
+from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import formulation, page, reference, summary, timing, verdict
 from sst_ros.report.reference import Comparison
 from sst_ros.report.timing import Timing
+
+DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
+"""Pictures of `plot` that a report has, too."""
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
@@ -71,37 +71,23 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     run = recording.read(bag, damaged=damaged)
     with writing(out, "report"):
         measured, integration, ideal, result = evaluate(run)
-        pictures = _pictures(run, integration, ideal, out)
+        drawn = _pictures(run, integration, ideal, out)
         save_figure(page.overview(run, integration, measured, result), out / PAGE)
-        result["pictures"] = [path.name for path in pictures]
+        result["pictures"] = [path.name for path in drawn]
         result["page"] = [PAGE, HTML]
-        page.write(result, out / PAGE, pictures, out / HTML)
+        page.write(result, out / PAGE, drawn, out / HTML)
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(text, encoding="utf-8")
     return result
 
 
-@styled
 def _pictures(
     run: Recording, integration: Comparison, ideal: Comparison | None, out: Path
 ) -> list[Path]:
     """Write the paper's figures of a run, its torques and its errors as PNG files."""
-    scene, ticks = run.scene, run.ticks
-    rows = envelope([*run.quaternion.T, *run.euler.T], len(run.time_ns))
-    motion = [Solution("run", run.seconds[rows], run.quaternion[rows], run.euler[rows])]
     errors = {"(a) integration error, against the same torques": page.error_curves(integration)}
     if ideal is not None:
         errors["(b) sample-and-hold error, against continuous torques"] = page.error_curves(ideal)
-    figures = {
-        "path_of_E": paper_figures.path(scene, motion),
-        "position_of_E": paper_figures.position_of_e(scene, motion),
-        **{name: paper_figures.angle(motion, k) for k, name in enumerate(("theta", "phi", "psi"))},
-        "torques": draw_torques(ticks.start_ns, ticks.end_ns, ticks.torque),
-        "error": draw_errors(run.seconds, errors),
-    }
-    paths = []
-    for name, figure in figures.items():
-        title = PICTURES[name].title if name in PICTURES else "Error against run time"
-        stem, title = paper_figures.caption(name, title, scene.name)
-        paths += save(figure, title, out, stem, ["png"])
-    return paths
+    title = f"Error against run time, {run.scene.name}"
+    paths, _ = pictures.draw(run.signals, out, DRAWN, ["png"])
+    return paths + pictures.save(draw_errors(run.seconds, errors), title, out, "error", ["png"])

@@ -36,9 +36,9 @@ def drawn(run, tmp_path_factory):
     kept, out = {}, tmp_path_factory.mktemp("pictures")
     whole = pictures.save
 
-    def keep(figure, title, folder, stem):
+    def keep(figure, title, folder, stem, formats):
         kept[stem] = figure
-        return whole(figure, title, folder, stem)
+        return whole(figure, title, folder, stem, formats)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pictures, "save", keep)
