@@ -24,7 +24,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +32,34 @@ from numpy.typing import NDArray
 from sst_ros.control.controller_settings import INSTANTS, MODES, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.tracking import TrackingMetrics, evaluate
+from sst_ros.control.tracking import evaluate
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.studies.bandwidth_limits import BandwidthLimit, bandwidth_limit, ideal_plant
 from sst_ros.studies.channel import Channel
 from sst_ros.studies.control_loop import ControlLoop, run_loop
 from sst_ros.studies.hold_order import HoldError, UnheldError, held_error, unheld_error
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
 from sst_ros.studies.parallel import run_jobs
+from sst_ros.studies.results import table
 from sst_ros.studies.sampled_data import slope
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 REST_S = 0.3
 """Time for which a loop goes on after the motion, to see whether it settles [s]."""
 
 OPEN_LOOP = "feedforward"
 """The mode that has no bandwidth."""
+
+COLUMNS = (
+    "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s", "seed",
+    "rms_rad", "largest_rad", "settling_s", "torque_rms_Nm", "torque_largest_Nm",
+    "feedforward_share", "feedback_share", "samples_limited", "failure",
+)  # fmt: skip
+"""Columns of the table of loops; those from rms_rad on are empty for a failure."""
 
 RESTLESS = "does not come to rest"
 """A failure: the loop is unstable, or its measurements are too coarse for its gains."""
@@ -80,31 +92,6 @@ class FeedforwardPlan:
 
 
 @dataclass(frozen=True)
-class LoopResult:
-    """Result of one loop.
-
-    Attributes:
-        error: name of the model error.
-        mode: of control.
-        bandwidth: of the feedback [rad/s]; None where there is none.
-        tracking: how well the motion was tracked; None for a failure.
-        failure: why it failed; empty where it did not.
-
-    """
-
-    error: str
-    mode: str
-    bandwidth: float | None
-    tracking: TrackingMetrics | None
-    failure: str
-
-    @property
-    def rms(self) -> float | None:
-        """Root of the mean square error of all gamma [rad]."""
-        return None if self.tracking is None else float(np.sqrt(np.mean(self.tracking.rms**2)))
-
-
-@dataclass(frozen=True)
 class FeedforwardStudy:
     """Result of a study.
 
@@ -112,7 +99,7 @@ class FeedforwardStudy:
         plan: its grid.
         seconds: length of the motion [s].
         left_out: errors that the plant cannot have.
-        loops: by error, mode and bandwidth.
+        loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
         holds: feedforward alone with an exact model, by instant and period.
         unheld: the same with torques as a function of time.
         limits: of the plant of the theory (`ideal_plant`), and of the plant as it is.
@@ -122,26 +109,28 @@ class FeedforwardStudy:
     plan: FeedforwardPlan
     seconds: float
     left_out: tuple[str, ...]
-    loops: tuple[LoopResult, ...]
+    loops: DataFrame
     holds: tuple[HoldError, ...]
     unheld: UnheldError
     limits: tuple[tuple[BandwidthLimit, BandwidthLimit], ...]
 
-    def of(self, error: str, mode: str, bandwidth: float | None) -> LoopResult:
-        """Return the result of one loop, a failure where it was not tried."""
-        key = (error, mode, None if mode == OPEN_LOOP else bandwidth)
-        tried = (loop for loop in self.loops if (loop.error, loop.mode, loop.bandwidth) == key)
-        return next(tried, LoopResult(*key, None, "not tried"))
+    def rms(self, error: str, mode: str, bandwidth: float) -> float | None:
+        """Root of the mean square error of all gamma [rad]; None where the loop failed."""
+        rows = self.loops[(self.loops.error == error) & (self.loops["mode"] == mode)]
+        if mode != OPEN_LOOP:
+            rows = rows[rows.bandwidth_rad_per_s == bandwidth]
+        known = rows.rms_rad.dropna()
+        return None if known.empty else float(known.iloc[0])
 
     def benefit(self, error: str, bandwidth: float) -> float | None:
         """RMS(pd) / RMS(feedforward_pd) at equal gains; None where one of them failed."""
-        pd, both = (self.of(error, mode, bandwidth).rms for mode in ("pd", "feedforward_pd"))
+        pd, both = (self.rms(error, mode, bandwidth) for mode in ("pd", "feedforward_pd"))
         return None if pd is None or not both else pd / both
 
     def least_benefit(self, error: str, bandwidth: float) -> float | None:
         """Return the bound of linear theory on the benefit where bodies weigh SHARE too much."""
-        pd = self.of(error, "pd", bandwidth).rms
-        exact = self.of("nominal", "feedforward_pd", bandwidth).rms
+        pd = self.rms(error, "pd", bandwidth)
+        exact = self.rms("nominal", "feedforward_pd", bandwidth)
         return None if not pd or exact is None else 1.0 / (SHARE + exact / pd)
 
     def orders(self) -> dict[str, float]:
@@ -169,29 +158,29 @@ def feedforward_study(
     basic = ControllerSettings(damping_ratio=plan.damping_ratio)
     plants = (ideal_plant(scene), scene)
     # What takes longest comes first, so that no core waits for another at the end.
-    limits: list[Callable[[], Any]] = [
+    jobs: list[Callable[[], Any]] = [
         partial(_limit, plant, basic, plan.period_ns, delay)
         for delay in plan.delays for plant in plants
     ]  # fmt: skip
-    loops = list(_loops(plan, basic, errors))
-    holds = [
+    ends = [len(jobs)]
+    jobs += _loops(plan, basic, errors)
+    ends.append(len(jobs))
+    jobs += [
         partial(_held, scene, dataclasses.replace(basic, feedforward_at=at), plan.period_ns * n)
         for at in INSTANTS for n in plan.multiples
     ]  # fmt: skip
-    jobs: list[Callable[[], Any]] = [*limits, *loops, partial(_unheld, scene), *holds]
-    progress = f"{scene.name:<16}" if shown else ""
-    found = run_jobs(_call, jobs, progress, workers)
-    bounds, found = found[: len(limits)], found[len(limits) :]
-    results, found = found[: len(loops)], found[len(loops) :]
+    jobs.append(partial(_unheld, scene))
+    found = run_jobs(_call, jobs, f"{scene.name:<16}" if shown else "", workers)
+    bounds, loops, holds = found[: ends[0]], found[ends[0] : ends[1]], found[ends[1] : -1]
     return FeedforwardStudy(
-        plan, motion.duration, left_out, tuple(results), tuple(found[1:]), found[0],
+        plan, motion.duration, left_out, table(loops, COLUMNS), tuple(holds), found[-1],
         tuple(zip(bounds[::2], bounds[1::2], strict=True)),
     )  # fmt: skip
 
 
 def _loops(
     plan: FeedforwardPlan, basic: ControllerSettings, errors: Sequence[ModelError]
-) -> Iterator[Callable[[], LoopResult]]:
+) -> Iterator[Callable[[], dict[str, Any]]]:
     for error in errors:
         model = error.model(plan.scene)
         for mode in MODES:
@@ -199,30 +188,46 @@ def _loops(
                 settings = dataclasses.replace(basic, mode=mode)
                 if bandwidth is not None:
                     settings = dataclasses.replace(settings, bandwidth=bandwidth)
+                named = {
+                    "scene": plan.scene.name, "error": error.name, "mode": mode,
+                    "bandwidth_rad_per_s": bandwidth, "damping_ratio": plan.damping_ratio,
+                    "period_s": plan.period_ns / NANOSECONDS, "seed": plan.seed,
+                }  # fmt: skip
                 yield partial(
-                    _tracked, error.name, bandwidth, plan.scene, model, settings, plan.period_ns,
-                    error.channel, plan.seed,
-                )  # fmt: skip
+                    _tracked, named, plan.scene, model, settings, plan.period_ns, error.channel
+                )
 
 
 def _tracked(
-    error: str,
-    bandwidth: float | None,
+    named: dict[str, Any],
     plant: Scene,
     model: Scene,
     settings: ControllerSettings,
     period_ns: int,
     channel: Channel,
-    seed: int,
-) -> LoopResult:
-    motion = _motion(plant)
+) -> dict[str, Any]:
+    """Run a loop: its row of the table."""
+    motion, seed = _motion(plant), named["seed"]
     loop = ControlLoop(plant, model, motion, settings, period_ns, channel, seed, rest_s=REST_S)
     track, limited, failure = run_loop(loop)
-    found = None if failure else evaluate(track, int(limited.sum()))
-    if found is not None and settings.mode != OPEN_LOOP:
+    if failure:
+        return named | {"failure": failure}
+    found = evaluate(track, int(limited.sum()))
+    if settings.mode != OPEN_LOOP:
         late = track.time >= motion.duration + 0.5 * REST_S
         failure = _restless(track.error[late], limited[late], found.band)
-    return LoopResult(error, settings.mode, bandwidth, None if failure else found, failure)
+        if failure:
+            return named | {"failure": failure}
+    power = found.torque_rms**2
+    shares = [
+        float(np.nansum(share * power) / power.sum()) if power.any() else None
+        for share in (found.feedforward, found.feedback)
+    ]
+    numbers = (
+        float(np.sqrt(np.mean(found.rms**2))), float(found.largest.max()), found.settling,
+        float(np.sqrt(power.mean())), float(found.torque_largest.max()), *shares, found.limited, "",
+    )  # fmt: skip
+    return named | dict(zip(COLUMNS[len(named) :], numbers, strict=True))
 
 
 def _restless(error: Array, limited: NDArray[np.bool_], band: float) -> str:

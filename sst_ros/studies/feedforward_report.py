@@ -16,22 +16,15 @@ from sst_ros.studies.feedforward import (
     OPEN_LOOP,
     FeedforwardPlan,
     FeedforwardStudy,
-    LoopResult,
     feedforward_study,
 )
 from sst_ros.studies.model_errors import SHARE
-from sst_ros.studies.results import markdown, provenance, table, write
+from sst_ros.studies.results import markdown, provenance, records, table, write
 from sst_ros.studies.sampled_data import ORDERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-COLUMNS = (
-    "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s", "seed",
-    "rms_rad", "largest_rad", "settling_s", "torque_rms_Nm", "torque_largest_Nm",
-    "feedforward_share", "feedback_share", "samples_limited", "failure",
-)  # fmt: skip
 
 INTRODUCTION = """\
 # How good feedforward is
@@ -60,54 +53,35 @@ def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> F
     """
     study = feedforward_study(plan, workers=workers, shown=True)
     print(text(study), flush=True)
-    write(out, "feedforward", csv=frame(study), document=document(study), page=page(study),
+    write(out, "feedforward", csv=study.loops, document=document(study), page=page(study),
           figures={"feedforward": figure(study)})  # fmt: skip
     return study
 
 
-def frame(study: FeedforwardStudy) -> DataFrame:
-    """Return a row for each loop, columns as in COLUMNS."""
-    return table(_rows(study), COLUMNS)
-
-
-def _rows(study: FeedforwardStudy) -> Iterator[dict[str, Any]]:
-    plan = study.plan
-    for loop in study.loops:
-        found = loop.tracking
-        numbers: list[Any] = [None] * 8
-        if found is not None:
-            power = found.torque_rms**2
-            shares = [
-                float(np.nansum(share * power) / power.sum()) if power.any() else None
-                for share in (found.feedforward, found.feedback)
-            ]
-            numbers = [loop.rms, float(found.largest.max()), found.settling,
-                       float(np.sqrt(power.mean())), float(found.torque_largest.max()), *shares,
-                       found.limited]  # fmt: skip
-        values = (plan.scene.name, loop.error, loop.mode, loop.bandwidth, plan.damping_ratio,
-                  plan.period_ns / 1e9, plan.seed, *numbers, loop.failure)  # fmt: skip
-        yield dict(zip(COLUMNS, values, strict=True))
-
-
 def rms_table(study: FeedforwardStudy) -> DataFrame:
     """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
-    footnote = {id(loop): f"[{n}]" for n, loop in enumerate(failed(study), start=1)}
+    footnotes = {
+        (row.error, row.mode, None if row.mode == OPEN_LOOP else row.bandwidth_rad_per_s): number
+        for number, row in enumerate(failed(study).itertuples(), start=1)
+    }
     rows = []
-    for error in dict.fromkeys(loop.error for loop in study.loops):
+    for error in study.loops.error.unique():
         for bandwidth in study.plan.bandwidths:
             row = {"error": error, "rad/s": f"{bandwidth:g}"}
             for mode in MODES:
-                loop = study.of(error, mode, bandwidth)
+                rms = study.rms(error, mode, bandwidth)
                 again = mode == OPEN_LOOP and bandwidth != study.plan.bandwidths[0]
-                row[mode] = "" if again else footnote.get(id(loop)) or f"{loop.rms:.1e}"
+                key = (error, mode, None if mode == OPEN_LOOP else bandwidth)
+                found = f"[{footnotes[key]}]" if rms is None else f"{rms:.1e}"
+                row[mode] = "" if again else found
             benefit = study.benefit(error, bandwidth)
             rows.append({**row, "pd / feedforward_pd": f"{benefit:.3g}" if benefit else "-"})
     return table(rows)
 
 
-def failed(study: FeedforwardStudy) -> list[LoopResult]:
+def failed(study: FeedforwardStudy) -> DataFrame:
     """Return the loops that failed, in the order of their footnotes."""
-    return [loop for loop in study.loops if loop.failure]
+    return study.loops[study.loops.failure != ""]
 
 
 def title(study: FeedforwardStudy) -> str:
@@ -151,9 +125,9 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
 
 def notes(study: FeedforwardStudy) -> Iterator[str]:
     """Yield what failed and what was left out, line by line."""
-    for number, loop in enumerate(failed(study), start=1):
-        at = "" if loop.bandwidth is None else f" at {loop.bandwidth:g} rad/s"
-        yield f"[{number}] {loop.error}, {loop.mode}{at}: {loop.failure}"
+    for number, row in enumerate(failed(study).itertuples(), start=1):
+        at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
+        yield f"[{number}] {row.error}, {row.mode}{at}: {row.failure}"
     for name in study.left_out:
         yield f"Left out: {name}, which this scene cannot have."
 
@@ -185,7 +159,7 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
         "scene": study.plan.scene.name,
         "motion_s": study.seconds,
         "left_out": list(study.left_out),
-        "loops": list(_rows(study)),
+        "loops": records(study.loops),
         "holds": [
             {"at": at, "order": None if np.isnan(order) else order, "order_of_theory": ORDERS[at],
              "errors": [asdict(hold) for hold in study.holds if hold.at == at]}
@@ -199,8 +173,8 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
 def figure(study: FeedforwardStudy) -> Figure:
     """Draw the study."""
     reasons: dict[str, int] = {}
-    for loop in failed(study):
-        first, _, last = loop.failure.partition(": ")
+    for failure in failed(study).failure:
+        first, _, last = failure.partition(": ")
         reason = last if "stopped at" in first else first
         reasons[reason] = reasons.get(reason, 0) + 1
     lines = [provenance()]
@@ -210,7 +184,7 @@ def figure(study: FeedforwardStudy) -> Figure:
     limits = table({"delay": ideal.delay, "theory": ideal.theory, "ideal": ideal.simulated,
                     "real": real.simulated} for ideal, real in study.limits)  # fmt: skip
     return draw_feedforward(
-        frame(study),
+        study.loops,
         table(asdict(hold) for hold in study.holds),
         limits,
         bandwidths=study.plan.bandwidths,

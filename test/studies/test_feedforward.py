@@ -20,8 +20,8 @@ from sst_ros.studies import bandwidth_limits
 from sst_ros.studies.bandwidth_limits import bandwidth_limit, ideal_plant, stable
 from sst_ros.studies.channel import Channel
 from sst_ros.studies.control_loop import ControlLoop, run_loop
-from sst_ros.studies.feedforward import RESTLESS, FeedforwardPlan, feedforward_study
-from sst_ros.studies.feedforward_report import COLUMNS, document, figure, frame, page, text
+from sst_ros.studies.feedforward import COLUMNS, RESTLESS, FeedforwardPlan, feedforward_study
+from sst_ros.studies.feedforward_report import document, figure, page, text
 from sst_ros.studies.model_errors import SHARE, model_errors
 from sst_ros.studies.results import write
 from sst_ros.studies.sampled_data import ORDERS, stability_limit
@@ -134,24 +134,23 @@ def test_the_same_bits_on_any_number_of_workers():
         SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2), delays=(),
     )  # fmt: skip
     first, second = (feedforward_study(plan, workers=n) for n in (1, 2))
-    assert frame(first).to_csv() == frame(second).to_csv()
+    assert first.loops.to_csv() == second.loops.to_csv()
     assert first.holds == second.holds and first.unheld == second.unheld
     other = feedforward_study(dataclasses.replace(plan, seed=9), workers=1)
-    assert frame(first).drop(columns="seed").to_csv() != frame(other).drop(columns="seed").to_csv()
+    assert first.loops.drop(columns="seed").to_csv() != other.loops.drop(columns="seed").to_csv()
 
 
 def test_failures_stay_with_their_reason(small):
-    failed = [loop for loop in small.loops if loop.failure]
-    assert {(o.error, o.bandwidth) for o in failed} == {("delay 5", 180.0)}
-    assert {o.mode for o in failed} == set(MODES) - {"feedforward"}
-    assert all(RESTLESS in o.failure or "stopped" in o.failure for o in failed)
+    failed = small.loops[small.loops.failure != ""]
+    assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {180.0}
+    assert set(failed["mode"]) == set(MODES) - {"feedforward"} and len(failed) == 4
+    assert failed.failure.str.contains(f"{RESTLESS}|stopped").all()
     said = text(small)
-    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed[-1].failure}" in said
-    assert (frame(small).failure != "").sum() == 4
+    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}" in said
 
 
 def test_what_it_writes_can_be_read(small, tmp_path):
-    write(tmp_path, "feedforward", csv=frame(small), document=document(small), page=page(small),
+    write(tmp_path, "feedforward", csv=small.loops, document=document(small), page=page(small),
           figures={"picture": figure(small)})  # fmt: skip
     rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
     assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
