@@ -25,8 +25,8 @@ parameter, no topic. Units are SI and angles radians; keys in degrees end in `_d
 paper's: {B} is fixed in the base, {E} in the star, {1k} = [r, w x r, w] in actuated link k and
 {2k} = [r, t x r, t] in intermediate link k.
 
-    sst-ros scene list           # the scenes that come with sst_ros
-    sst-ros scene show example2  # what a scene is made of and what it costs
+    sst-ros scene list           # the shipped scenes
+    sst-ros scene show example2  # contents, cost of a step, advice on the method
     sst-ros scene check my.yaml  # every fault, with its line
     sst-ros scene schema > scene.schema.json   # for editors
 

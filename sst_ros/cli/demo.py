@@ -14,7 +14,9 @@ from sst_ros.output_folder import require_free
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    demo = commands.add_parser("demo", help="run the paper's examples, or a motion, by the nodes")
+    demo = commands.add_parser(
+        "demo", help="run the paper's examples or a reference motion by the nodes"
+    )
     demo.add_argument(
         "kind",
         nargs="?",

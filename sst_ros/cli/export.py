@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`export`: a recorded run as CSV or Parquet."""
+"""`export`: write a recorded run as CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sst_ros.output_folder import require_free, results_folder
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    export = commands.add_parser("export", help="a recorded run as CSV or Parquet")
+    export = commands.add_parser("export", help="write a recorded run as CSV or Parquet")
     export.add_argument("bag", type=Path, metavar="BAG", help="folder of the bag")
     export.add_argument(
         "--format", choices=("csv", "parquet"), default="csv", help="default: csv", dest="form"

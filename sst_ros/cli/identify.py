@@ -17,7 +17,7 @@ def add(commands: Commands) -> None:
     """Add the command to the command line."""
     identify = commands.add_parser(
         "identify",
-        help="inertias, friction and more from a recorded run; motions that show them",
+        help="identify inertias, friction and more from a recorded run; design excitation motions",
         description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
         "what the motion determines, with standard deviations, and the nearest scene whose bodies "
         "can exist. `identify design SCENE` makes a motion that determines the parameters well, "

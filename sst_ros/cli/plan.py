@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`plan`: what a desired motion asks of the actuators."""
+"""`plan`: check a reference motion: torques, limits, shortest duration."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from sst_ros.output_folder import require_free
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    kinds = group(commands.add_parser("plan", help="what a desired motion asks of the actuators"))
+    kinds = group(
+        commands.add_parser(
+            "plan", help="check a reference motion: torques, limits, shortest duration"
+        )
+    )
     check = kinds.add_parser(
-        "check", help="can the actuators do it, and how fast; exit status 0 if they can"
+        "check",
+        help="check feasibility and the shortest duration; exit status 0 if feasible",
     )
     add_scene(check, "scene", metavar="SCENE", help="scene with a motion: name, or .yaml file")
     check.add_argument("--json", action="store_true", help="print JSON instead of a table")

@@ -12,14 +12,14 @@ from sst_ros.output_folder import require_free, results_folder
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    plot = commands.add_parser("plot", help="pictures of recorded runs, as PDF and PNG")
+    plot = commands.add_parser("plot", help="draw recorded runs, as PDF and PNG")
     plot.add_argument("bags", type=Path, nargs="*", metavar="BAG", help="folder of the bag")
     add_out(plot, "folder of the pictures", "BAG_plots, beside the first bag")
     plot.add_argument("--only", nargs="+", default=[], metavar="NAME", help="draw only these")
     plot.add_argument("--list", action="store_true", help="list the pictures, and draw none")
     plot.add_argument(
         "--compare", nargs="+", type=Path, default=[], metavar="BAG",
-        help="draw runs over each other, and print their differences from the first",
+        help="overlay runs and print their differences from the first",
     )  # fmt: skip
     plot.set_defaults(run=_plot, parser=plot)
 

@@ -11,7 +11,9 @@ from sst_ros.cli.parsing import Commands
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    recovery = commands.add_parser("recover", help="make a whole recording of a cut or damaged one")
+    recovery = commands.add_parser(
+        "recover", help="write a valid recording from a truncated or damaged one"
+    )
     recovery.add_argument("bag", type=Path, help="folder of the bag")
     recovery.add_argument("--out", type=Path, help="folder of the new bag; default: beside the old")
     recovery.set_defaults(run=_recover)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`report`: evaluate a recorded run, or the methods."""
+"""`report`: evaluate a recorded run or the integration methods."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ from sst_ros.output_folder import require_free, results_folder
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    kinds = group(commands.add_parser("report", help="evaluate a recorded run, or the methods"))
+    kinds = group(
+        commands.add_parser("report", help="evaluate a recorded run or the integration methods")
+    )
     run = kinds.add_parser("run", help="evaluate a recorded run")
     run.add_argument("bag", type=Path, help="folder of the bag")
     add_out(run, "folder of the results", "BAG_report, beside the bag")
     run.add_argument("--verbose", action="store_true", help="print all figures")
     run.add_argument(
-        "--damaged", action="store_true", help="evaluate what is intact of a damaged recording"
+        "--damaged", action="store_true", help="evaluate the intact part of a damaged recording"
     )
     run.set_defaults(run=_run)
-    accuracy = kinds.add_parser("accuracy", help="error against cost of every method and step")
+    accuracy = kinds.add_parser(
+        "accuracy", help="work-precision diagrams: error against cost of every method and step"
+    )
     add_scene(
         accuracy, "--scene", nargs="+", metavar="S",
         help="names, or paths of .yaml files; default: all",

@@ -13,15 +13,15 @@ from sst_ros.errors import SstError
 
 def add(commands: Commands) -> None:
     """Add the command to the command line."""
-    kinds = group(commands.add_parser("scene", help="look at scenes"))
-    kinds.add_parser("list", help="the scenes that come with sst_ros").set_defaults(run=_list)
-    show = kinds.add_parser("show", help="what a scene is made of and what it costs")
+    kinds = group(commands.add_parser("scene", help="list, show and check scenes"))
+    kinds.add_parser("list", help="list the shipped scenes").set_defaults(run=_list)
+    show = kinds.add_parser("show", help="show contents, cost of a step and advice on the method")
     add_scene(show, "scene", metavar="SCENE")
     show.set_defaults(run=_show)
-    check = kinds.add_parser("check", help="report every fault of scene files")
+    check = kinds.add_parser("check", help="check scene files and report all faults")
     check.add_argument("files", nargs="+", type=Path, metavar="FILE")
     check.set_defaults(run=_check)
-    kinds.add_parser("schema", help="JSON schema for editors").set_defaults(run=_schema)
+    kinds.add_parser("schema", help="print the JSON schema, for editors").set_defaults(run=_schema)
 
 
 def _list(_: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ def add(commands: Commands) -> None:
     kinds = group(commands.add_parser("study", help="robustness of controllers to model errors"))
     feedforward = kinds.add_parser(
         "feedforward",
-        help="every mode of control against every error of its model",
+        help="compare all control schemes under all model errors",
         description="Every mode of control against every error of its model, delay, encoders and "
         "noise; the order of the hold; the largest stable bandwidth. On all cores; the same bits "
         "on any number of them.",
