@@ -84,9 +84,9 @@ class Regressor:
         return compiled_for_arrays(self.program)
 
     def _torques(self, *inputs: Any) -> tuple[Any, ...]:
-        present = (present(symbol) for symbol in inputs[10:])
+        varied = [present(symbol) for symbol in inputs[10:]]
         opened = with_symbols(
-            self.scene, dict(zip(self._traced, present, strict=True)), moments=True
+            self.scene, dict(zip(self._traced, varied, strict=True)), moments=True
         )
         model = kernel.model_of(opened, self._geometry)
         torque, _ = kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])
