@@ -85,7 +85,7 @@ class Sensitivities:
             InputError: the motion cannot be integrated with these values.
 
         """
-        # Inertias on the way to a fit need not be those of bodies that can exist.
+        # Inertias between iterations of a fit need not be those of bodies that can exist.
         outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
         names = [self.names[i] for i in outer]
         scene = parameters.with_numbers(self.scene, names, values[outer])
