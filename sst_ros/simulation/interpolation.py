@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""States of a trajectory between its samples: integrated from the sample before."""
+"""States of a trajectory between its samples: propagated from the sample before."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.applied_torque import StateFeedback
-from sst_ros.scene.scene import Scene
+from sst_ros.integration.adaptive_stepper import EvaluationBudget
+from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.methods import DOP853
+from sst_ros.integration.propagator import Propagator
 from sst_ros.simulation.sampled_motion import Array, SampledMotion
-from sst_ros.simulation.torque import ConstantTorque, FeedbackFunction, TorqueProfile
+from sst_ros.simulation.torque import ConstantTorque, TorqueProfile
 
 _ACCURACY = 1e-13
 """Error of a step; gaps between samples are short, so that steps do not add up."""
@@ -23,7 +22,8 @@ def integrated(trajectory: SampledMotion, times: Array) -> Array:
         states = trajectory.dense(times)
         if states.shape[1] > 7 or not isinstance(trajectory.law, TorqueProfile):
             return states
-        limit = _torque_limit(trajectory.scene)
+        actuators = trajectory.scene.actuators
+        limit = (actuators.torque_limit if actuators else None) or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
     samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
     before = np.searchsorted(trajectory.t, times, side="right") - 1
@@ -36,73 +36,45 @@ def integrated(trajectory: SampledMotion, times: Array) -> Array:
     return found
 
 
-def _torque_limit(scene: Scene) -> float:
-    limit = scene.actuators.torque_limit if scene.actuators else None
-    return np.inf if limit is None else limit
-
-
 class _Gap:
-    """Integrates from a sample towards the next one."""
+    """Propagates from a sample towards the next one."""
 
     def __init__(self, trajectory: SampledMotion) -> None:
-        scene = trajectory.scene
-        self._dynamics = Dynamics.of(scene)
+        self._propagator = Propagator(
+            trajectory.scene, DOP853.name, _ACCURACY,
+            compiled=False, budget=EvaluationBudget(), limits=False,
+        )  # fmt: skip
         self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
-        self._limit = _torque_limit(scene)
-        self._more = (0.0,) * (len(self._dynamics.drive) - 3)
 
     def states(self, k: int, sample: Array, times: Array) -> Array:
         """States at ascending times between sample k and the next, shape (m, 10)."""
-        from scipy.integrate import solve_ivp
-
-        size = len(self._dynamics.state)
-        t, y, found = float(self._t[k]), sample[:size], []
+        propagator, dynamics = self._propagator, self._propagator.dynamics
+        moment = (0.0,) * (len(dynamics.drive) - 3)
+        at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
+        found = []
         for end, torque in self._pieces(k, t, float(times[-1])):
-            here = times[(times > t) & (times <= end)]
-            slope = self._slope(torque)
-            solved = solve_ivp(
-                slope, (t, end), y, "DOP853", rtol=_ACCURACY, atol=_ACCURACY,
-                t_eval=np.unique([*here, end]), first_step=min(end - t, 1e-2),
-            )  # fmt: skip
-            states = solved.y.T
-            states[:, :4] /= np.linalg.norm(states[:, :4], axis=1)[:, None]
-            acting = states[:, 7:10]
-            if size == 7:
-                acting = np.array([torque(s, x) for s, x in zip(solved.t, states, strict=True)])
-            rows = np.searchsorted(solved.t, here)
-            found.append(np.hstack([states[:, :7], acting])[rows])
-            t, y = end, solved.y[:, -1]
-        return np.vstack(found)
+            for time in (*times[(times > t) & (times < end)].tolist(), end):
+                if time > t:
+                    at, _ = propagator.advance(at, t, time - t, 1, torque, moment)
+                    t = time
+                    lagged = at.y[7:10] if len(dynamics.state) > 7 else None
+                    acting = lagged or propagator.torque_at(torque, t, at.y)
+                    found.append((t, *at.y[:7], *acting))
+        states = np.array(found)
+        return np.asarray(states[np.searchsorted(states[:, 0], times), 1:])
 
-    def _pieces(
-        self, k: int, begin: float, end: float
-    ) -> list[tuple[float, Callable[[float, Array], Array]]]:
-        """List the ends of the pieces with a smooth torque, and the clamped torque there."""
+    def _pieces(self, k: int, begin: float, end: float) -> list[tuple[float, Torque]]:
+        """List the ends of the pieces with a smooth torque, and the torque there."""
         law = self._law
         if law is None:
-            held = self._torque[k + 1]
-            return [(end, lambda t, y: held)]
+            first, second, third = self._torque[k + 1].tolist()
+            return [(end, (first, second, third))]
         if not isinstance(law, TorqueProfile):
-            return [(end, self._feedback(law))]
+            return [(end, StateFeedback(law, self._propagator.dynamics))]
         breaks = law.breaks()
         ends = [*breaks[(breaks > begin) & (breaks < end)].tolist(), end]
+        pieces = (law.between(*span) for span in zip([begin, *ends], ends, strict=False))
         return [
-            (stop, self._limited(law.between(start, stop)))
-            for start, stop in zip([begin, *ends], ends, strict=False)
+            (stop, piece.torque if isinstance(piece, ConstantTorque) else piece)
+            for stop, piece in zip(ends, pieces, strict=True)
         ]
-
-    def _limited(self, torque: Callable[[float], Sequence[float]]) -> Callable[..., Array]:
-        if isinstance(torque, ConstantTorque):
-            constant = np.clip(torque.torque, -self._limit, self._limit)
-            return lambda t, y: constant
-        return lambda t, y: np.clip(torque(t), -self._limit, self._limit)
-
-    def _feedback(self, function: FeedbackFunction) -> Callable[[float, Array], Array]:
-        torque = StateFeedback(function, self._dynamics)
-        return lambda t, y: np.clip(torque(t, y.tolist()), -self._limit, self._limit)
-
-    def _slope(self, torque: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
-        def slope(t: float, y: Array) -> Array:
-            return np.array(self._dynamics.derivative(*y.tolist(), *torque(t, y), *self._more))
-
-        return slope
