@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from sst_ros.scene.scene import load as load_scene
     from sst_ros.simulation.simulate import simulate
     from sst_ros.simulation.simulation import Simulation
-    from sst_ros.simulation.torque import PolynomialTorque, TorqueTable
+    from sst_ros.simulation.torque import TorqueTable
+    from sst_ros.simulation.torque_profile import PolynomialTorque
     from sst_ros.simulation.trajectory import Trajectory
     from sst_ros.state import State
     from sst_ros.sweeps.sweep import sweep
@@ -92,7 +93,7 @@ _MODULES = {
     "Identification": "identification.identification",
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
-    "PolynomialTorque": "simulation.torque",
+    "PolynomialTorque": "simulation.torque_profile",
     "Recording": "recording.recording",
     "ReferenceMotion": "control.reference",
     "RunStopped": "errors",

@@ -7,15 +7,11 @@ leaves nothing behind in a traced program (`trace`).
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross, dot
-from sst_ros.scene.scene import Friction, Link, Scene, Stroke
+from sst_ros.mechanism.vec3 import Scalar, Triple, cross, dot
+from sst_ros.scene.scene import Friction
 
 
 class JointSpring(NamedTuple):
@@ -74,61 +70,6 @@ class LegMotion(NamedTuple):
     gamma_dot: Scalar
     a_dot: Scalar
     beta_dot: Scalar
-
-
-def of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
-    """Collect the loads of leg k; None where it has none."""
-    joints, springs = scene.friction, scene.springs
-    friction = (joints.gamma, joints.mu, joints.beta) if joints else (None, None, None)
-    by_joint = tuple(
-        _joined([s for s in springs if s.joint == f"{kind}_{k + 1}"])
-        for kind in ("gamma", "mu", "beta")
-    )
-    drive = link = ZERO
-    if scene.gravity is not None:
-        drive, link = _moment(scene.actuated_links[k]), _moment(scene.intermediate_links[k])
-    stops = None
-    if scene.stroke.stiffness is not None:
-        damping = damping_of(scene.stroke)
-        stops = CompliantStops(float(geometry.arc[k]), scene.stroke.stiffness, damping)
-    heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
-    if not (any(friction) or any(by_joint) or heavy or stops):
-        return None
-    return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)
-
-
-def damping_of(stroke: Stroke) -> float:
-    """Damping of compliant stops [s/rad], as given or from the restitution at the impact rate.
-
-    For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v into the
-    stop to e v out of it, with d = c v,
-
-        d (1 + e) = ln((1 + d) / (1 - d e)),
-
-    whatever m and k (Gonthier, McPhee, Lange & Piedboeuf, Multibody Syst. Dyn. 11 (2004) 209-233;
-    the force is that of Hunt & Crossley, J. Appl. Mech. 42 (1975) 440-445). With s = d (1 + e) it
-    reads L(s/2) = (1 - e) / (1 + e), where L(x) = coth x - 1/x is Langevin's function.
-    """
-    if stroke.restitution is None or stroke.impact_rate is None:
-        return stroke.damping
-    e = stroke.restitution
-    return 2.0 * _inverse_langevin((1.0 - e) / (1.0 + e)) / ((1.0 + e) * stroke.impact_rate)
-
-
-def _inverse_langevin(y: float) -> float:
-    """Solve coth x - 1/x = y for x >= 0, 0 <= y < 1."""
-    if y < 0.05:  # coth x - 1/x would cancel; the next term of the series is 2.1 y^13
-        coefficients = (3.0, 9 / 5, 297 / 175, 1539 / 875, 126117 / 67375, 43733439 / 21896875)
-        return sum(c * y ** (2 * i + 1) for i, c in enumerate(coefficients))
-    low, high = 3.0 * y, 1.0 / (1.0 - y) + 3.0 * y
-    while True:  # at most some sixty bisections
-        x = 0.5 * (low + high)
-        if not low < x < high:
-            return x
-        if 1.0 / math.tanh(x) - 1.0 / x < y:
-            low = x
-        else:
-            high = x
 
 
 def joint_torques(
@@ -248,15 +189,3 @@ def _push(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
 def _combined(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
     first, second, third = (c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))
     return (first, second, third)
-
-
-def _joined(springs: list[Any]) -> JointSpring | None:
-    stiffness = sum(spring.stiffness for spring in springs)
-    if not springs:
-        return None
-    return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
-
-
-def _moment(link: Link) -> Triple:
-    x, y, z = link.centre
-    return (link.mass * x, link.mass * y, link.mass * z)

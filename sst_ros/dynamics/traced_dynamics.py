@@ -75,11 +75,6 @@ class Dynamics:
         return trace(self._joints, (*QUATERNION, *RATE))
 
     @cached_property
-    def acceleration(self) -> Function:
-        """W_dot without external moment, of the first seven numbers and torques that act now."""
-        return compiled(trace(self._acceleration, (*QUATERNION, *RATE, *TORQUE)))
-
-    @cached_property
     def inverse(self) -> Function:
         """Torques that give a W_dot, det g and sin^2(mu_k), 7 numbers: `kernel.actuator_torque`.
 
@@ -103,10 +98,6 @@ class Dynamics:
 
     def _joints(self, *state: Any) -> tuple[Any, ...]:
         return tuple(number for triple in kernel.joints(self.model, state) for number in triple)
-
-    def _acceleration(self, *inputs: Any) -> tuple[Any, ...]:
-        q, rate, torque = inputs[:4], inputs[4:7], inputs[7:]
-        return kernel.body_acceleration(self.model, q, rate, torque)
 
     def _inverse(self, *inputs: Any) -> tuple[Any, ...]:
         q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:] or None

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import ConstantTorque, TorqueTable
+from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import ConstantTorque
 from sst_ros.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:

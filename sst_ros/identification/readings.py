@@ -20,7 +20,8 @@ from sst_ros.identification.measured_motion import Measured, measured_motion
 from sst_ros.mechanism.geometry import Array
 from sst_ros.mechanism.vec3 import ZERO, rotation_rows
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import PolynomialTorque, SineProfile, TorqueProfile, TorqueTable
+from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import PolynomialTorque, SineProfile, TorqueProfile
 
 GAMMA = ("gamma_1", "gamma_2", "gamma_3")
 OBSERVABLES = (*GAMMA, "theta", "phi", "psi", "x", "y", "z")

@@ -21,16 +21,17 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.dynamics import kernel, loads
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compiled
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.regressor import present
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import TorqueProfile
+from sst_ros.simulation.torque_profile import TorqueProfile
 
 TOLERANCE = 1e-12
 """Relative and absolute, of a step; the latter over the size of a parameter for its column."""
@@ -93,7 +94,7 @@ class Sensitivities:
         chain = np.ones(len(values))
         if RESTITUTION in self.names:
             chain[self.names.index(RESTITUTION)] = damping_slope(scene)
-            inner[self._inner.index(self.names.index(RESTITUTION))] = loads.damping_of(scene.stroke)
+            inner[self._inner.index(self.names.index(RESTITUTION))] = damping_of(scene.stroke)
         state, slopes = self._start(scene)
         size, count = len(self._state), len(values)
         scale = np.abs(values) + (values == 0.0)
@@ -185,11 +186,11 @@ def damping_slope(scene: Scene) -> float:
     """Return the derivative of the damping of compliant stops by the restitution [s/rad].
 
     From s = d (1 + e), L(s/2) = (1 - e) / (1 + e) with Langevin's function L, see
-    `loads.damping_of`: ds/de = -4 / ((1 + e)^2 L'(s/2)), L'(x) = 1/x^2 - 1/sinh(x)^2.
+    `damping_of`: ds/de = -4 / ((1 + e)^2 L'(s/2)), L'(x) = 1/x^2 - 1/sinh(x)^2.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None
-    d = loads.damping_of(scene.stroke) * v
+    d = damping_of(scene.stroke) * v
     x = 0.5 * d * (1.0 + e)
     if x < 0.05:  # the difference would cancel
         slope = 1.0 / 3.0 - x * x / 15.0 + 2.0 * x**4 / 189.0 - x**6 / 675.0

@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from sst_ros.dynamics.traced_dynamics import Function, compiled
+from sst_ros.dynamics.traced_dynamics import Function
 from sst_ros.integration import coarse_solution
 from sst_ros.integration.compiled_method import (
     CompiledMethod,
@@ -19,16 +16,16 @@ from sst_ros.integration.compiled_method import (
     StepPoint,
     Vector,
 )
+from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
 from sst_ros.integration.ode import ODE
+from sst_ros.integration.step_control import GROW, better_method, step_factor
 
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
-_SAFETY, _SHRINK, _GROW = 0.9, 0.2, 5.0
 _LOOK_EVERY = 16
 _LOOK_AFTER_REJECTIONS = 3
-_STIFF, _EASY = 2.0, 0.5
 
 
 class AcceptedStep(NamedTuple):
@@ -39,39 +36,6 @@ class AcceptedStep(NamedTuple):
     y: list[float]
     z: list[float]
     order: int
-
-
-class CannotStep(ArithmeticError):
-    """No step is small enough to resolve the motion."""
-
-
-class BudgetSpent(CannotStep):
-    """The evaluations that a period may take are used up."""
-
-
-class EvaluationBudget:
-    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run."""
-
-    def __init__(self, per_period: int | None = None) -> None:
-        self.per_period = per_period
-        self.spent = 0
-        self._end: float = float("inf")
-
-    def begin(self) -> None:
-        """Begin a period."""
-        if self.per_period is not None:
-            self._end = self.spent + self.per_period
-
-    def charge(self, evaluations: int) -> None:
-        """Count evaluations before they are made.
-
-        Raises:
-            BudgetSpent: the period has none left.
-
-        """
-        if self.spent + evaluations > self._end:
-            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the step")
-        self.spent += evaluations
 
 
 class MethodChange(NamedTuple):
@@ -152,7 +116,7 @@ class AdaptiveStepper:
             loaded.step_many(h, 1, self.tolerance, at, d)
         if self._auto:
             with contextlib.suppress(ArithmeticError, ValueError):  # no finite Jacobian here
-                np.linalg.eigvals(self._jacobian(0.0, at[0], d))
+                self._ode.eigenvalues(0.0, at[0], d)
 
     def checkpoint(self) -> StepperCheckpoint:
         """Return what the next steps depend on, to go back to."""
@@ -183,7 +147,7 @@ class AdaptiveStepper:
             order = self.method.order
             self.budget.charge(self.pair_cost)
             new_y, new_z, size = self._current.step_pair(t, h, y, z, d)
-            factor = self._factor(size / self.tolerance)
+            factor = self._factor(size)
             if size > self.tolerance:
                 self._h = h * min(factor, 1.0)
                 if self._h < 1e-15 * max(abs(t), end - t) or self._h < 1e-200:
@@ -221,9 +185,9 @@ class AdaptiveStepper:
             at = (at[0], coarse_solution.rescaled(at[0], at[1], order, self.method.order), at[2])
         done, end = self._current.step_many(h, count, self.tolerance, at, d)
         self.budget.spent += done * self.pair_cost
-        if self._h < _GROW * h:
+        if self._h < GROW * h:
             for size in self._current.sizes[:done]:
-                self._h = max(self._h, h * self._factor(float(size) / self.tolerance))
+                self._h = max(self._h, h * self._factor(float(size)))
         if implicit:
             self._since_look += done
         return done, end
@@ -251,12 +215,7 @@ class AdaptiveStepper:
         return new_y, new_z, self.method.order
 
     def _factor(self, size: float) -> float:
-        if size == 0.0:
-            return _GROW
-        if not size < float("inf"):
-            return _SHRINK
-        power = 1.0 / (self.method.error_order + 1)
-        return float(min(max(_SAFETY * size**-power, _SHRINK), _GROW))
+        return step_factor(size / self.tolerance, self.method.error_order)
 
     def _look(self, t: float, h: float, y: Vector, d: Vector, rejected: int = 0) -> None:
         """Ask the spectrum whether another method would take longer steps.
@@ -272,39 +231,17 @@ class AdaptiveStepper:
             return
         if not early:
             self._since_look = 0
+        self.budget.charge(JACOBIAN_COST)
         try:
-            eigenvalues = self.spectrum(t, y, d)
+            eigenvalues = self._ode.eigenvalues(t, y, d)
         except (ArithmeticError, ValueError):
             return  # no finite Jacobian here; the step size has to do
-        reach = h * np.abs(eigenvalues).max()
-        decay = h * -eigenvalues.real.min()
-        implicit = isinstance(self.method, Rosenbrock)
-        if not implicit and decay > _STIFF and decay > 0.5 * reach:
-            self._change(t, RODAS4, f"stiff: step times fastest decay is {decay:.2g}")
-        elif early:
-            return
-        elif implicit and reach < _EASY:
-            self._change(t, DORMAND_PRINCE, f"no longer stiff: step times rate is {reach:.2g}")
-        elif self.method is DORMAND_PRINCE and self.tolerance < 1e-7 and decay <= _STIFF:
-            self._change(t, DOP853, "many small steps that accuracy asks for")
-
-    def _change(self, t: float, method: Method, reason: str) -> None:
-        self._current = self._method_of(method)
-        self.history.append(MethodChange(self.origin + t, method.name, reason))
-
-    def spectrum(self, t: float, y: Vector, d: Vector) -> np.ndarray:
-        """Eigenvalues of the exact Jacobian [1/s]."""
-        self.budget.charge(JACOBIAN_COST)
-        return np.asarray(np.linalg.eigvals(self._jacobian(t, y, d)))
-
-    def _jacobian(self, t: float, y: Vector, d: Vector) -> np.ndarray:
-        size = len(self._ode.state)
-        flat = np.array(self._linearised(t, *y, *d)[2 * size :])
-        return np.asarray(flat.reshape(size, size).T)
-
-    @cached_property
-    def _linearised(self) -> Function:
-        return compiled(self._ode.jacobian)
+        method, reason = better_method(
+            self.method, self.tolerance, h * eigenvalues, only_stiff=early
+        )
+        if method is not self.method:
+            self._current = self._method_of(method)
+            self.history.append(MethodChange(self.origin + t, method.name, reason))
 
     def _method_of(self, method: Method) -> CompiledMethod:
         if method.name not in self._methods:

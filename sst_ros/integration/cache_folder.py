@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import grp
 import os
+import pickletools
 import pwd
 import shutil
 import stat
@@ -19,6 +20,7 @@ import tempfile
 import warnings
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 
 def cache_folder() -> Path:
@@ -64,6 +66,42 @@ def objection(folder: Path) -> str | None:
 def is_safe_file(path: Path) -> bool:
     """Return whether a file belongs to the user or root, and no other user can write it."""
     return _objection(path, above=False) is None
+
+
+def warn_if_not_kept(function: Any) -> None:
+    """Have a compiled function warn, and run, where numba cannot write it to its cache."""
+    cache = getattr(function, "_cache", None)  # numba has no public name for it
+    save = getattr(cache, "save_overload", None)
+    if cache is None or save is None:
+        return
+
+    def save_or_warn(signature: Any, result: Any) -> None:
+        try:
+            save(signature, result)
+        except OSError as error:
+            warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)
+            cache.disable()
+
+    cache.save_overload = save_or_warn
+
+
+def drop_damaged(path: Path) -> None:
+    """Remove what numba has cached for a module if any of it is cut off or of another user."""
+    cached = list((path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"))
+    if not all(map(is_safe_file, cached)):
+        for file in cached:
+            file.unlink(missing_ok=True)
+        return
+    try:
+        for file in cached:
+            with file.open("rb") as stream:
+                # An index is two pickles. Read, not run: they need modules that are not there yet.
+                for _ in range(2 if file.suffix == ".nbi" else 1):
+                    for _ in pickletools.genops(stream):
+                        pass
+    except Exception:  # what is damaged may raise anything
+        for file in cached:
+            file.unlink(missing_ok=True)
 
 
 def _objection(path: Path, *, above: bool) -> str | None:

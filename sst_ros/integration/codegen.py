@@ -12,12 +12,10 @@ import hashlib
 import importlib.util
 import inspect
 import os
-import pickletools
 import platform
 import sys
 import tempfile
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -25,7 +23,12 @@ from typing import Any
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration import step_loops
-from sst_ros.integration.cache_folder import cache_folder, is_safe_file
+from sst_ros.integration.cache_folder import (
+    cache_folder,
+    drop_damaged,
+    is_safe_file,
+    warn_if_not_kept,
+)
 from sst_ros.integration.methods import Rosenbrock, Tableau
 from sst_ros.integration.runge_kutta_source import explicit_step
 
@@ -171,7 +174,7 @@ def _imported(path: Path) -> ModuleType:
     known = sys.modules.get(path.stem)
     if known is not None and known.__file__ == str(path):
         return known
-    _drop_damaged(path)
+    drop_damaged(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -179,44 +182,8 @@ def _imported(path: Path) -> ModuleType:
     sys.modules[path.stem] = module
     spec.loader.exec_module(module)
     for function in vars(module).values():
-        _bear_a_full_disk(function)
+        warn_if_not_kept(function)
     return module
-
-
-def _bear_a_full_disk(function: Any) -> None:
-    """Have a compiled function run although numba cannot write it to its cache."""
-    cache = getattr(function, "_cache", None)  # numba has no public name for it
-    save = getattr(cache, "save_overload", None)
-    if cache is None or save is None:
-        return
-
-    def save_or_warn(signature: Any, result: Any) -> None:
-        try:
-            save(signature, result)
-        except OSError as error:
-            warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)
-            cache.disable()
-
-    cache.save_overload = save_or_warn
-
-
-def _drop_damaged(path: Path) -> None:
-    """Remove what numba has cached for a module if any of it is cut off or of another user."""
-    cached = list((path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"))
-    if not all(map(is_safe_file, cached)):
-        for file in cached:
-            file.unlink(missing_ok=True)
-        return
-    try:
-        for file in cached:
-            with file.open("rb") as stream:
-                # An index is two pickles. Read, not run: they need modules that are not there yet.
-                for _ in range(2 if file.suffix == ".nbi" else 1):
-                    for _ in pickletools.genops(stream):
-                        pass
-    except Exception:  # what is damaged may raise anything
-        for file in cached:
-            file.unlink(missing_ok=True)
 
 
 def _executed(text: str, name: str) -> ModuleType:
@@ -295,6 +262,3 @@ def _cached_file(text: str) -> Path | None:
             return path
     except OSError:
         return None
-
-
-Loop = Callable[..., Any]

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any
+
+import numpy as np
 
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Program, trace, with_jacobian
 from sst_ros.dynamics.math_functions import positive, sin
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import Dynamics, Function, compiled
+from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import SineTorque
 
 
@@ -57,6 +61,21 @@ class ODE:
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
         return with_jacobian(self.derivative, self._inputs, ("t", *self.state))
+
+    def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
+        """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
+
+        Raises:
+            ArithmeticError, ValueError: it is not finite.
+
+        """
+        size = len(self.state)
+        flat = np.array(self._linearised(t, *y, *d)[2 * size :])
+        return np.asarray(np.linalg.eigvals(flat.reshape(size, size).T))
+
+    @cached_property
+    def _linearised(self) -> Function:
+        return compiled(self.jacobian)
 
     @property
     def joints(self) -> Program:

@@ -14,12 +14,12 @@ from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
     AdaptiveStepper,
-    EvaluationBudget,
     MethodChange,
     StepperCheckpoint,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
 from sst_ros.integration.coarse_solution import ErrorGrowth, Point, coulomb_joints
+from sst_ros.integration.evaluation_budget import EvaluationBudget
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,

@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_ros.dynamics.kernel import Model, model_of
 from sst_ros.dynamics.limits import limits_of
-from sst_ros.dynamics.loads import damping_of
+from sst_ros.dynamics.model import damping_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.scene.schema import Section

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_ros.integration.adaptive_stepper import EvaluationBudget
 from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.evaluation_budget import EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import Propagator
 from sst_ros.simulation.sampled_motion import Array, SampledMotion
-from sst_ros.simulation.torque import ConstantTorque, TorqueProfile
+from sst_ros.simulation.torque_profile import ConstantTorque, TorqueProfile
 
 _ACCURACY = 1e-13
 """Error of a step; gaps between samples are short, so that steps do not add up."""

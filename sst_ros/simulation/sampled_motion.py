@@ -16,7 +16,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import frames, kinematics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile
+from sst_ros.simulation.torque_profile import FeedbackFunction, TorqueProfile
 
 Array = NDArray[np.float64]
 Law: TypeAlias = TorqueProfile | FeedbackFunction
@@ -24,32 +24,7 @@ T = TypeVar("T", bound="SampledMotion")
 
 
 class SampledMotion:
-    """A motion over n instants. Arrays are shared between calls: treat them as read-only.
-
-    Args:
-        scene: what moves.
-        t: times [s], shape (n,), strictly ascending.
-        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
-        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
-        torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`.
-        joints: angles and rates of the joints where they are known already, shape (n, 18): gamma,
-            mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
-        status: 0 where the motion reached its end, 1 where a limit ended it, -1 where no step
-            resolved it.
-        message: the same in words.
-        method: the integrator, and why it was chosen.
-        error_estimate: estimated error of the orientation at the end [rad], nan if unknown.
-        energy_residual: energy at the end, less that at the start, less the work done [J]; a
-            number, or a function that computes it when it is asked for.
-        evaluations: how often the derivative was evaluated.
-        law: torques that act between the samples, for `at`; by default each is held over the
-            interval that ends at its sample.
-        dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
-
-    Raises:
-        InputError: shapes do not fit, or times do not ascend.
-
-    """
+    """Base of `Trajectory`, which has its arguments: the arrays, and what follows from them."""
 
     def __init__(
         self,

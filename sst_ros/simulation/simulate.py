@@ -19,14 +19,14 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
 from sst_ros.simulation.simulate_steps import stepped
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
-from sst_ros.simulation.torque import (
+from sst_ros.simulation.torque import profile_of
+from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     FeedbackFunction,
     FunctionTorque,
     SineProfile,
     TorqueFunction,
     TorqueProfile,
-    profile_of,
 )
 from sst_ros.simulation.trajectory import Array, Trajectory
 

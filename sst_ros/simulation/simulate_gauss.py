@@ -14,7 +14,7 @@ from sst_ros.integration.gauss_motion import GaussMotion, NotSmooth
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.simulation.torque import ConstantTorque, SineProfile
+from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamped
 

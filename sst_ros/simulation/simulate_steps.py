@@ -15,7 +15,8 @@ from sst_ros.integration.methods import RK4
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.simulation.torque import FeedbackFunction, TorqueProfile, TorqueTable, three
+from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import FeedbackFunction, TorqueProfile, three
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, State, Vector3, clamped
 

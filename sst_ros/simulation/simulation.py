@@ -13,15 +13,11 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.virtual_work_derivative import VirtualWorkDerivative
 from sst_ros.errors import Diverged, InputError, Problem, StepBudgetExceeded
-from sst_ros.integration.adaptive_stepper import (
-    BudgetSpent,
-    CannotStep,
-    EvaluationBudget,
-    MethodChange,
-)
+from sst_ros.integration.adaptive_stepper import MethodChange
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.coarse_solution import Point
 from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.evaluation_budget import BudgetSpent, CannotStep, EvaluationBudget
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix

@@ -1,94 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques over time: constant, sine, table of held values, polynomial pieces, functions."""
+"""Torques as a user gives them: tables in files, numbers, profiles and functions."""
 
 from __future__ import annotations
 
 import csv
 import inspect
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.loads import SineTorque
-from sst_ros.state import State, Vector3, finite_vector
-
-Array = NDArray[np.float64]
-TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
-FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
-
-
-class TorqueProfile:
-    """Base of the torques that are known as a function of time alone."""
-
-    def values(self, t: Array) -> Array:
-        """Torques [N m] at times [s], shape (n,) -> (n, 3)."""
-        raise NotImplementedError
-
-    def breaks(self) -> Array:
-        """Return the times [s] at which the torques or their derivatives jump, ascending."""
-        return np.empty(0)
-
-    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
-        """Torques [N m] on [begin, end], between which no break lies; ends belong to it."""
-        return self
-
-    def record(self) -> dict[str, Any] | None:
-        """Numbers from which `profile_from` builds the same profile; None for a function."""
-        raise NotImplementedError
-
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        first, second, third = self.values(np.array([t]))[0].tolist()
-        return first, second, third
-
-
-@dataclass(frozen=True)
-class ConstantTorque(TorqueProfile):
-    """The same three torques [N m] at all times."""
-
-    torque: Vector3
-
-    def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
-        return np.tile(self.torque, (len(t), 1))
-
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        return self.torque
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "constant", "torque": self.torque}
-
-
-@dataclass(frozen=True)
-class SineProfile(TorqueProfile):
-    """tau_k(t) = amplitude_k sin(frequency_k t + phase_k), from the section of a scene."""
-
-    sine: SineTorque
-
-    def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
-        parts = (np.array(part) for part in self._parts())
-        amplitude, frequency, phase = parts
-        return np.asarray(amplitude * np.sin(np.multiply.outer(t, frequency) + phase))
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        amplitude, frequency, phase = self._parts()
-        return {"kind": "sine", "amplitude": amplitude, "frequency": frequency, "phase": phase}
-
-    def _parts(self) -> tuple[Vector3, Vector3, Vector3]:
-        return self.sine.amplitude, self.sine.frequency, self.sine.phase
-
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s], by the sine of the C library."""
-        return self.sine.at(t)
+from sst_ros.simulation.torque_profile import (
+    Array,
+    ConstantTorque,
+    FeedbackFunction,
+    FunctionTorque,
+    PolynomialTorque,
+    SineProfile,
+    TorqueProfile,
+    three,
+)
 
 
 class TorqueTable(TorqueProfile):
@@ -145,87 +80,6 @@ class TorqueTable(TorqueProfile):
         return {"kind": "table", "times": self.times.tolist(), "torques": self.torques.tolist()}
 
 
-class PolynomialTorque(TorqueProfile):
-    """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`; zero outside of them.
-
-    Args:
-        coefficients: highest power first, shape (order + 1, pieces, 3).
-        breakpoints: beginnings of the pieces and the end of the last [s], shape (pieces + 1,).
-
-    Raises:
-        InputError: shapes, order or numbers are not allowed.
-
-    """
-
-    def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
-        self.c, self.x = np.array(coefficients, dtype=float), np.array(breakpoints, dtype=float)
-        if self.x.ndim != 1 or len(self.x) < 2 or np.any(np.diff(self.x) <= 0.0):
-            allowed = "must be two or more ascending times [s]"
-            raise InputError("torque", [Problem("breakpoints", breakpoints, allowed)])
-        if self.c.ndim != 3 or self.c.shape[1:] != (len(self.x) - 1, 3):
-            allowed = f"must have the shape (order + 1, {len(self.x) - 1}, 3)"
-            raise InputError("torque", [Problem("coefficients", self.c.shape, allowed)])
-        if not (np.all(np.isfinite(self.c)) and np.all(np.isfinite(self.x))):
-            raise InputError("torque", [Problem("coefficients", "not finite", "must be finite")])
-
-    def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
-        piece = np.clip(np.searchsorted(self.x, t, side="right") - 1, 0, self.c.shape[1] - 1)
-        total = self._sum(self.c[:, piece], t - self.x[piece])
-        total[(t < self.x[0]) | (t > self.x[-1])] = 0.0
-        return total
-
-    def breaks(self) -> Array:
-        """See `TorqueProfile`."""
-        return self.x
-
-    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
-        """See `TorqueProfile`."""
-        piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
-        if not 0 <= piece < self.c.shape[1]:
-            return ConstantTorque((0.0, 0.0, 0.0))
-        start = float(self.x[piece])
-        first, second, third = self.c[:, piece].T.tolist()
-
-        def value(c: list[float], t: float) -> float:
-            total = 0.0
-            for factor in c:
-                total = total * (t - start) + factor
-            return total
-
-        return lambda t: (value(first, t), value(second, t), value(third, t))
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "polynomial", "c": self.c.tolist(), "x": self.x.tolist()}
-
-    @staticmethod
-    def _sum(c: Array, t: Array) -> Array:
-        total: Array = np.zeros_like(c[0])
-        for row in c:
-            total = total * t[:, None] + row
-        return total
-
-
-class FunctionTorque(TorqueProfile):
-    """A function f(t) [s] -> three torques [N m]."""
-
-    def __init__(self, function: TorqueFunction) -> None:
-        self._function = function
-
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        return three(self._function(t), f"torque({t:g})")
-
-    def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
-        return np.array([self(float(time)) for time in t]).reshape(-1, 3)
-
-    def record(self) -> None:
-        """See `TorqueProfile`."""
-        return None
-
-
 def profile_of(torque: Any) -> TorqueProfile | FeedbackFunction:
     """Turn what a user gives into a profile, or leave a function of time and state as it is.
 
@@ -257,19 +111,6 @@ def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
     if record["kind"] == "table":
         return TorqueTable(more["times"], more["torques"])
     return PolynomialTorque(more["c"], more["x"])
-
-
-def three(value: Any, name: str) -> Vector3:
-    """Return three finite numbers as floats.
-
-    Raises:
-        InputError: `value` is something else.
-
-    """
-    if (vector := finite_vector(value)) is not None:
-        return vector
-    allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
-    raise InputError("simulate", [Problem(name, value, allowed)])
 
 
 def _arguments(function: Callable[..., Any]) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from sst_ros.dynamics.limits import limits_of
-from sst_ros.dynamics.loads import damping_of
+from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene

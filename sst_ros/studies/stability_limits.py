@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.integration.ode import ODE
@@ -113,10 +112,8 @@ def eigenvalues(scene: Scene) -> NDArray[np.complex128]:
     dynamics = Dynamics.of(scene)
     start = initial_state(scene, Geometry.of(scene))
     lagged = (0.0,) * (len(dynamics.state) - 7)
-    stepper = AdaptiveStepper(ODE(dynamics), "dopri5", 1.0, compiled=False)
-    return np.asarray(
-        stepper.spectrum(0.0, (*start, *lagged), (0.0,) * len(dynamics.drive)), dtype=complex
-    )
+    drive = (0.0,) * len(dynamics.drive)
+    return np.asarray(ODE(dynamics).eigenvalues(0.0, (*start, *lagged), drive), dtype=complex)
 
 
 def largest_step(family: str, method: Method, coefficient: float) -> LargestStep:

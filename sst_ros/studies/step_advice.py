@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.errors import SstError
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
 from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
@@ -62,9 +61,8 @@ def step_advice(scene: Scene) -> StepAdvice:
         return StepAdvice(f"none, the scene cannot start: {error}")
     state, dynamics = simulation.state, simulation.dynamics
     lagged = (0.0,) * (len(dynamics.state) - 7)
-    stepper = AdaptiveStepper(ODE(dynamics), DORMAND_PRINCE.name, 1.0, compiled=False)
     y = (*state.quaternion, *state.body_rate, *lagged)
-    eigenvalues = stepper.spectrum(0.0, y, (0.0,) * len(dynamics.drive))
+    eigenvalues = ODE(dynamics).eigenvalues(0.0, y, (0.0,) * len(dynamics.drive))
     fastest = float(np.abs(eigenvalues).max())
     name = DORMAND_PRINCE.name
     if fastest == 0.0:

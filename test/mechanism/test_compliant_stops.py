@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sst_ros.dynamics.loads import damping_of
+from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
 from sst_ros.mechanism.symmetric_motion import inertia
 from sst_ros.mechanism.symmetric_motion import inertia_slope as slope

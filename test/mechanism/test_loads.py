@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST, samples, seeded_samples
 
-from sst_ros.dynamics import energy, kernel, loads
+from sst_ros.dynamics import energy, kernel, loads, model
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
 from sst_ros.scene.bodies import Inertia, Link, Payload
@@ -184,7 +184,7 @@ def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
 def test_elastic_ends_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
     scene = only(sample, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
-    stops = loads.of_leg(scene, sample.geometry, 0).stops
+    stops = model.loads_of_leg(scene, sample.geometry, 0).stops
     assert loads._push(stops, 0.5 * stops.arc, 1.0) == 0.0
     assert loads._push(stops, -0.01, 0.0) == pytest.approx(1.0)
     assert loads._push(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bound of what a period may cost, in evaluations of the right-hand side."""
+
+from __future__ import annotations
+
+
+class CannotStep(ArithmeticError):
+    """No step is small enough to resolve the motion."""
+
+
+class BudgetSpent(CannotStep):
+    """The evaluations that a period may take are used up."""
+
+
+class EvaluationBudget:
+    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run."""
+
+    def __init__(self, per_period: int | None = None) -> None:
+        self.per_period = per_period
+        self.spent = 0
+        self._end: float = float("inf")
+
+    def begin(self) -> None:
+        """Begin a period."""
+        if self.per_period is not None:
+            self._end = self.spent + self.per_period
+
+    def charge(self, evaluations: int) -> None:
+        """Count evaluations before they are made.
+
+        Raises:
+            BudgetSpent: the period has none left.
+
+        """
+        if self.spent + evaluations > self._end:
+            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the step")
+        self.spent += evaluations
