@@ -8,7 +8,7 @@ EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: help demo demo-feedforward demo-sweep docs view test test-all test-jazzy test-ros test-slow lint format clean
+.PHONY: help demo demo-feedforward demo-identify demo-sweep docs view test test-all test-jazzy test-ros test-slow lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -22,6 +22,9 @@ demo-feedforward: $(VENV)/.demo  ## follow a motion with a controller; results i
 demo-sweep: $(VENV)/.sweep  ## 100,000 runs with random inertias and starts: table and pictures in sweep_out
 	$(RUN) -m sst_ros sweep examples/monte_carlo.yaml --out sweep_out
 	$(RUN) -m sst_ros sweep plot sweep_out
+
+demo-identify: $(VENV)/.demo  ## identify a wrong model from a recorded motion; results in demo_out/identify
+	$(RUN) -m sst_ros demo identify --force
 
 docs: $(VENV)/.docs  ## build the documentation into site, in a folder named after the version
 	@site=site/$$($(RUN) -c 'print(__import__("sst_ros").__version__)') && \

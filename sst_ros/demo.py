@@ -64,8 +64,10 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
     return 0
 
 
-def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
+def follow(name: str, bag: Path, mode: str, seconds: float, *, model: str | None = None) -> None:
     """Have the controller node follow a scene's motion for some time [s], and record the run.
+
+    The controller's model and motion are those of the scene `model`, by default the plant's own.
 
     Raises:
         SstError: a node failed or did not end in time; names it.
@@ -73,7 +75,7 @@ def follow(name: str, bag: Path, mode: str, seconds: float) -> None:
     """
     run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
     with _recorded(bag, publish_rate=CONTROL_RATE, **run):
-        followed = {"scene": name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
+        followed = {"scene": model or name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
         followed |= {"stamped": True, "feedforward_at": "middle"}
         waits = {"min_subscribers": 2, "wait_for_recorder": True}
         with _node("inverse_dynamics", **followed, **waits) as controller:

@@ -27,7 +27,7 @@ FLOORS = (
     {"runtime"},
     {"studies", "identification", "sweeps"},
     {"nodes"},
-    {"demo", "launch_parts", "paper"},
+    {"demo", "identification_demo", "launch_parts", "paper"},
     {"cli"},
     {"__main__"},
 )

@@ -20,20 +20,21 @@ def add(commands: Commands) -> None:
     demo.add_argument(
         "kind",
         nargs="?",
-        choices=("examples", "feedforward"),
+        choices=("examples", "feedforward", "identify"),
         default="examples",
-        help="the paper's examples, or the node inverse_dynamics following a scene's motion",
+        help="the paper's examples; the node inverse_dynamics following a scene's motion; or a "
+        "model identified from a recorded motion, and the tracking error before and after",
     )
-    add_out(demo, "folder of the results", "demo_out, or demo_out/feedforward")
+    add_out(demo, "folder of the results", "demo_out, demo_out/feedforward or demo_out/identify")
     add_scene(demo, "--scene", help="with feedforward: name of a scene, or path of a .yaml file")
     demo.add_argument("--mode", nargs="+", metavar="MODE", help="with feedforward: control modes")
     demo.set_defaults(run=_demo)
 
 
 def _demo(options: argparse.Namespace) -> int:
-    if options.kind == "examples":
+    if options.kind != "feedforward":
         given = {"--scene": options.scene, "--mode": options.mode}
-        allowed = "is an option of `demo feedforward`; `demo` runs example1 and example2"
+        allowed = "is an option of `demo feedforward`"
         if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
             raise InputError("demo", wrong)
     from sst_ros.control.controller_settings import MODES
@@ -42,7 +43,7 @@ def _demo(options: argparse.Namespace) -> int:
         if mode not in MODES:
             allowed = f"must be one of {', '.join(MODES)}{suggestion(mode, MODES)}"
             raise InputError("demo", [Problem("--mode", mode, allowed)])
-    default = "demo_out" if options.kind == "examples" else "demo_out/feedforward"
+    default = "demo_out" if options.kind == "examples" else f"demo_out/{options.kind}"
     out = require_free(options.out or Path(default), "demo", force=options.force)
     for module in ("rclpy", "rosbags", "matplotlib"):
         require(module)  # the nodes, which need the first two, are processes of their own
@@ -50,4 +51,8 @@ def _demo(options: argparse.Namespace) -> int:
 
     if options.kind == "examples":
         return demo.demo(out)
+    if options.kind == "identify":
+        from sst_ros.identification_demo import identification
+
+        return identification(out)
     return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)

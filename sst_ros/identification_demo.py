@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo of identification: a wrong model, an exciting motion, and the identified model.
+
+The nodes follow a designed motion with a model that is wrong, and record it. From the recording, as
+encoders and torque sensors would give it, the model is identified; then the nodes follow another
+motion with either model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.tracking import TrackingMetrics
+from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
+from sst_ros.identification.excitation import design
+from sst_ros.identification.identify import identify
+from sst_ros.identification.parameters import INERTIA, value_of, with_numbers
+from sst_ros.plot.identification import draw_tracking_errors
+from sst_ros.plot.style import save_figure
+from sst_ros.recording.recording import read as read_bag
+from sst_ros.report import tracking
+from sst_ros.scene.scene import Scene, load
+from sst_ros.scene.yaml_document import dump
+
+SHARE = 0.2
+"""Part by which the inertia of each kind of body differs from the model."""
+
+GUESS = {"gamma": {"viscous": 0.1, "coulomb": 0.1, "smoothing": 0.05}}
+"""Friction of the model: half of what the actuators have, and none in the passive joints."""
+
+UNKNOWN = ("star", "actuated_links", "intermediate_links", "friction.gamma",
+           "friction.mu.viscous", "friction.beta.viscous")  # fmt: skip
+COUNTS, NOISE = 65536, 0.01
+"""Steps of an encoder per turn, and noise of the torques over their largest value."""
+
+MODE = "feedforward_pd"
+PICTURE, TABLE = "identification.png", "identification.txt"
+
+
+def identification(out: Path, name: str = FOLLOWED) -> int:
+    """Identify a plant with wrong inertias and friction, and follow a motion before and after.
+
+    Results lie in `out`: the scenes plant, model, exciting and identified, three bags, the table
+    and the picture.
+
+    Raises:
+        SstError: a node failed or a motion is refused; names it.
+
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    given = load(name)
+    model = dataclasses.replace(given.with_values({"friction": GUESS}), name=f"{name}_model")
+    plant = unknown(given)
+    designed = design(model, UNKNOWN)
+    scenes = {"plant": plant, "model": model, "exciting": designed.scene}
+    for key, scene in scenes.items():
+        (out / f"{key}.yaml").write_text(dump(scene), encoding="utf-8")
+    print(f"{name}: bodies of the plant differ by {SHARE:.0%}, friction is not known", flush=True)
+    _follow(out, "exciting", "exciting")
+    found = identify(measured(out / "exciting" / "bag"), model, UNKNOWN)
+    identified = dataclasses.replace(found.scene, name=f"{name}_identified")
+    (out / "identified.yaml").write_text(dump(identified), encoding="utf-8")
+    print(found.table(), flush=True)
+    for key in ("model", "identified"):
+        _follow(out, key, key)
+    text = compare(out, found.table())
+    print(text, flush=True)
+    return 0
+
+
+def unknown(scene: Scene, share: float = SHARE) -> Scene:
+    """Return a plant whose bodies differ from those of a scene: two kinds heavier, one lighter."""
+    signs = {"star": 1.0, "actuated_links": -1.0, "intermediate_links": 1.0}
+    parts = ("mass", *(f"inertia.{part}" for part in INERTIA))
+    names = [f"{body}.{part}" for body in signs for part in parts]
+    factors = [1.0 + sign * share for sign in signs.values() for _ in parts]
+    numbers = np.array([value_of(scene, name) for name in names], dtype=float) * factors
+    plant = with_numbers(scene, names, numbers)
+    return dataclasses.replace(plant, name=f"{scene.name}_plant")
+
+
+def measured(bag: Path, seed: int = 0) -> dict[str, object]:
+    """Read a recording as encoders and torque sensors would have given it."""
+    recording = read_bag(bag)
+    motion = recording.trajectory
+    step = 2.0 * math.pi / COUNTS
+    noise = np.random.default_rng(seed).normal(size=(len(motion.t) - 1, 3))
+    torque = motion.torque[1:] + noise * NOISE * np.abs(motion.torque).max(axis=0)
+    return {
+        "t": motion.t, "gamma": step * np.round(motion.gamma / step), "torque": torque,
+        "held": True, "quaternion": motion.quaternion[0],
+    }  # fmt: skip
+
+
+def compare(out: Path, identified: str) -> str:
+    """Write the table and the picture of the tracking errors before and after; return the table."""
+    runs = {key: tracking.read(out / key / "bag") for key in ("model", "identified")}
+    found = {key: tracking.metrics(run) for key, run in runs.items()}
+    before, after = (_rms(found[key]) for key in runs)
+    lines = [f"{'tracking error of gamma [rad]':32}{'RMS':>12}{'largest':>12}"]
+    for key, label in (
+        ("model", "with the wrong model"),
+        ("identified", "with the identified one"),
+    ):
+        lines.append(f"{label:32}{_rms(found[key]):12.3e}{found[key].largest.max():12.3e}")
+    lines.append(f"{'ratio':32}{before / after:12.1f}")
+    text = "\n".join(lines)
+    (out / TABLE).write_text(f"{identified}\n{text}\n", encoding="utf-8")
+    figure = draw_tracking_errors(
+        {"with the wrong model": (runs["model"].track.time, runs["model"].track.error),
+         "with the identified model": (runs["identified"].track.time,
+                                       runs["identified"].track.error)},
+        f"Tracking error, {MODE.replace('_', ' + ')}: RMS {before:.1e} to {after:.1e} rad",
+    )  # fmt: skip
+    save_figure(figure, out / PICTURE)
+    return text
+
+
+def _rms(found: TrackingMetrics) -> float:
+    return float(np.sqrt(np.mean(found.rms**2)))
+
+
+def _follow(out: Path, model: str, folder: str) -> None:
+    """Follow the motion of a model's scene on the plant, and record it in a folder."""
+    path = out / f"{model}.yaml"
+    seconds = reference_motion(load(path)).duration + HOLD_S
+    seconds = math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE
+    bag = empty_bag(out / folder)
+    print(f"{folder}: following for {seconds:g} s", flush=True)
+    follow(str(out / "plant.yaml"), bag, MODE, seconds, model=str(path))
