@@ -246,3 +246,13 @@ def test_the_error_estimate_at_the_end_is_within_the_tolerance():
     assert found.error_estimate <= 1e-9
     finer = simulate("swing", lambda t: (0.0, 0.0, 0.0), 10.0, tolerance=1e-11, **options)
     assert np.abs(found.quaternion - finer.quaternion).max() <= 1e-9
+
+
+def test_rodas4_runs_under_a_sine_profile():
+    """It needs the derivative of the torques: a sine is traced, and not a Python function."""
+    motions = {
+        method: simulate("example2_heavy", method=method, tolerance=1e-8, t_eval=[0.0, 1.0])
+        for method in ("dopri5", "rodas4")
+    }
+    assert motions["rodas4"].evaluations != motions["dopri5"].evaluations
+    np.testing.assert_allclose(motions["rodas4"].gamma, motions["dopri5"].gamma, atol=1e-7)

@@ -16,7 +16,7 @@ from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.simulation.torque import TorqueTable
-from sst_ros.simulation.torque_profile import FeedbackFunction, TorqueProfile, three
+from sst_ros.simulation.torque_profile import FeedbackFunction, SineProfile, TorqueProfile, three
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, State, Vector3, clamped
 
@@ -149,6 +149,8 @@ class SteppedMotion:
         if self._period is None:
             if not isinstance(law, TorqueProfile):
                 return self._feedback
+            if isinstance(law, SineProfile):
+                return law.sine  # traced: implicit methods need its derivatives
             piece = law.between(start, end / NANOSECONDS)
             return getattr(piece, "torque", piece)
         state = self._simulation.state

@@ -93,6 +93,12 @@ def _choices(of):
     return next((a.choices for a in of._actions if hasattr(a, "_choices_actions")), None)
 
 
+def test_the_readme_is_short_and_begins_with_the_mechanism():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) < 120
+    assert any("docs/mechanism.png" in line for line in lines[:20])
+
+
 def test_every_page_is_in_the_site():
     """All but the README are listed in an index, so that nobody has to guess an address."""
     listed, docs = {"index"}, ROOT / "docs"
