@@ -30,7 +30,8 @@ def test_every_extra_that_a_message_names_brings_the_module():
     for module, extra in EXTRAS.items():
         assert f'"{extra}"' in setup
         if module not in ("lz4", "zstandard"):  # brought by rosbags
-            package = {"pinocchio": "pin>="}.get(module, module)
+            names = {"pinocchio": "pin>=", "distributed": "dask[distributed]"}
+            package = names.get(module, module)
             assert f'"{package}' in setup
 
 

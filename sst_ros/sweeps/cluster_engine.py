@@ -103,7 +103,8 @@ def run_on_cluster(
             scheduler is gone. All others are.
 
     """
-    _Run(client, task, done, note).run(list(chunks))
+    with client.as_current():
+        _Run(client, task, done, note).run(list(chunks))
 
 
 class _Run:

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study of a million runs against its own kernel, MuJoCo, and two workers against one.
+
+python -m benchmark.sweep [--rows 1000000] [--mujoco] [--cluster] [--json FILE]
+
+Example 2, one second, DOP853 by the steps that reach 1e-9 rad, the inertia of every body varied by
+a factor of its own, final states to Parquet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmark import machine
+from sst_ros import load_scene, simulate
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.sweeps.chunk_task import ChunkTask, run_chunk, versions
+from sst_ros.sweeps.prepared import PreparedSweep, prepared
+from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
+
+BODIES = (
+    "star",
+    *(f"{links}[{k}]" for links in ("actuated_links", "intermediate_links") for k in range(3)),
+)
+VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
+MUJOCO_STEPS = 2780
+"""Steps, with the softness below, by which rollout reaches 1e-6 rad soonest (docs/peers.csv)."""
+
+RUNS = 1e9
+
+
+def study_of(rows: int) -> SweepStudy:
+    return SweepStudy(load_scene("example2_heavy"), VARY, n=rows, seed=1)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and print; the exit status is 0."""
+    parser = argparse.ArgumentParser(prog="python -m benchmark.sweep", description=__doc__)
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    parser.add_argument("--mujoco", action="store_true", help="time MuJoCo's rollout, too")
+    parser.add_argument("--cluster", action="store_true", help="time Dask workers, too")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    PreparedSweep(study_of(1000))  # compile, or load what is compiled
+    found: dict[str, Any] = {"machine": machine.described("numpy", "numba", "dask", "pyarrow")}
+    found |= _study(options.rows)
+    found |= _kernel(min(options.rows, 10 * CHUNK), found["steps"])
+    found["ratio to the kernel"] = found["us a run"] / found["us a run, kernel alone"]
+    if options.mujoco:
+        found |= _mujoco(found["us a run"])
+    if options.cluster:
+        found |= _cluster(found["steps"])
+    for name, value in found.items():
+        if name != "machine":
+            print(f"{name:>44}: {value:.6g}")
+    print(machine.line(found["machine"]))
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def _study(rows: int) -> dict[str, float]:
+    """The whole study, preparation and files included, without reading the files again."""
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        study = study_of(rows)
+        ready = prepared(study)
+        prepared_s = time.perf_counter() - began
+        out = Path(folder) / "out"
+        table = run_study(study, out, progress=False)
+        seconds = time.perf_counter() - began
+        size = sum(path.stat().st_size for path in out.iterdir())
+    assert len(table) == rows
+    assert (table["status"] == 0).all()
+    return {
+        "rows": rows, "steps": ready.steps, "error of pilot rows [rad]": ready.pilot_error,
+        "seconds": seconds, "of these to choose the steps": prepared_s,
+        "us a run": 1e6 * seconds / rows, "files [MB]": size / 1e6,
+        "largest memory [GB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    }  # fmt: skip
+
+
+def _kernel(rows: int, steps: int) -> dict[str, float]:
+    """The compiled loop alone, on prepared arrays, on all cores."""
+    study = study_of(rows)
+    ready = prepared(study, steps)
+    values = study.sampler.rows(0, rows)
+    scenarios, _, _ = ready._scenarios(values)
+    batch = ready.batch.with_parameters(scenarios)
+    y, code = batch.start(np.tile(study.scene.initial.gamma, (rows, 1)), (0.0, 0.0, 0.0))
+    given = batch.drives((0.0, 0.0, 0.0), rows)
+    best = np.inf
+    for _ in range(3):
+        arrays = y.copy(), given, code.copy(), np.full(rows, np.nan), np.zeros(rows)
+        began = time.perf_counter()
+        batch.advance(0, steps, study.length / steps, *arrays)
+        best = min(best, time.perf_counter() - began)
+    return {"us a run, kernel alone": 1e6 * best / rows}
+
+
+def _mujoco(ours_us: float) -> dict[str, float]:
+    """MuJoCo's `rollout` on as many threads, by the setting that is fastest to 1e-6 rad.
+
+    The runs are alike: other inertias would not change its time.
+    """
+    from mujoco import rollout
+
+    from benchmark.peers.mujoco_model import Model
+    from benchmark.peers.task import Task
+
+    task, threads, copies = Task(), len(os.sched_getaffinity(0)), 8
+    model = Model(task, "RK4", 0.01, 0.003, True)
+    mujoco, kind = model.mujoco, model.mujoco.mjtState.mjSTATE_FULLPHYSICS
+    model.reset(MUJOCO_STEPS)
+    middles = (np.arange(MUJOCO_STEPS) + 0.5) / MUJOCO_STEPS
+    controls = np.array([task.torque_at(t) for t in middles])[None].repeat(copies, axis=0)
+    start = np.zeros(mujoco.mj_stateSize(model.model, kind))
+    mujoco.mj_getState(model.model, model.data, start, kind)
+    data = [mujoco.MjData(model.model) for _ in range(threads)]
+    best = np.inf
+    for _ in range(3):
+        began = time.perf_counter()
+        states, _ = rollout.rollout(
+            model.model, data, start[None].repeat(copies, axis=0), controls, nstep=MUJOCO_STEPS
+        )
+        best = min(best, (time.perf_counter() - began) / copies)
+    mujoco.mj_setState(model.model, model.data, states[0, -1], kind)
+    reference = simulate(task.scene, t_eval=[1.0], tolerance=1e-12).quaternion[0]
+    turn = rotation_matrix(reference).T @ model.pose().rotation
+    error = float(np.linalg.norm(turn - np.eye(3)) / np.sqrt(2.0))
+    return {
+        "us a run, MuJoCo rollout": 1e6 * best,
+        "error of MuJoCo [rad]": error,
+        "MuJoCo rollout over the study": 1e6 * best / ours_us,
+    }
+
+
+def _cluster(steps: int) -> dict[str, float]:
+    """Two workers of one thread against one; cost of a chunk and of the scheduler."""
+    from sst_ros.sweeps.cluster_engine import connect, run_on_cluster, send_code
+
+    found: dict[str, float] = {}
+    chunks = 16
+    study = study_of(chunks * CHUNK)
+    ready = prepared(study, steps)
+    with tempfile.TemporaryDirectory() as folder:
+        task = ChunkTask(study, steps, folder, versions())
+        began = time.perf_counter()
+        run_chunk(task, 0)
+        found["seconds of a chunk"] = time.perf_counter() - began
+        with _workers(Path(folder), 2) as address, contextlib.closing(connect(address)) as client:
+            client.wait_for_workers(2, timeout=60)
+            send_code(client, ready.module)
+            both = list(client.scheduler_info(n_workers=-1)["workers"])
+            for index, worker in enumerate(both):  # each prepares the study once
+                client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
+            for workers in (1, 2):
+                began = time.perf_counter()
+                if workers == 1:
+                    futures = [
+                        client.submit(_on_worker, task, i, workers=[both[0]], pure=False)
+                        for i in range(chunks)
+                    ]
+                    client.gather(futures)
+                else:
+                    run_on_cluster(client, task, range(chunks), lambda _: None, print)
+                found[f"seconds of {chunks} chunks, {workers} workers"] = (
+                    time.perf_counter() - began
+                )
+            began = time.perf_counter()
+            client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
+            found["seconds of an empty task, scheduler and client"] = (
+                time.perf_counter() - began
+            ) / 1000
+    one, two = (found[f"seconds of {chunks} chunks, {workers} workers"] for workers in (1, 2))
+    found["two workers against one"] = one / two
+    # The scheduler serves one task at a time: more threads than this wait for it.
+    useful = found["seconds of a chunk"] / found["seconds of an empty task, scheduler and client"]
+    found["largest useful number of threads"] = useful
+    found["hours of 1e9 runs on them"] = (
+        RUNS / CHUNK * found["seconds of an empty task, scheduler and client"] / 3600
+    )
+    return found
+
+
+def _on_worker(task: ChunkTask, index: int) -> str:
+    return run_chunk(task, index).status
+
+
+def _nothing(index: int) -> int:
+    return index
+
+
+@contextlib.contextmanager
+def _workers(folder: Path, count: int) -> Any:
+    """Start a scheduler and workers of one thread; end them."""
+    file = folder / "scheduler.json"
+    options = ["--no-dashboard", "--scheduler-file", str(file)]
+    words = [["dask_scheduler", "--port", "0", "--host", "127.0.0.1", *options]]
+    words += [["dask_worker", "--nthreads", "1", "--no-nanny", *options]] * count
+    processes = []
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    try:
+        for name, *more in words:
+            command = [sys.executable, "-m", f"distributed.cli.{name}", *more]
+            processes.append(
+                subprocess.Popen(
+                    command, env=environment, stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL, cwd=Path(__file__).parents[1],
+                )
+            )  # fmt: skip
+            end = time.monotonic() + 60.0
+            while not (file.exists() and file.stat().st_size):
+                if time.monotonic() > end:
+                    raise TimeoutError("no scheduler")
+                time.sleep(0.05)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait(60)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study on real `dask scheduler` and `dask worker` processes: killed, replaced, refused, full."""
+
+import dataclasses
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from sst_ros import load_scene
+from sst_ros.sweeps import cluster_engine
+from sst_ros.sweeps.cluster_engine import connect
+from sst_ros.sweeps.local_engine import SweepFailed
+from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep_study import SweepStudy
+
+for module in ("numba", "distributed", "pandas", "pyarrow"):
+    pytest.importorskip(module, reason="a cluster needs it")
+
+pytestmark = pytest.mark.timeout(300)
+LIMIT_S = 60
+VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
+STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
+WORKER = "from distributed.cli.dask_worker import main; main()"
+OLD = "import sst_ros; sst_ros.__version__ = '0.0.9'"
+FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))"
+POISONED = """
+import os, signal
+from sst_ros.sweeps.prepared import PreparedSweep
+compute = PreparedSweep.chunk
+def poisoned(self, index):
+    if index == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return compute(self, index)
+PreparedSweep.chunk = poisoned
+"""
+SLOW = """
+import time
+from sst_ros.sweeps.prepared import PreparedSweep
+compute = PreparedSweep.chunk
+def slow(self, index):
+    time.sleep(0.1)
+    return compute(self, index)
+PreparedSweep.chunk = slow
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    return run_study(STUDY, None)
+
+
+class Processes:
+    """A scheduler and workers of a test, in folders of its own."""
+
+    def __init__(self, folder):
+        self.folder, self.scheduler, self.workers = folder, None, []
+        self.environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "3"}
+
+    def start(self, words):
+        log = (self.folder / f"log_{time.monotonic_ns()}").open("wb")
+        with log:
+            return subprocess.Popen(
+                [sys.executable, *words], stdout=log, stderr=log, env=self.environment,
+                cwd=self.folder,
+            )  # fmt: skip
+
+    def start_scheduler(self):
+        file = self.folder / f"scheduler_{time.monotonic_ns()}.json"
+        words = ["-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1",
+                 "--no-dashboard", "--scheduler-file", str(file)]  # fmt: skip
+        self.scheduler = self.start(words)
+        until(lambda: file.exists() and file.stat().st_size > 0)
+        self.file = file
+        return self
+
+    def add_worker(self, patch=""):
+        words = [
+            "-c", f"{patch}\n{WORKER}", "--scheduler-file", str(self.file), "--nthreads", "1",
+            "--no-dashboard", "--local-directory", str(self.folder / "work"),
+            "--no-nanny",
+        ]  # fmt: skip
+        self.workers.append(self.start(words))
+        return self.workers[-1]
+
+    @contextmanager
+    def client(self, workers):
+        import json
+
+        found = connect(json.loads(self.file.read_text())["address"])
+        try:
+            found.wait_for_workers(workers, timeout=LIMIT_S)
+            yield found
+        finally:
+            found.close(timeout=5)
+
+    def stop(self):
+        for process in [*self.workers, self.scheduler]:
+            if process is not None:
+                process.kill()
+                process.wait(LIMIT_S)
+
+
+@pytest.fixture
+def processes(tmp_path):
+    started = Processes(tmp_path).start_scheduler()
+    try:
+        yield started
+    finally:
+        started.stop()
+
+
+def until(condition):
+    end = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.02)
+
+
+def same(one, other):
+    assert list(one.columns) == list(other.columns)
+    assert one["reason"].tolist() == other["reason"].tolist()
+    for name in set(one.columns) - {"reason"}:
+        assert one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes(), name
+
+
+def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
+    processes.environment |= {"SST_ROS_CACHE": str(tmp_path / "empty")}
+    processes.add_worker()
+    processes.add_worker()
+    with processes.client(2) as client:
+        same(run_study(STUDY, tmp_path / "out", client=client), expected)
+    # Code was sent, not compiled: no file of a worker is younger than the epoch.
+    sent = list((tmp_path / "empty").rglob("sst_*.nbc"))
+    assert sent
+    assert all(path.stat().st_mtime == 0 for path in sent)
+
+
+@pytest.mark.slow
+def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
+    study = dataclasses.replace(STUDY, n=2000, chunk=10)
+    assert study.chunks == 200
+    for _ in range(2):
+        processes.add_worker(SLOW)
+    rng, over = random.Random(3), threading.Event()
+
+    def kill():
+        for _ in range(6):
+            if over.wait(rng.uniform(0.5, 2.0)):
+                return
+            victim = rng.choice([one for one in processes.workers if one.poll() is None])
+            victim.kill()
+            processes.add_worker(SLOW)
+
+    killer = threading.Thread(target=kill)
+    with processes.client(2) as client:
+        killer.start()
+        try:
+            found = run_study(study, tmp_path / "out", client=client)
+        finally:
+            over.set()
+            killer.join(LIMIT_S)
+    assert sum(one.poll() is not None for one in processes.workers) >= 3
+    assert found.index.tolist() == list(range(2000))
+    assert len(list((tmp_path / "out").glob("part-*.parquet"))) == 200
+    same(found, run_study(study, None))
+
+
+@pytest.mark.slow
+def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster_engine, "NO_SCHEDULER", 3.0)
+    processes.add_worker(SLOW)
+    out = tmp_path / "out"
+
+    def kill():
+        until(lambda: len(list(out.glob("part-*"))) >= 3)
+        processes.scheduler.kill()
+
+    killer = threading.Thread(target=kill)
+    with processes.client(1) as client:
+        killer.start()
+        with pytest.raises(SweepFailed, match="scheduler does not answer; continue with --resume"):
+            run_study(STUDY, out, client=client)
+        killer.join(LIMIT_S)
+    done = len(list(out.glob("part-*")))
+    assert 3 <= done < 12
+    processes.stop()
+    processes.workers.clear()
+    processes.start_scheduler().add_worker()
+    with processes.client(1) as client:
+        same(run_study(STUDY, out, client=client, resume=True), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("patch", "reason"),
+    [(OLD, "sst_ros 0.0.9 in place of"), (FULL, "File too large")],
+    ids=["another version", "no space left"],
+)
+def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
+    processes, expected, tmp_path, capsys, patch, reason
+):
+    processes.add_worker(patch)
+    processes.add_worker()
+    with processes.client(2) as client:
+        same(run_study(STUDY, tmp_path / "out", client=client), expected)
+    said = capsys.readouterr().err
+    assert "gets no more chunks: " in said
+    assert reason in said
+    assert not list((tmp_path / "out").glob(".part-*"))
+
+
+@pytest.mark.slow
+def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster_engine, "NO_WORKER", 2.0)
+    processes.add_worker(OLD)
+    with processes.client(1) as client, pytest.raises(SweepFailed, match=r"in place of"):
+        run_study(STUDY, tmp_path / "out", client=client)
+
+
+@pytest.mark.slow
+def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
+    processes, expected, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(cluster_engine, "MOST_DEATHS", 2)
+    processes.stop()
+    processes.environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    processes.start_scheduler()
+    live = threading.Event()
+
+    def keep_one():
+        """Start a worker whenever there is none, as a nanny or SLURM does."""
+        while not live.wait(0.1):
+            if all(one.poll() is not None for one in processes.workers):
+                processes.add_worker(POISONED)
+
+    keeper = threading.Thread(target=keep_one)
+    keeper.start()
+    try:
+        died = pytest.raises(SweepFailed, match="chunk 3: its workers died 2 times")
+        with processes.client(1) as client, died:
+            run_study(STUDY, tmp_path / "out", client=client)
+    finally:
+        live.set()
+        keeper.join(LIMIT_S)
+    assert len(list((tmp_path / "out").glob("part-*"))) == 11
+    found = run_study(STUDY, tmp_path / "out", resume=True)
+    same(found, expected)
+    assert np.array_equal(found.index, expected.index)
