@@ -133,7 +133,8 @@ class Batch:
         given = self.drives(torque, number)
         time, error = np.full(number, np.nan), np.zeros(number)
         kept, ends = [y.copy()], [0]
-        for part in slices(count, keep_every, self.scene.name, progress):
+        size = keep_every or (0 if progress else max(count, 1))  # few calls: each passes all rows
+        for part in slices(count, size, self.scene.name, progress):
             span = part.stop - part.start
             self.advance(part.start, span, step, y, given, code, time, error, threads=threads)
             if keep_every and span == keep_every:

@@ -66,14 +66,16 @@ def initial_states(
             one[owner] = valid
             starting = counts[same] == 1
             here, chosen = rows[starting], one[same[starting]]
-            rotation = found.rotation[chosen]
             moving = gamma_dot[here].any(axis=1)
             singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
             code[here] = np.where(singular, NO_RATE, 0)
-            quaternion[here] = quaternion_of(rotation) if len(here) else 0.0
+            if len(here):
+                quaternion[here] = quaternion_of(found.rotation[one])[same[starting]]
             moves = moving & ~singular
             if moves.any():
-                rate[here[moves]] = _body_rates(geometry, rotation[moves], gamma_dot[here[moves]])
+                rate[here[moves]] = _body_rates(
+                    geometry, found.rotation[chosen[moves]], gamma_dot[here[moves]]
+                )
             if stroke:
                 outside = (gamma[rows] < 0.0) | (gamma[rows] > geometry.arc)
                 code[rows[outside.any(axis=1)]] = OUTSIDE

@@ -41,9 +41,9 @@ from sst_ros.studies.channel import Channel
 from sst_ros.studies.control_loop import ControlLoop, run_loop
 from sst_ros.studies.hold_order import HoldError, UnheldError, held_error, unheld_error
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
-from sst_ros.studies.parallel import run_jobs
 from sst_ros.studies.results import table
 from sst_ros.studies.sampled_data import slope
+from sst_ros.sweeps.job_list import run_jobs
 
 if TYPE_CHECKING:
     from pandas import DataFrame

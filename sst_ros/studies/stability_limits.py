@@ -28,8 +28,8 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.parallel import run_jobs
 from sst_ros.studies.step_advice import step_advice
+from sst_ros.sweeps.job_list import run_jobs
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
 """Viscous coefficients of the damped family [N m s/rad]."""

@@ -24,7 +24,6 @@ from sst_ros.studies.extreme_cases import (
 )
 from sst_ros.studies.geometry_cases import geometry_cases
 from sst_ros.studies.load_cases import load_cases
-from sst_ros.studies.parallel import run_jobs
 from sst_ros.studies.results import markdown, provenance, records, table, write
 from sst_ros.studies.scaling_cases import scaling_cases
 from sst_ros.studies.stability_limits import (
@@ -35,6 +34,7 @@ from sst_ros.studies.stability_limits import (
     scene_points,
     stability_function,
 )
+from sst_ros.sweeps.job_list import run_jobs
 
 if TYPE_CHECKING:
     from pandas import DataFrame

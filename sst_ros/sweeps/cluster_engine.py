@@ -8,6 +8,7 @@ worker again and again is given up when all others are done. Every wait has a bo
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,6 +24,11 @@ from sst_ros.sweeps.local_engine import SweepFailed
 
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker that takes chunks, and for a scheduler that does not answer [s]."""
+
+GATHER = 10.0
+"""Longest wait for the outcome of a chunk that is done [s]."""
+
+NO_ANSWER = "the scheduler does not answer; continue with --resume"
 
 MOST_DEATHS = 5
 """Attempts at a chunk whose workers die; Dask itself makes three of each."""
@@ -110,61 +116,85 @@ def run_on_cluster(
 class _Run:
     def __init__(self, client: Any, task: ChunkTask, done: Any, note: Any) -> None:
         self._distributed = require("distributed")
+        # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
+        self._waits = TimeoutError, self._distributed.TimeoutError, self._distributed.CancelledError
         self._client, self._task, self._done, self._note = client, task, done, note
         self._refused: dict[str, str] = {}
-        self._running: dict[Any, int] = {}
+        self._running: dict[Any, tuple[int, tuple[str, ...] | None]] = {}
         self._deaths: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
 
     def run(self, waiting: list[int]) -> None:
-        for worker, detail in refuse_other_versions(self._client, self._task).items():
-            self._refuse(worker, detail)
         waiting.reverse()
-        idle = time.monotonic()
         try:
-            while waiting or self._running:
-                workers = self._workers()
-                if workers:
-                    idle = time.monotonic()
-                elif time.monotonic() - idle > NO_WORKER:
-                    raise SweepFailed(self._no_worker())
-                room = AHEAD * sum(workers.values()) - len(self._running)
-                for _ in range(min(room, len(waiting))):
-                    self._submit(waiting.pop(), list(workers))
-                waiting += self._collect()
+            for worker, detail in refuse_other_versions(self._client, self._task).items():
+                self._refuse(worker, detail)
+            self._run(waiting)
+        except (OSError, *self._waits) as error:
+            if self._alive():
+                raise
+            raise SweepFailed(NO_ANSWER) from error
         finally:
-            self._client.cancel(list(self._running), force=True) if self._alive() else None
+            if self._client.status == "running":
+                self._client.cancel(list(self._running), force=True)
         if self._given_up:
             texts = [f"chunk {index}: {text}" for index, text in sorted(self._given_up.items())]
             raise SweepFailed("; ".join(texts))
 
-    def _submit(self, index: int, workers: list[str]) -> None:
+    def _run(self, waiting: list[int]) -> None:
+        idle = time.monotonic()
+        while waiting or self._running:
+            workers = self._workers()
+            if workers:
+                idle = time.monotonic()
+            elif time.monotonic() - idle > NO_WORKER:
+                raise SweepFailed(self._no_worker())
+            waiting += self._stranded(set(workers))
+            room = AHEAD * sum(workers.values()) - len(self._running)
+            for _ in range(min(room, len(waiting))):
+                self._submit(waiting.pop(), tuple(workers))
+            waiting += self._collect()
+
+    def _submit(self, index: int, workers: tuple[str, ...]) -> None:
+        """Send a chunk: to any worker, or where some are refused to one of the others."""
+        chosen = workers if self._refused else None
         future = self._client.submit(
-            _task_on_worker, self._task, index, pure=False, workers=workers, retries=0,
+            _task_on_worker, self._task, index, pure=False, workers=chosen,
             allow_other_workers=False, key=f"chunk-{index}-{time.monotonic_ns()}",
         )  # fmt: skip
-        self._running[future] = index
+        self._running[future] = index, chosen
+
+    def _stranded(self, workers: set[str]) -> list[int]:
+        """Take back chunks whose chosen workers are all gone."""
+        stranded = [
+            future
+            for future, (_, chosen) in self._running.items()
+            if chosen is not None and not workers & set(chosen) and future.status == "pending"
+        ]
+        again = [self._running.pop(future)[0] for future in stranded]
+        if stranded:
+            self._client.cancel(stranded, force=True)
+        return again
 
     def _collect(self) -> list[int]:
         """Take what has ended; return the chunks to be computed again."""
         if not self._running:
             time.sleep(0.2)
             return []
-        try:
+        with contextlib.suppress(*self._waits):
             self._distributed.wait(list(self._running), timeout=1.0, return_when="FIRST_COMPLETED")
-        except (TimeoutError, self._distributed.TimeoutError):
-            pass
-        except self._distributed.CancelledError:
-            pass
         again = []
         for future in [one for one in self._running if one.status != "pending"]:
-            index = self._running.pop(future)
-            if future.status == "finished":
-                again += self._take(index, future.result(timeout=NO_SCHEDULER))
-            elif future.status in ("cancelled", "lost"):
-                again.append(index)
-            else:
-                again += self._failed(index, future.exception(timeout=NO_SCHEDULER))
+            index, _ = self._running.pop(future)
+            try:
+                if future.status == "finished":
+                    again += self._take(index, future.result(timeout=GATHER))
+                elif future.status == "error":
+                    again += self._failed(index, future.exception(timeout=GATHER))
+                else:
+                    again.append(index)
+            except self._waits:
+                again.append(index)  # the worker that held the outcome is gone
             future.release()
         return again
 
@@ -196,7 +226,7 @@ class _Run:
     def _workers(self) -> dict[str, int]:
         """Threads of each worker that takes chunks."""
         if not self._alive():
-            raise SweepFailed("the scheduler does not answer; continue with --resume")
+            raise SweepFailed(NO_ANSWER)
         info = self._client.scheduler_info(n_workers=-1)["workers"]
         return {
             address: about["nthreads"]

@@ -1,27 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Independent jobs in parallel, one process for each core; results in the order of the jobs."""
+"""Independent jobs in Python, one process for each core; results in the order of the jobs.
+
+Runs that the compiled batch loop cannot do (variable steps, other number types) go here, on Dask's
+process scheduler; without Dask one after the other.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from typing import TypeVar
+from contextlib import nullcontext
+from typing import Any, TypeVar
 
+from sst_ros.extras import require
 from sst_ros.progress import slices
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not Linux
-        return os.cpu_count() or 1
 
 
 def run_jobs(
@@ -42,19 +40,27 @@ def run_jobs(
         workers: processes; None for one a core, 1 for this process alone.
 
     """
-    workers = min(workers or cores(), len(jobs))
+    workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     parts = slices(len(jobs), 1, progress, bool(progress))
-    if workers <= 1:
+    if workers <= 1 or importlib.util.find_spec("dask") is None:
         return [function(jobs[part.start]) for part in parts]
-    # Forked processes would share locks of threads that they do not have.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _end_with_the_parent) as executor:
-        try:
-            results = executor.map(function, jobs)
-            return [next(results) for _ in parts]
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
+    dask = require("dask")
+    call = dask.delayed(function, pure=False, traverse=False)
+    tasks = [call(dask.delayed(job, traverse=False)) for job in jobs]
+    with _bar(parts) if progress else nullcontext():
+        return list(
+            dask.compute(
+                *tasks, scheduler="processes", num_workers=workers, chunksize=1,
+                initializer=_end_with_the_parent, optimize_graph=False,
+            )
+        )  # fmt: skip
+
+
+def _bar(parts: Any) -> Any:
+    """Return a Dask callback that draws the next part of a bar when a job is done."""
+    next(parts, None)
+    callback = require("dask.callbacks").Callback
+    return callback(posttask=lambda *_: next(parts, None))
 
 
 def _end_with_the_parent() -> None:

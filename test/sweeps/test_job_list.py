@@ -8,9 +8,9 @@ import sys
 import time
 from pathlib import Path
 
-from sst_ros.studies.parallel import run_jobs
+from sst_ros.sweeps.job_list import run_jobs
 
-ASKING = "from studies.test_parallel import waiting; waiting()"
+ASKING = "from sweeps.test_job_list import waiting; waiting()"
 
 
 def slow(number):
