@@ -116,6 +116,7 @@ def run_on_cluster(
 class _Run:
     def __init__(self, client: Any, task: ChunkTask, done: Any, note: Any) -> None:
         self._distributed = require("distributed")
+        self._closed = require("distributed.comm").CommClosedError
         # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
         self._waits = TimeoutError, self._distributed.TimeoutError, self._distributed.CancelledError
         self._client, self._task, self._done, self._note = client, task, done, note
@@ -130,10 +131,8 @@ class _Run:
             for worker, detail in refuse_other_versions(self._client, self._task).items():
                 self._refuse(worker, detail)
             self._run(waiting)
-        except (OSError, *self._waits) as error:
-            if self._alive():
-                raise
-            raise SweepFailed(NO_ANSWER) from error
+        except (self._closed, *self._waits) as error:
+            raise SweepFailed(f"{NO_ANSWER} ({error})") from error
         finally:
             if self._client.status == "running":
                 self._client.cancel(list(self._running), force=True)
