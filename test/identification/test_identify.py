@@ -156,7 +156,7 @@ def test_bad_arguments_are_refused():
     short = {name: rows[:10] for name, rows in good().items()}
     for data, options, message in (
         (short, {}, "must be 20 samples or more"),
-        (good(), {"method": "magic"}, "must be one of"),
+        (good(), {"method": "magic"}, "must be inverse_dynamics or simulation"),
         (good(), {"cutoff": 1e3}, "below half the rate of samples"),
         (good(), {"noise": (0.1, 0.0, 0.1)}, "three finite standard deviations"),
         (good(), {"parameters": ("mass",)}, "begins no parameter"),

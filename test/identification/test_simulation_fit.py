@@ -9,8 +9,9 @@ import pytest
 from identification import manipulators
 
 from sst_ros import load_scene, simulate
-from sst_ros.dynamics import kernel, loads
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
@@ -121,7 +122,7 @@ def test_the_slope_of_the_damping_by_the_restitution():
     for e in (0.05, 0.3, 0.8, 0.97):
         scene = load_scene("swing").with_values({"stroke": elastic | {"restitution": e}})
         high, low = (
-            loads.damping_of(scene.with_values({"stroke.restitution": e + h}).stroke)
+            damping_of(scene.with_values({"stroke.restitution": e + h}).stroke)
             for h in (1e-6, -1e-6)
         )
         assert damping_slope(scene) == pytest.approx((high - low) / 2e-6, rel=1e-7)
@@ -214,3 +215,16 @@ def test_options_of_the_other_method_are_refused():
         identify({}, scene, ("star.inertia.zz",), method="simulation", cutoff=3.0)
     with pytest.raises(InputError, match="must be in the scene"):
         identify({"t": [0.1], "psi": [0.0]}, scene, ("star.inertia.zz",), method="simulation")
+
+
+def test_the_sensitivity_to_the_restitution_over_a_bounce():
+    """gamma_1 meets its stop at 0.91 s; the slope of the damping takes part."""
+    elastic = {"at_end": "elastic", "stiffness": 500.0, "impact_rate": 1.5, "restitution": 0.6}
+    scene = load_scene("impacts").with_values({"stroke": elastic})
+    motion = Sensitivities(scene, ("stroke.restitution",), SineProfile(scene.torque))
+    end, h = np.array([1.0]), 1e-4
+    _, slopes = motion.run(np.array([0.6]), end)
+    high, low = (motion.run(np.array([0.6 + sign * h]), end)[0][0] for sign in (1.0, -1.0))
+    expected = (high - low) / (2.0 * h)
+    assert np.abs(expected).max() > 1e-3
+    assert np.abs(slopes[0, :, 0] - expected).max() < 1e-6 * np.abs(expected).max()
