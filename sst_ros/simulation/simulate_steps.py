@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_ros.errors import Diverged, RunStopped
 from sst_ros.integration.applied_torque import StateFeedback
-from sst_ros.integration.methods import RK4
+from sst_ros.integration.methods import RK4, RODAS4
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
@@ -149,8 +149,8 @@ class SteppedMotion:
         if self._period is None:
             if not isinstance(law, TorqueProfile):
                 return self._feedback
-            if isinstance(law, SineProfile):
-                return law.sine  # traced: implicit methods need its derivatives
+            if isinstance(law, SineProfile) and self._method == RODAS4.name:
+                return law.sine  # traced, which is slower here: the method needs its derivative
             piece = law.between(start, end / NANOSECONDS)
             return getattr(piece, "torque", piece)
         state = self._simulation.state
