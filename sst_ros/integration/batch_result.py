@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-_BLOCK = 8192
+_BLOCK = 1024
 """Scenarios whose joints are computed at once: all numbers of the program are arrays as long."""
 
 _SCENARIO = ("status", "message", "fault_time", "local_error")

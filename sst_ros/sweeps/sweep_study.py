@@ -34,7 +34,7 @@ FINAL = (*QUANTITIES, "energy")
 DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
 OUTPUTS = (*FINAL, "extremes")
 MOST_ROWS = 2**53
-CHUNK = 16_384
+CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
 _KEYS = (
