@@ -27,6 +27,7 @@ REPLY_S = 0.5
 CLOSE_S = 2.0
 """A node ends within this time of a signal."""
 NODE = "/sst_simulator"
+EXECUTABLES = Path(__file__).parents[2] / "executables"
 
 
 @contextmanager
@@ -60,11 +61,13 @@ def _lock(stack: contextlib.ExitStack) -> int:
 
 
 def start(command: str, patch: str = "", **given: object) -> subprocess.Popen[str]:
-    """Start a node with parameters; `patch` is code that it runs first."""
+    """Start a node as `ros2 run` does, with parameters; `patch` is code that it runs first."""
     words = ["--ros-args", *child_process.words(given)] if given else []
     program = f"{patch}\nimport sys\nfrom sst_ros.__main__ import main\nsys.exit(main())"
+    node = [sys.executable, "-c", program, command] if patch else [str(EXECUTABLES / command)]
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     return subprocess.Popen(
-        [sys.executable, "-c", program, command, *words],
+        [*node, *words], env={**os.environ, "PATH": path},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         pipesize=1 << 20,  # nobody reads before the end, and a full pipe stops the node
     )  # fmt: skip

@@ -161,6 +161,7 @@ class RunLoop:
             return Reply(False, f"fault, reset first: {self.fault}")
         if paused:
             reply = "already paused" if self.phase is Phase.PAUSED else "paused"
+            self._ticks.publish_rest()
             self._to(Phase.PAUSED)
             return Reply(True, reply)
         if self.phase is not Phase.PAUSED:

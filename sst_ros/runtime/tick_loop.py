@@ -20,6 +20,8 @@ _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.steps`, after which requests are served."""
+_LONGEST_WAIT_S = 0.1
+"""Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
 
 class Counters:
@@ -117,6 +119,7 @@ class TickLoop:
         self._period_ns, self._ticks_per_sample = given.period_ns, given.ticks_per_sample
         self._last_tick = math.ceil(given.duration * given.rate - 1e-6) or math.inf
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
+        self._kept: Triple | None = None  # in lockstep, an answer whose deadline has not come
         self._awaited_since = time.monotonic()
 
     def warm_up(self) -> None:
@@ -133,7 +136,7 @@ class TickLoop:
 
     def restart(self, simulation: Simulation) -> None:
         """Take another simulation, or the same at its start; stamps go on."""
-        self.simulation, self.begun, self._tick = simulation, False, 0
+        self.simulation, self.begun, self._tick, self._kept = simulation, False, 0, None
         self._input.clear()
         self.held.clear()
 
@@ -177,17 +180,25 @@ class TickLoop:
                 paused run is stepped.
 
         """
-        answer = self._answer(paced) if self._lockstep else None
-        if self._lockstep and answer is None:
-            return False
-        at_once = answer is not None or not paced or self._pacer.speed == 0.0
+        if self._lockstep:
+            self._kept = self._kept or self._answer(paced)
+            if self._kept is None:
+                return False
+        at_once = self._lockstep or not paced or self._pacer.speed == 0.0
+        longest = time.monotonic() + _LONGEST_WAIT_S
+
+        def interrupted() -> bool:
+            late = self.requested.is_set() and time.monotonic() > longest
+            return late or self.stopped.is_set()
+
         while True:
             ticks = self._ticks_left() if at_once else 1
-            if paced and not self._pacer.wait(self.stopped.is_set, ticks):
+            if paced and not self._pacer.wait(interrupted, ticks):
                 return False
-            torque = self._input.torque(self.simulation) if answer is None else answer
+            torque = self._kept or self._input.torque(self.simulation)
             self._advance(torque, 1 if self._input.depends_on_state else ticks)
             if self._tick % self._ticks_per_sample == 0 or self.complete:
+                self._kept = None
                 self._publish()
                 return True
 

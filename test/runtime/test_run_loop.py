@@ -150,6 +150,31 @@ def test_pause_is_idempotent_and_a_step_is_one_sample():
     assert spacing == {2_000_000}
 
 
+def test_requests_are_served_while_a_deadline_is_far():
+    bench = Bench(real_time_factor=1e-3)  # a tick takes 1 s, a sample 2 s
+    with bench.running() as loop:
+        bench.until(lambda: loop.counters.ticks == 1)
+        assert loop.ask(partial(loop.pause, True), timeout=0.5) == (True, "paused")
+        last = stamps(bench)[-1]
+        assert last - stamps(bench)[0] == 1_000_000  # what was done since the last sample is one
+        bench.until(lambda: bench.output.idles)
+        assert bench.output.idles[0][2] == last
+        assert loop.ask(loop.step).success
+        assert stamps(bench)[-1] == last + 1_000_000
+
+
+def test_an_answer_outlives_a_request_before_its_deadline():
+    bench = Bench(sync="lockstep", real_time_factor=1e-3, lockstep_timeout=1.0)
+    with bench.running() as loop:
+        bench.stamped.append(answer(0))
+        bench.until(lambda: stamps(bench))
+        bench.stamped.append(answer(stamps(bench)[0]))
+        bench.until(lambda: not bench.stamped)
+        assert loop.ask(lambda: Reply(True, "served"), timeout=0.5) == (True, "served")
+        bench.until(lambda: len(stamps(bench)) > 1)
+        assert not loop.fault
+
+
 def test_resume_makes_no_burst():
     bench = Bench(real_time_factor=1.0)
     with bench.running() as loop:
