@@ -78,9 +78,9 @@ class State:
         cls, time_ns: int, y: Sequence[float], joints: Sequence[float], torque: Vector3
     ) -> State:
         """Collect a state: quaternion and body rate begin y, 18 angles and rates are the joints."""
-        x, y_, z, w, wx, wy, wz = y[:7]
-        j = [(joints[i], joints[i + 1], joints[i + 2]) for i in range(0, 18, 3)]
-        return cls(time_ns, (x, y_, z, w), (wx, wy, wz), Joints(*j), torque)
+        j: Any = joints if type(joints) is tuple else tuple(joints)
+        by_kind = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])
+        return cls(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque)
 
 
 @dataclass(frozen=True)

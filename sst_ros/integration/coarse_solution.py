@@ -49,7 +49,7 @@ class ErrorGrowth(NamedTuple):
     def after(self, at: Point, end: Point, steps: int = 1) -> ErrorGrowth:
         """Add steps, of which the last led from `at` to `end`."""
         if not self.coulomb:
-            return ErrorGrowth(steps=self.steps + steps)
+            return ErrorGrowth((), self.steps + steps)
         old, new = ([a - b for a, b in zip(x.y[4:7], x.z[4:7], strict=True)] for x in (at, end))
         grown = math.dist(old, new)
         lost = grown if self._steps_over_sign_change(at, end) else 0.0
