@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,12 @@ LONGEST_S = 1.0
 
 AMPLITUDE = 1e-4
 """Distance of the springs' start from their rest [rad]: so small that the motion is linear."""
+
+FAR = -1e12
+"""Where the stability function of an L-stable method has vanished."""
+
+WRONG_ORDER, CONDITION, ROUNDING = 0.04, 1e-12, 1e-13
+"""Faults: difference from the order, relative, and from a condition; errors of R(z) by rounding."""
 
 _SHORTEST_S, _STEPS, _GROWTH = 1e-9, 400, 10.0
 
@@ -78,6 +84,50 @@ def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.
     for row in method.a:
         stages.append(one + z * _weighted(row, stages))
     return np.asarray(one + z * _weighted(method.b, stages))
+
+
+def method_faults(method: Method) -> Iterator[str]:
+    """Yield the order conditions that the coefficients of a method do not meet.
+
+    R(z) - exp(z) must fall with z^(order + 1); rows of an explicit method must add up to its nodes,
+    its weights integrate polynomials below its order, and its error weights vanish on those below
+    theirs (Hairer, Norsett & Wanner, Solving ODEs I, section II.1).
+    """
+    found = observed_order(method)
+    if abs(found / method.order - 1.0) > WRONG_ORDER:
+        yield f"order {found:.2f} in place of {method.order}"
+    if isinstance(method, Rosenbrock):
+        at_infinity = abs(stability_function(method, np.array([FAR + 0j]))[0])
+        if at_infinity > 1e-10:
+            yield f"not L-stable: abs(R({FAR:g})) = {at_infinity:.0e}"
+        if method.a[-1] != (*method.a[-2], 1.0):
+            yield "the last stage does not start from the solution of the one before"
+        return
+    off = max(abs(math.fsum(row) - c) for row, c in zip(method.a, method.c, strict=True))
+    # DOP853 combines two estimates, of orders 5 and 3, into one of order 7.
+    below = (5, 3) if method.damping else (method.error_order, 0)
+    for weights, count, what in (
+        (method.b, method.order, "weights"), (method.error, below[0], "error weights"),
+        (method.damping, below[1], "weights of the second estimate"),
+    ):  # fmt: skip
+        for k in range(count):
+            moment = math.fsum(w * c**k for w, c in zip(weights, method.c, strict=True))
+            wanted = 1.0 / (k + 1) if what == "weights" else 0.0
+            if abs(moment - wanted) > CONDITION:
+                yield f"{what}: moment {k} is off by {abs(moment - wanted):.0e}"
+    if off > CONDITION:
+        yield f"a row is off its node by {off:.0e}"
+
+
+def observed_order(method: Method) -> float:
+    """Order of R(z) at the smallest z whose error is not rounding, the worse of two axes."""
+    orders = []
+    for direction in (-1.0, 1j):
+        z = direction * 2.0 ** -np.arange(12.0)
+        errors = np.abs(stability_function(method, z) - np.exp(z))
+        last = np.flatnonzero(errors > ROUNDING)[-1]
+        orders.append(math.log2(errors[last - 1] / errors[last]) - 1.0)
+    return max(orders, key=lambda order: abs(order - method.order))
 
 
 def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-GENERATED = ("accuracy.md", "feedforward.md", "peers.md", "realtime.md")
+GENERATED = (
+    "accuracy.md", "control_rate.md", "feedforward.md", "peers.md", "realtime.md", "stability.md",
+)  # fmt: skip
 """Reports, whose words are not instructions."""
 
 
