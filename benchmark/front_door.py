@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `simulate` costs beside the integration itself: Example 2 at 1e-9 rad, compiled.
+"""What `simulate` costs beside the integration itself, and a command beside the import of NumPy.
 
 python -m benchmark.front_door
+
+`simulate` runs Example 2 at 1e-9 rad, compiled; the command is `sst-ros scene list`.
 """
 
+import resource
+import subprocess
+import sys
 import time
 from statistics import median
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.integration.gauss_motion import GaussMotion
 
-ROUNDS, CALLS = 50, 40
+ROUNDS, CALLS, STARTS = 50, 40, 9
 
 
 def seconds(call):
@@ -18,6 +23,14 @@ def seconds(call):
     for _ in range(CALLS):
         call()
     return (time.perf_counter() - began) / CALLS
+
+
+def processor_seconds(*words):
+    """Processor time of one start of Python [s]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True, timeout=60)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def main():
@@ -35,6 +48,17 @@ def main():
     print(found)
     print(f"integration {alone:.1f} us, simulate() {all_of_it:.1f} us")
     print(f"overhead {ratio - 1.0:.2f} times the integration (median of {ROUNDS} rounds)")
+    starts = [
+        (
+            processor_seconds("-m", "sst_ros", "scene", "list"),
+            processor_seconds("-c", "import numpy"),
+        )
+        for _ in range(STARTS)
+    ]
+    ratio = median(listing / numpy for listing, numpy in starts)
+    print(
+        f"sst-ros scene list: {ratio:.1f} times import numpy (median of {STARTS} rounds, limit 3)"
+    )
 
 
 if __name__ == "__main__":

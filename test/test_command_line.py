@@ -283,24 +283,3 @@ def test_the_workspace_of_a_scene_is_drawn(tmp_path, monkeypatch, capsys):
     assert "parallel: none inside" in capsys.readouterr().out
     assert (tmp_path / "example2_workspace.png").stat().st_size > 50_000
     assert "exists already" in error_of(["workspace", "example2"], capsys)
-
-
-def processor_time(*words):
-    """Least processor time of three starts of Python [s]."""
-    times = []
-    for _ in range(3):
-        before = os.times()
-        subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True, timeout=60)
-        after = os.times()
-        times.append(
-            after.children_user + after.children_system
-            - before.children_user - before.children_system
-        )  # fmt: skip
-    return min(times)
-
-
-def test_the_list_of_scenes_comes_fast():
-    """It loads fourteen scenes; half of the time is the import of NumPy."""
-    assert processor_time("-m", "sst_ros", "scene", "list") <= 3.0 * processor_time(
-        "-c", "import numpy"
-    )

@@ -107,7 +107,7 @@ class Task:
 
     def kernel_answer(self, y: list[float], torque: Array) -> Array:
         """gamma_ddot [rad/s^2] of the kernel that sst_ros runs."""
-        rate = np.array(self.dynamics.acceleration(*y, *torque))
+        rate = np.array(self.dynamics.derivative(*y, *torque)[4:7])
         reach = np.array(self.dynamics.reach(*y))
         return np.asarray(reach[:9].reshape(3, 3) @ rate + reach[9:])
 
