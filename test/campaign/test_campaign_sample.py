@@ -13,6 +13,8 @@ ROS = {"damages", "recorder_kills", *(part for part, room in PARTS.items() if ro
 def test_nothing_is_found_in_a_share_of(part):
     if part in ROS:
         pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+    if part == "bits":
+        pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
     # Other tests run at the same time: only what takes ten times its bound is a hang here.
     ledger = run(part, 0.02, seed=7, patience=10.0)
     assert ledger.tried > 0
