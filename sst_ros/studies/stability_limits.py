@@ -123,7 +123,7 @@ def observed_order(method: Method) -> float:
     """Order of R(z) at the smallest z whose error is not rounding, the worse of two axes."""
     orders = []
     for direction in (-1.0, 1j):
-        z = direction * 2.0 ** -np.arange(12.0)
+        z = np.asarray(direction * 2.0 ** -np.arange(12.0), dtype=np.complex128)
         errors = np.abs(stability_function(method, z) - np.exp(z))
         last = np.flatnonzero(errors > ROUNDING)[-1]
         orders.append(math.log2(errors[last - 1] / errors[last]) - 1.0)
