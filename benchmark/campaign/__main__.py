@@ -47,7 +47,8 @@ def main() -> int:
     parts = options.only or list(PARTS)
     began, found = time.monotonic(), {}
     with ProcessPoolExecutor(options.processes, max_tasks_per_child=1) as pool:
-        long_first = sorted(parts, key=lambda part: PARTS[part] != "nodes")
+        # The longest first: `bits` compiles 200 scenes, then the nodes.
+        long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part] != "nodes"))
         waiting = {pool.submit(run, part, options.share, options.seed): part for part in long_first}
         for future in as_completed(waiting):
             part = waiting[future]

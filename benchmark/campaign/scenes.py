@@ -252,8 +252,8 @@ def bits(budget: Budget, seed: int) -> Ledger:
     )
     for number in budget.cases(200, least=1):
         name = f"scene {number} (seed {seed + 1})"
-        method = rng.choice(("rk4", "dopri5", "dop853", "rodas4", "auto"))
-        # Compiling takes seconds.
+        # Compiling takes seconds, for `auto` that of three methods.
+        method = rng.choice(("rk4", "dopri5", "dop853", "rodas4")) if number % 10 else "auto"
         with ledger.case(f"{name} {method}", (SstError,), bound=120.0), warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = random_scene(rng)
