@@ -50,6 +50,8 @@ def own_domain():
 @pytest.mark.parametrize("page", WITH_BLOCKS)
 def test_every_block_of_a_page_runs(page, tmp_path):
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+    if "parquet" in (ROOT / page).read_text(encoding="utf-8"):
+        pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
     from docs.session import Session
 
     with own_domain() as domain, contextlib.closing(Session(tmp_path, domain)) as session:
