@@ -237,8 +237,8 @@ def _cell(results: Results, found: Reached, target: float) -> str:
     if found.time is None:
         return "-"
     ratio = results.ratio(found, target)
-    found = "" if ratio is None else f" ({_rounded(ratio)} x)"
-    return f"{1e3 * found.time:.3g}{found}"
+    beside = "" if ratio is None else f" ({_rounded(ratio)} x)"
+    return f"{1e3 * found.time:.3g}{beside}"
 
 
 def _rounded(ratio: float) -> str:

@@ -101,6 +101,18 @@ def test_our_headline_is_the_public_call(peers, task):
         assert peers("task").apart(end, ends[-1]) <= tolerance + 1e-13
 
 
+def test_the_table_has_times_and_their_ratio_to_ours(peers, task):
+    study, results = peers("study"), peers("results")
+    rows = []
+    for module, seconds in (("ours", 1e-5), ("scipy_peer", 1e-3)):
+        series = peers(module).series(task, quick=True)[0]
+        point = study.Point(series.settings[0], 1e-12, 1e-12, 1e-12, seconds=[seconds] * 3)
+        rows.append(study.Curve(series, 0.0, [point]))
+    found = results.Results(rows, {}, 0.0, 3, True, 1.0, None)
+    ours, other = results.rows(found)[1:]
+    assert set(ours[4:]) == {"0.01 (1 x)"} and set(other[4:]) == {"1 (100 x)"}
+
+
 def test_the_readme_has_the_table_of_the_published_results(peers):
     readme = peers("readme")
     text = readme.README.read_text(encoding="utf-8")
