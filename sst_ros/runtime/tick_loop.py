@@ -204,7 +204,7 @@ class TickLoop:
 
     def publish_rest(self) -> None:
         """Publish what has been done since the last sample, if anything."""
-        if self.begun and self._tick % self._ticks_per_sample:
+        if self.begun and self._start_ns + self._tick * self._period_ns != self._stamp_ns:
             with contextlib.suppress(Exception):  # publishing may be what failed
                 self._publish()
 

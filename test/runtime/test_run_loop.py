@@ -159,6 +159,8 @@ def test_requests_are_served_while_a_deadline_is_far():
         assert last - stamps(bench)[0] == 1_000_000  # what was done since the last sample is one
         bench.until(lambda: bench.output.idles)
         assert bench.output.idles[0][2] == last
+        assert loop.ask(partial(loop.pause, True)) == (True, "already paused")
+        assert stamps(bench)[-2] < last == stamps(bench)[-1]  # and is published once
         assert loop.ask(loop.step).success
         assert stamps(bench)[-1] == last + 1_000_000
 
