@@ -78,7 +78,8 @@ class Batch:
         if problems:
             raise InputError(scene.name, problems)
         self.scene, self._method = scene, method
-        self._scenarios = Scenarios(scene, parameters or {})
+        own = {key: copy.copy(values) for key, values in (parameters or {}).items()}
+        self._scenarios = Scenarios(scene, own)
         self._scenarios.check(progress=progress)
         self.model = ParametricModel(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
@@ -155,9 +156,12 @@ class Batch:
         self, gamma: ArrayLike, gamma_dot: ArrayLike, *, progress: bool = False
     ) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
-        angles = _rows("gamma", gamma, self._scenarios.count)
+        count = self._scenarios.count
+        # One start for all is solved once.
+        alike = np.ndim(gamma) == np.ndim(gamma_dot) == 1 and len(self.columns.geometries) == 1
+        angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
-        which = np.broadcast_to(self.columns.geometry, len(angles))
+        which = np.broadcast_to(self.columns.geometry[: len(angles)], len(angles))
         label = f"{self.scene.name}, starting"
         quaternion, rate, code = initial_states(
             self.columns.geometries,
@@ -168,9 +172,10 @@ class Batch:
             label=label,
             progress=progress,
         )
-        y = np.zeros((len(self.state), len(angles)))
+        number = count if alike and count else len(angles)
+        y = np.zeros((len(self.state), number))
         y[:4], y[4:7] = quaternion.T, rate.T
-        return y, code
+        return y, np.repeat(code, number) if alike else code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""

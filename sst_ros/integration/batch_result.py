@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_ros.extras import require
 from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.initial_states import REASONS
-from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
+from sst_ros.integration.parametric_model import OUTPUTS, ParameterColumns, ParametricModel
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
 from sst_ros.state import DIMENSIONS, QUANTITIES
@@ -59,43 +59,71 @@ class BatchStates:
         self._model, self._columns, self._torque, self._valid = model, columns, torque, valid
         self._state = np.moveaxis(y, -2, -1)
         self.t = t
+        self._computed: dict[str, Array] = {}
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
 
     @property
     def gamma(self) -> Array:
         """Angles of the actuators [rad], shape (..., N, 3); nan where a scenario has no start."""
-        return self._outputs[..., 0:3]
+        return self._quantity("gamma")
 
     @property
     def mu(self) -> Array:
         """Angles between base arcs and arcs of the star [rad], shape (..., N, 3)."""
-        return self._outputs[..., 3:6]
+        return self._quantity("mu")
 
     @property
     def beta(self) -> Array:
         """Angles from the carriages to E [rad], shape (..., N, 3)."""
-        return self._outputs[..., 6:9]
+        return self._quantity("beta")
 
     @property
     def gamma_dot(self) -> Array:
         """Rates of gamma [rad/s], shape (..., N, 3)."""
-        return self._outputs[..., 9:12]
+        return self._quantity("gamma_dot")
 
     @property
     def mu_dot(self) -> Array:
         """Rates of mu [rad/s], shape (..., N, 3)."""
-        return self._outputs[..., 12:15]
+        return self._quantity("mu_dot")
 
     @property
     def beta_dot(self) -> Array:
         """Rates of beta [rad/s], shape (..., N, 3)."""
-        return self._outputs[..., 15:18]
+        return self._quantity("beta_dot")
 
     @property
     def energy(self) -> Array:
         """Kinetic and potential energy [J], shape (..., N)."""
-        return self._outputs[..., 18]
+        return self._quantity("energy")[..., 0]
+
+    def compute(self, *names: str) -> None:
+        """Compute these quantities of joints, or the energy, and no others, for later use."""
+        if not names:
+            return
+        shapes = [1 if name == "energy" else 3 for name in names]
+        found = np.empty((sum(shapes), *self.t.shape))
+        flat = found.reshape(len(found), -1, self.t.shape[-1])
+        function = self._model.output_function(names)
+        states = np.moveaxis(self._state, -1, 0)[:7].reshape(7, *flat.shape[1:])
+        columns = self._columns.inputs
+        for sample in range(flat.shape[1]):
+            for first in range(0, flat.shape[2], _BLOCK):
+                rows = slice(first, first + _BLOCK)
+                own = columns[:, rows] if columns.shape[1] > 1 else columns
+                with np.errstate(all="ignore"):
+                    numbers = function(*states[:, sample, rows], *own)
+                for j, number in enumerate(numbers):
+                    flat[j, sample, rows] = number
+        flat[..., ~self._valid] = np.nan
+        parts = np.split(np.moveaxis(found, 0, -1), np.cumsum(shapes)[:-1], axis=-1)
+        self._computed |= dict(zip(names, parts, strict=True))
+
+    def _quantity(self, name: str) -> Array:
+        if name not in self._computed:
+            self.compute(*OUTPUTS)
+        return self._computed[name]
 
     @cached_property
     def euler_zyz(self) -> Array:
@@ -112,26 +140,6 @@ class BatchStates:
             return np.broadcast_to(self._torque, self.body_rate.shape)
         rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
         return np.stack([a * np.sin(f * self.t + p) for a, f, p in rows], axis=-1)
-
-    @cached_property
-    def _outputs(self) -> Array:
-        """Angles and rates of the joints and the energy, shape (..., N, 19)."""
-        program = self._model.outputs
-        function = self._model.output_function
-        found = np.full((*self.t.shape, len(program.outputs)), np.nan)
-        flat = found.reshape(-1, *found.shape[-2:])
-        states = self._state.reshape(-1, *self._state.shape[-2:])
-        started = np.flatnonzero(self._valid)
-        blocks = [started[i : i + _BLOCK] for i in range(0, len(started), _BLOCK)]
-        columns = self._columns.inputs
-        for sample, of_sample in enumerate(states):
-            for rows in blocks:
-                own = columns[:, rows] if columns.shape[1] > 1 else columns
-                with np.errstate(all="ignore"):
-                    numbers = function(*of_sample[rows, :7].T, *own)
-                for j, number in enumerate(numbers):
-                    flat[sample, rows, j] = number
-        return found
 
     def to_xarray(self) -> xr.Dataset:
         """Arrays with the dimension scenario, before it time if there are several; needs xarray."""

@@ -51,9 +51,9 @@ def initial_states(
     order = np.argsort(which, kind="stable")
     groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(geometries)))[:-1])
     blocks = [
-        (geometry, rows[first : first + _BLOCK])
+        (geometry, block)
         for geometry, rows in zip(geometries, groups, strict=True)
-        for first in range(0, len(rows), _BLOCK)
+        for block in _blocks(rows, gamma)
     ]
     for part in slices(len(blocks), 0, label, progress):
         for geometry, rows in blocks[part]:
@@ -66,7 +66,7 @@ def initial_states(
             one[owner] = valid
             starting = counts[same] == 1
             here, chosen = rows[starting], one[same[starting]]
-            moving = gamma_dot[here].any(axis=1)
+            moving = _any(gamma_dot[here] != 0.0)
             singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
             code[here] = np.where(singular, NO_RATE, 0)
             if len(here):
@@ -77,17 +77,29 @@ def initial_states(
                     geometry, found.rotation[chosen[moves]], gamma_dot[here[moves]]
                 )
             if stroke:
-                outside = (gamma[rows] < 0.0) | (gamma[rows] > geometry.arc)
-                code[rows[outside.any(axis=1)]] = OUTSIDE
+                code[rows[_any((gamma[rows] < 0.0) | (gamma[rows] > geometry.arc))]] = OUTSIDE
     return quaternion, rate, code
 
 
-_BLOCK = 20_000
+_BLOCK = 2000
+"""Rows solved at once: their arrays fit the cache."""
+
+
+def _any(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """`mask.any(axis=1)` of (N, 3), ten times as fast."""
+    return np.asarray(mask[:, 0] | mask[:, 1] | mask[:, 2])
+
+
+def _blocks(rows: NDArray[np.intp], gamma: Array) -> list[NDArray[np.intp]]:
+    """Rows in blocks, in a single one where all start alike."""
+    if (gamma[rows] == gamma[rows[:1]]).all():
+        return [rows] if len(rows) else []
+    return np.array_split(rows, -(-len(rows) // _BLOCK))
 
 
 def _distinct(rows: Array) -> tuple[Array, NDArray[np.intp]]:
     """Distinct rows of (N, 3), and for each row the index of its own."""
-    if np.array_equal(rows, np.broadcast_to(rows[:1], rows.shape)):
+    if (rows == rows[:1]).all():
         return rows[:1], np.zeros(len(rows), dtype=np.intp)
     different, same = np.unique(rows, axis=0, return_inverse=True)
     return different, same.ravel()

@@ -25,6 +25,10 @@ from sst_ros.integration.ode import ODE
 from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.state import Joints
+
+OUTPUTS = (*Joints._fields, "energy")
+"""Quantities of a state that depend on the numbers of its scenario."""
 
 _OF_GEOMETRY = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 
@@ -78,6 +82,7 @@ class ParametricModel:
         self._fixed = {place: float(np.ravel(value)[0]) for place, value in numbers.items()}
         dynamics = Dynamics.of(self.scene)
         self._moved = dynamics.moved
+        self._functions: dict[tuple[str, ...], Callable[..., tuple[Any, ...]]] = {}
         self.ode = ODE(dynamics, self.scene.torque if profile else None)
         self._limits = tuple(limits_of(self.scene, geometries[0]))
 
@@ -136,21 +141,22 @@ class ParametricModel:
 
         return trace(distances, (*QUATERNION, *RATE, *self.names))
 
-    @cached_property
-    def outputs(self) -> Program:
-        """Angles and rates of joints (18 numbers) and energy [J]; inputs as `limit_distances`."""
+    def output_function(self, names: tuple[str, ...]) -> Callable[..., tuple[Any, ...]]:
+        """Return a function of arrays: quantities of OUTPUTS by name; inputs as `limit_distances`.
+
+        Three angles [rad] or rates [rad/s] each, or the energy [J].
+        """
 
         def values(*inputs: Expression) -> tuple[Any, ...]:
             model, state = self.constants(inputs[7:]).model, inputs[:7]
-            joints = [number for triple in kernel.joints(model, state) for number in triple]
-            return (*joints, energy.kinetic(model, state) + energy.potential(model, state))
+            found = kernel.joints(model, state)._asdict()
+            found["energy"] = (energy.kinetic(model, state) + energy.potential(model, state),)
+            return tuple(number for name in names for number in found[name])
 
-        return trace(values, (*QUATERNION, *RATE, *self.names))
-
-    @cached_property
-    def output_function(self) -> Callable[..., tuple[Any, ...]]:
-        """The program `outputs` as a function of arrays."""
-        return compiled_for_arrays(self.outputs)
+        if names not in self._functions:
+            program = trace(values, (*QUATERNION, *RATE, *self.names))
+            self._functions[names] = compiled_for_arrays(program)
+        return self._functions[names]
 
     @property
     def names(self) -> tuple[str, ...]:

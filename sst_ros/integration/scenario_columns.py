@@ -56,8 +56,8 @@ def valid_rows(
     for key, values in rows.items():
         spec, flat = specs[key], values.reshape(count, -1)
         least = SMALLEST if spec.above == 0.0 else spec.least
-        valid &= ((flat >= least) & (flat <= min(spec.most, LARGEST))).all(axis=1)
-        valid &= (flat >= -LARGEST).all(axis=1)
+        for column in flat.T:
+            valid &= (column >= max(least, -LARGEST)) & (column <= min(spec.most, LARGEST))
     reach = max(scene.base.radius, scene.star.radius) * (1.0 - RELATIVE_ROUNDING)
     mass: Any = 0.0
     for body in (columns.star, *columns.actuated_links, *columns.intermediate_links):
@@ -148,6 +148,8 @@ def _is_inertia(tensor: tuple[Any, ...]) -> Mask:
 
 def _is_positive(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Mask:
     """Whether a symmetric matrix is positive definite: the pivots of its L D L^T are positive."""
+    if not any(isinstance(x, np.ndarray) or x != 0.0 for x in (xy, xz, yz)):
+        return np.asarray((xx > 0.0) & (yy > 0.0) & (zz > 0.0))
     second = yy - xy * xy / xx
     off = yz - xy * xz / xx
     third = zz - xz * xz / xx - off * off / second

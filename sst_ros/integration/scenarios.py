@@ -171,7 +171,7 @@ def _entered(tree: Tree, section: Section, words: list[str], key: str) -> Spec:
 def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Array:
     words = ", ".join(map(str, (count or "N", *spec.shape))) + ("" if spec.shape else ",")
     try:
-        rows = np.array(value, dtype=float)
+        rows = np.asarray(value, dtype=float)
     except TypeError as error:
         raise ValueError(str(error)) from None
     number = count or max(1, len(np.atleast_1d(rows)))

@@ -111,11 +111,10 @@ def run_chunk(task: ChunkTask, index: int, worker: str = "") -> ChunkOutcome:
     )
     if folder is None:
         return ChunkOutcome(**vars(outcome) | {"table": table, "trajectory": trajectory})
-    about = parts.metadata(task.study, task.steps, ready.units)
     try:
         if trajectory is not None:
-            parts.write(trajectory, folder, parts.part(index, "trajectory"), about)
-        parts.write(table, folder, parts.part(index), about)
+            parts.write(trajectory, folder, parts.part(index, "trajectory"), ready.about)
+        parts.write(table, folder, parts.part(index), ready.about)
     except OSError as error:
         return ChunkOutcome(index, UNWRITABLE, f"{folder}: {error}", worker=worker)
     return outcome

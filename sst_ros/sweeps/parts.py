@@ -32,21 +32,6 @@ def part(index: int, kind: str = "part") -> str:
     return f"{kind}-{index:07d}.parquet"
 
 
-def metadata(study: SweepStudy, steps: int, units: Mapping[str, str]) -> dict[str, Any]:
-    """Return what a file says of itself."""
-    import sst_ros
-
-    return {
-        "version": sst_ros.__version__,
-        "digest": study.digest,
-        "steps": steps,
-        "duration": study.length,
-        "study": study.document(),
-        "units": dict(units),
-        "inputs": [name for one in study.variations for name in one.columns],
-    }
-
-
 def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) -> None:
     """Write a table as a file that is there whole or not at all.
 
@@ -61,8 +46,10 @@ def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) ->
     handle, temporary = tempfile.mkstemp(prefix=_TEMPORARY, dir=folder)
     try:
         with os.fdopen(handle, "wb") as file:
-            # Random mantissas do not compress.
-            parquet.write_table(table, file, compression="none", use_dictionary=["reason"])
+            # Random mantissas do not compress, and their least and greatest help no reader.
+            parquet.write_table(
+                table, file, compression="none", use_dictionary=["reason"], write_statistics=False
+            )
             file.flush()
             os.fsync(file.fileno())
         Path(temporary).chmod(0o644)

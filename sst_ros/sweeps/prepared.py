@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import threading
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_result import BatchResult, BatchStates
+from sst_ros.integration.parametric_model import OUTPUTS
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
 from sst_ros.state import DIMENSIONS, QUANTITIES
@@ -102,6 +104,21 @@ class PreparedSweep:
             parameters |= one.parameters(values[one.key])
         Scenarios(self.study.model_scene, _split(parameters)[0]).check()
 
+    @cached_property
+    def about(self) -> dict[str, Any]:
+        """Metadata of the files: study, its digest, version, units."""
+        import sst_ros
+
+        return {
+            "version": sst_ros.__version__,
+            "digest": self.study.digest,
+            "steps": self.steps,
+            "duration": self.study.length,
+            "study": self.study.document(),
+            "units": self.units,
+            "inputs": [name for one in self.study.variations for name in one.columns],
+        }
+
     @property
     def units(self) -> dict[str, str]:
         """Unit of each column that has one."""
@@ -126,6 +143,7 @@ class PreparedSweep:
             "fault_time": result.fault_time,
             "local_error": result.local_error,
         }
+        result.compute(*(name for name in OUTPUTS if name in self.study.outputs))
         for name in self.study.outputs:
             if name == "energy":
                 columns[name] = result.energy
@@ -170,8 +188,10 @@ class PreparedSweep:
         initial = self.study.scene.initial
         if self.controlled is not None:
             return self.controlled.run(batch, starts, rows, steps, kept)
-        gamma = starts.get("initial.gamma", np.tile(initial.gamma, (count, 1)))
-        rate = starts.get("initial.gamma_dot", np.tile(initial.gamma_dot, (count, 1)))
+        gamma = starts.get("initial.gamma", np.array(initial.gamma))
+        rate = starts.get("initial.gamma_dot", np.array(initial.gamma_dot))
+        if scenarios.count is None:
+            gamma = np.broadcast_to(gamma, (count, 3))
         step = self.study.length / steps
         every = kept or (-(-steps // PARTS) if "extremes" in self.study.outputs else 0)
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)

@@ -114,8 +114,9 @@ def run_study(
         with writing(out, "sweep"):
             parts.clear_temporary(out)
             done = parts.complete(out, study, ready.steps)
-            about = parts.metadata(study, ready.steps, ready.units)
-            (out / "study.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+            (out / "study.json").write_text(
+                json.dumps(ready.about, indent=1) + "\n", encoding="utf-8"
+            )
     bar = SweepProgress(study.rows, _rows(study, done), shown=progress)
     tables: dict[int, ChunkOutcome] = {}
 
@@ -135,7 +136,7 @@ def run_study(
         run_on_cluster(client, task, missing, take, bar.note)
     if out is not None:
         return _read(out, study)
-    return _joined(study, ready, tables)
+    return _joined(ready, tables)
 
 
 def _recorded_steps(out: Path | None) -> int | None:
@@ -164,14 +165,11 @@ def _read(out: Path, study: SweepStudy) -> pd.DataFrame:
     return frame
 
 
-def _joined(
-    study: SweepStudy, ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]
-) -> pd.DataFrame:
+def _joined(ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]) -> pd.DataFrame:
     pyarrow = require("pyarrow")
     ordered = [outcomes[index] for index in sorted(outcomes)]
-    about = parts.metadata(study, ready.steps, ready.units)
-    frame = parts.framed(pyarrow.concat_tables([one.table for one in ordered]), about)
+    frame = parts.framed(pyarrow.concat_tables([one.table for one in ordered]), ready.about)
     known = [one.trajectory for one in ordered if one.trajectory is not None]
     if known:
-        frame.attrs["trajectory"] = parts.framed(pyarrow.concat_tables(known), about)
+        frame.attrs["trajectory"] = parts.framed(pyarrow.concat_tables(known), ready.about)
     return frame
