@@ -30,3 +30,30 @@ def test_numpy_and_yaml_are_all_that_is_loaded(program):
     )  # fmt: skip
     loaded = set(done.stdout.splitlines()[-1].split())
     assert "sst_ros" in loaded and not loaded & HEAVY
+
+
+STEPS = """
+import sys
+from sst_ros import Simulation
+from sst_ros.errors import RunStopped
+simulation = Simulation("{scene}", compiled=False)
+simulation.load_code(1_000_000)
+before = set(sys.modules)
+try:
+    simulation.steps(({torque}, 0.0, 0.0), 1_000_000, 2000)
+except RunStopped as stopped:
+    print(stopped)
+assert simulation.time_ns > 100_000_000
+print(*sorted(set(sys.modules) - before))
+"""
+
+
+@pytest.mark.parametrize(("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)])
+def test_steps_import_nothing_after_the_code_is_loaded(scene, torque):
+    """A limit or a stop that a run in real time meets costs no import: it takes 0.4 s."""
+    done = subprocess.run(
+        [sys.executable, "-c", STEPS.format(scene=scene, torque=torque)],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == ""

@@ -25,6 +25,7 @@ from sst_ros.integration.events import (
     first_event,
     free_range,
     just_beyond,
+    load_root_finder,
     may_occur,
 )
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
@@ -192,6 +193,7 @@ class Propagator:
 
     def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
         """Have the code loaded that periods of h [s] under constant torques may need."""
+        load_root_finder()
         self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
 
     def torque_at(self, torque: Torque, time: float, y: list[float]) -> Vector3:

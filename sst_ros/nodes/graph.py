@@ -21,13 +21,6 @@ def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str
     ]
 
 
-def namesakes(node: Node) -> int:
-    """Count other nodes with the same full name."""
-    own = node.get_fully_qualified_name()
-    found = node.get_node_names_and_namespaces()
-    return sum(full_name(namespace, name) == own for name, namespace in found) - 1
-
-
 def full_name(namespace: str, name: str) -> str:
     """Join a namespace and a name; names that are not yet known are put into words."""
     return UNNAMED if _UNKNOWN in name else f"{namespace.rstrip('/')}/{name}"

@@ -63,6 +63,15 @@ def own_domain():
     raise AssertionError("no ROS domain is free")
 
 
+def children(process):
+    """Numbers of the processes that a process has started."""
+    return Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+
+
+def is_running(number):
+    return Path(f"/proc/{number}").exists()
+
+
 class Nodes:
     """Starts nodes and leaves none behind."""
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSProfile
+from ros.conftest import children, is_running
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool
@@ -183,11 +184,11 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
     looking = "from sst_ros.view.live import simulator\nwith simulator('swing'): input()"
     viewer = subprocess.Popen([sys.executable, "-c", looking], stdin=subprocess.PIPE)
-    names = observer.node.get_node_names
-    observer.until(lambda: "sst_simulator" in names(), "simulator")
+    observer.until(lambda: "sst_simulator" in observer.node.get_node_names(), "simulator")
+    (simulator,) = children(viewer)
     viewer.kill()
     viewer.communicate()
-    observer.until(lambda: "sst_simulator" not in names(), "end of it", 10.0)
+    observer.until(lambda: not is_running(simulator), "end of it")
 
 
 def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer):

@@ -130,10 +130,14 @@ def test_refused_parameters_are_named(run_here, given, said):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, observer, number):
-    """Otherwise it would be there for 20 s more, and a new one would not be the only one."""
+    """Otherwise it would be there for 20 s more, and a new one would not be the only one.
+
+    Its name may stay: rmw_dds_common keeps for ever what a node that has left said at last.
+    """
     process = nodes.run("simulator")
-    names = observer.node.get_node_names
     observer.told("phase", "running")
     status, _, err = nodes.stop(process, number)
     assert status == 0 and "Traceback" not in err
-    observer.until(lambda: "sst_simulator" not in names(), "end of it", 5.0)
+    observer.until(
+        lambda: not observer.node.count_publishers("/sst_simulator/phase"), "end of it", 5.0
+    )

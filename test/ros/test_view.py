@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ros.conftest import Nodes, Observer
+from ros.conftest import Nodes, Observer, children, is_running
 from std_msgs.msg import Float64MultiArray, String
 
 pytest.importorskip("viser", reason="needs viser: pip install .[view]")
@@ -122,6 +122,7 @@ def test_torques_by_hand_until_a_controller_comes(viewed):
 
 def test_ctrl_c_ends_the_page_and_the_simulator(viewed):
     started, process, _, watching = viewed
+    (simulator,) = children(process)
     status, _, errors = started.stop(process, signal.SIGINT, 30)
     assert status == 0 and "Traceback" not in errors
-    watching.until(lambda: "sst_simulator" not in watching.node.get_node_names(), "end of it", 5.0)
+    watching.until(lambda: not is_running(simulator), "end of it", 5.0)
