@@ -8,7 +8,7 @@ EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 
-.PHONY: help demo demo-feedforward demo-identify demo-sweep docs view test test-all test-jazzy test-ros test-slow lint format clean
+.PHONY: help demo demo-feedforward demo-identify demo-sweep docs view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -52,9 +52,16 @@ test-slow: $(VENV)/.test  ## run the slow tests: sweeps, long pages, packages, f
 test-all: test test-slow test-jazzy  ## run all tests
 
 lint: $(VENV)/.test  ## check style and types
+	@$(MAKE) --no-print-directory --jobs --keep-going --output-sync lint-style lint-types lint-words
+
+lint-style:
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+
+lint-types:
 	$(VENV)/bin/mypy
+
+lint-words:
 	$(VENV)/bin/codespell
 
 format: $(VENV)/.test  ## format the source

@@ -22,11 +22,10 @@ import numpy as np
 from benchmark import c_batch, c_floor, machine, variants
 from benchmark.timing import interleaved, ratio
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.methods import DOP853, RK4, Tableau
-from sst_ros.integration.ode import ODE
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 

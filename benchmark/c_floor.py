@@ -14,8 +14,8 @@ import subprocess
 from pathlib import Path
 
 from sst_ros.dynamics.expression import Program
+from sst_ros.integration.codegen import explicit_step
 from sst_ros.integration.methods import Tableau
-from sst_ros.integration.runge_kutta_source import explicit_step
 
 HEAD = "#include <math.h>\n#define abs fabs\n#define max fmax\n#define nan NAN\n"
 

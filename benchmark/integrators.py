@@ -21,10 +21,9 @@ import numpy as np
 
 from benchmark import machine as described
 from benchmark.timing import interleaved
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
-from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 

@@ -22,10 +22,9 @@ import numpy as np
 from benchmark import c_floor, machine
 from benchmark.timing import interleaved, ratio
 from sst_ros.dynamics.expression import Program
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
-from sst_ros.integration.ode import ODE
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 

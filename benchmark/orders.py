@@ -18,11 +18,10 @@ from scipy.integrate import solve_ivp
 
 from benchmark import machine
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, RODAS4
-from sst_ros.integration.ode import ODE
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 
@@ -70,7 +69,10 @@ def _orders() -> None:
         told(method.name, method.order, n, [math.dist(end, truth) for end in ends])
     for nodes, n in ((2, 64), (4, 12)):
         gauss = Collocation(system, nodes, compiled=False)
-        ends = [gauss.solve(0.0, SPAN / k, k, start, iterations=20).y for k in (n, 2 * n)]
+        motions = [gauss.prepare(0.0, SPAN / k, k, start, iterations=20) for k in (n, 2 * n)]
+        for motion in motions:
+            motion.run()
+        ends = [motion.end for motion in motions]
         told(f"gauss {nodes}", 2 * nodes, n, [math.dist(end, truth) for end in ends])
 
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmark import machine
 from benchmark.timing import interleaved
-from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
-from sst_ros.integration.ode import ODE
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compiled
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 

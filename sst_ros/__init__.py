@@ -12,76 +12,41 @@ import importlib
 
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
-    from sst_ros.control.controller import Controller
-    from sst_ros.control.controller_settings import ControllerSettings
-    from sst_ros.control.inverse_dynamics import InverseDynamics
-    from sst_ros.control.reference import ReferenceMotion
-    from sst_ros.control.reference_motions import reference_motion
-    from sst_ros.errors import (
-        AssemblyError,
-        InputError,
-        RunStopped,
-        SingularConfiguration,
-        SstError,
-    )
-    from sst_ros.identification.identification import Identification
-    from sst_ros.identification.identify import identify
-    from sst_ros.integration.batch import Batch
-    from sst_ros.mechanism.geometry import Geometry
-    from sst_ros.mechanism.kinematics import direct as direct_kinematics
-    from sst_ros.mechanism.kinematics import inverse as inverse_kinematics
-    from sst_ros.mechanism.workspace import workspace
-    from sst_ros.plot.workspace import plot_workspace
-    from sst_ros.recording.recording import Recording
-    from sst_ros.recording.recording import read as read_bag
-    from sst_ros.scene.arcs import arc_inertia
-    from sst_ros.scene.loads import SineTorque
-    from sst_ros.scene.scene import Scene
-    from sst_ros.scene.scene import load as load_scene
-    from sst_ros.simulation.simulate import simulate
-    from sst_ros.simulation.simulation import Simulation
-    from sst_ros.simulation.torque import TorqueTable
-    from sst_ros.simulation.torque_profile import PolynomialTorque
-    from sst_ros.simulation.trajectory import Trajectory
-    from sst_ros.state import State
-    from sst_ros.sweeps.sweep import sweep
+    from sst_ros.control.controller import Controller as Controller
+    from sst_ros.control.controller_settings import ControllerSettings as ControllerSettings
+    from sst_ros.control.inverse_dynamics import InverseDynamics as InverseDynamics
+    from sst_ros.control.reference import ReferenceMotion as ReferenceMotion
+    from sst_ros.control.reference_motions import reference_motion as reference_motion
+    from sst_ros.errors import AssemblyError as AssemblyError
+    from sst_ros.errors import InputError as InputError
+    from sst_ros.errors import RunStopped as RunStopped
+    from sst_ros.errors import SingularConfiguration as SingularConfiguration
+    from sst_ros.errors import SstError as SstError
+    from sst_ros.identification.identification import Identification as Identification
+    from sst_ros.identification.identify import identify as identify
+    from sst_ros.integration.batch import Batch as Batch
+    from sst_ros.mechanism import kinematics as _kinematics
+    from sst_ros.mechanism.geometry import Geometry as Geometry
+    from sst_ros.mechanism.workspace import workspace as workspace
+    from sst_ros.plot.workspace import plot_workspace as plot_workspace
+    from sst_ros.recording import recording as _recording
+    from sst_ros.recording.recording import Recording as Recording
+    from sst_ros.scene import scene as _scene
+    from sst_ros.scene.arcs import arc_inertia as arc_inertia
+    from sst_ros.scene.loads import SineTorque as SineTorque
+    from sst_ros.scene.scene import Scene as Scene
+    from sst_ros.simulation.simulate import simulate as simulate
+    from sst_ros.simulation.simulation import Simulation as Simulation
+    from sst_ros.simulation.torque import TorqueTable as TorqueTable
+    from sst_ros.simulation.torque_profile import PolynomialTorque as PolynomialTorque
+    from sst_ros.simulation.trajectory import Trajectory as Trajectory
+    from sst_ros.state import State as State
+    from sst_ros.sweeps.sweep import sweep as sweep
+
+    direct_kinematics, inverse_kinematics = _kinematics.direct, _kinematics.inverse
+    load_scene, read_bag = _scene.load, _recording.read
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "AssemblyError",
-    "Batch",
-    "Controller",
-    "ControllerSettings",
-    "Geometry",
-    "Identification",
-    "InputError",
-    "InverseDynamics",
-    "PolynomialTorque",
-    "Recording",
-    "ReferenceMotion",
-    "RunStopped",
-    "Scene",
-    "Simulation",
-    "SineTorque",
-    "SingularConfiguration",
-    "SstError",
-    "State",
-    "TorqueTable",
-    "Trajectory",
-    "__version__",
-    "arc_inertia",
-    "direct_kinematics",
-    "identify",
-    "inverse_kinematics",
-    "load_scene",
-    "plot_workspace",
-    "read_bag",
-    "reference_motion",
-    "simulate",
-    "sweep",
-    "workspace",
-]
 
 # Module of each name, and its name there where that is another one.
 _MODULES = {
@@ -120,6 +85,7 @@ _MODULES = {
 
 
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
+    __all__ = ["__version__", *_MODULES]
 
     def __getattr__(name: str) -> object:
         if name not in _MODULES:
@@ -129,6 +95,5 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
         globals()[name] = value
         return value
 
-
-def __dir__() -> list[str]:
-    return __all__
+    def __dir__() -> list[str]:
+        return __all__

@@ -6,10 +6,13 @@ import os
 # Before NumPy is imported: OpenBLAS's threads wait for each other where workers share the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from types import SimpleNamespace
+
 import pytest
 from bags import bags, example2, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
+from sst_ros.integration import batch, batch_source, codegen
 
 pytest_plugins = ["unexpected_skips"]
 __all__ = ["bags", "browser", "example2", "written", "wrong_kernel"]
@@ -32,6 +35,21 @@ def browser():
 
     with browse() as started:
         yield started
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """Batches and sweeps run by the interpreter, in narrow blocks: the text that numba compiles."""
+    from sst_ros.sweeps import controlled_batch
+
+    def load(texts, constants, **_):
+        return codegen.load(["import numpy as np", *texts], constants, numba=False)
+
+    plain = SimpleNamespace(load=load, numba_version=codegen.numba_version)
+    for module in (batch, controlled_batch):
+        monkeypatch.setattr(module, "codegen", plain)
+    for module in (batch, batch_source, controlled_batch):
+        monkeypatch.setattr(module, "SIMD_WIDTH", 4)
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star
+from sst_ros.state import Assembly
 
 COUNT = 64
 FAST = settings(
@@ -95,6 +96,13 @@ def rigid_body(numbers, size: float) -> np.ndarray:
     return (tensor + tensor.T) / 2.0
 
 
+def assembly_of(geometry: Geometry, gamma, rotation) -> Assembly:
+    """Describe the assembly R at actuator angles gamma; R closes the loops."""
+    r = kinematics.carriage_directions(geometry, gamma)
+    mu, beta, det_j2, admissible = kinematics.described(geometry, r, np.asarray(rotation))
+    return Assembly(rotation, mu, beta, float(det_j2), bool(admissible))
+
+
 def star_orientation(geometry: Geometry, numbers) -> np.ndarray:
     """R with E inside the base triangle; at zeros E is at the centre and mu_1 = 90 deg."""
     s = (1.2 + np.asarray(numbers[:3])) @ geometry.v
@@ -122,7 +130,7 @@ def sample_of(numbers, isotropic: bool = False) -> Sample | None:
     geometry = Geometry.of(scene)
     rotation = star_orientation(geometry, x[53:57])
     gamma, mu, beta = kinematics.inverse(geometry, rotation)
-    assembly = kinematics.assembly_of(geometry, gamma, rotation)
+    assembly = assembly_of(geometry, gamma, rotation)
     regular = np.sin(mu).min() > 0.2 and abs(assembly.det_j2) > 0.05 and beta.max() < 1.5
     if not (regular and assembly.admissible):
         return None

@@ -44,7 +44,6 @@ def test_each_name_has_a_docstring_and_one_entry_in_the_reference(name):
 def test_dir_shows_the_public_names_and_nothing_else():
     assert dir(sst_ros) == sorted(sst_ros.__all__)
     assert not hasattr(sst_ros, "nothing")
-    assert set(sst_ros._MODULES) == set(NAMES)
 
 
 def test_importing_it_imports_nothing_large():
@@ -57,7 +56,7 @@ def test_importing_it_imports_nothing_large():
 def test_a_script_has_precise_types(tmp_path):
     pytest.importorskip("mypy", reason="types are checked by mypy")
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
+    script.write_text("\n".join([SCRIPT, *(f"sst_ros.{name}" for name in NAMES)]))
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(script)],
         capture_output=True,

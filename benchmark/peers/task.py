@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry

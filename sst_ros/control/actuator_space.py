@@ -18,7 +18,6 @@ from sst_ros.control.reference import Quadruple, Reference, Triple
 from sst_ros.dynamics import kernel, loads
 from sst_ros.dynamics.expression import trace
 from sst_ros.dynamics.kernel import Leg
-from sst_ros.dynamics.math_functions import sqrt
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
@@ -26,8 +25,16 @@ from sst_ros.dynamics.traced_dynamics import (
     compiled,
     compiled_for_arrays,
 )
+from sst_ros.mechanism.generic_math import (
+    ZERO,
+    cross,
+    dot,
+    rotation_rows,
+    scaled,
+    sqrt,
+    turned_back,
+)
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, cross, dot, rotation_rows, scaled, turned_back
 
 ROUNDING = 4e-16
 """Residual abs(r_k . t_k) at which Newton's method ends: rounding."""

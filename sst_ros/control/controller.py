@@ -36,8 +36,8 @@ from sst_ros.control.reference import Reference, ReferenceMotion, Triple
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.generic_math import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows, scaled
 from sst_ros.scene.scene import Scene
 from sst_ros.state import State, clamped
 

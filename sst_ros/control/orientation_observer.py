@@ -17,8 +17,8 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.reference import Quadruple, Triple
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import axpy, cross, dot, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import axpy, cross, dot, rotation_rows
 
 CLOSED = 1e-14
 """Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from sst_ros.dynamics import loads
 from sst_ros.dynamics.kernel import Model, State, field_of, leg_motion
-from sst_ros.dynamics.math_functions import sqrt
-from sst_ros.mechanism.vec3 import Scalar, Triple, dot, rotation_rows
+from sst_ros.mechanism.generic_math import Scalar, Triple, dot, rotation_rows, sqrt
 
 
 def kinetic(model: Model, state: State) -> Scalar:

@@ -23,9 +23,8 @@ from typing import NamedTuple
 
 from sst_ros.dynamics import loads
 from sst_ros.dynamics.loads import LegMotion
-from sst_ros.dynamics.math_functions import sqrt
 from sst_ros.dynamics.model import Leg, Model, model_of
-from sst_ros.mechanism.vec3 import (
+from sst_ros.mechanism.generic_math import (
     ZERO,
     Rows,
     Scalar,
@@ -37,6 +36,7 @@ from sst_ros.mechanism.vec3 import (
     rotation_rows,
     scaled,
     solve_symmetric,
+    sqrt,
     turned_back,
 )
 from sst_ros.state import Joints

@@ -9,8 +9,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
-from sst_ros.mechanism.vec3 import Scalar, Triple, cross, dot
+from sst_ros.mechanism.generic_math import (
+    Scalar,
+    Triple,
+    atan2,
+    cross,
+    dot,
+    exp,
+    positive,
+    sqrt,
+    tanh,
+)
 from sst_ros.scene.scene import Friction
 
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.loads import CompliantStops, JointSpring, LegLoads
+from sst_ros.mechanism.generic_math import ZERO, Scalar, Triple, cross
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, Scalar, Triple, cross
 from sst_ros.scene.scene import Inertia, Link, Payload, Scene, Star, Stroke
 
 

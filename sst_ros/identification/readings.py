@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel, loads
 from sst_ros.dynamics.expression import with_jacobian
-from sst_ros.dynamics.math_functions import atan2, sqrt
 from sst_ros.dynamics.traced_dynamics import QUATERNION, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.measured_motion import Measured, measured_motion
+from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array
-from sst_ros.mechanism.vec3 import ZERO, rotation_rows
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque import TorqueTable
 from sst_ros.simulation.torque_profile import PolynomialTorque, SineProfile, TorqueProfile

@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from sst_ros.dynamics.traced_dynamics import Function
+from sst_ros.dynamics.traced_dynamics import ODE, Function
 from sst_ros.integration import coarse_solution
 from sst_ros.integration.compiled_method import (
     CompiledMethod,
@@ -18,7 +18,6 @@ from sst_ros.integration.compiled_method import (
 )
 from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
-from sst_ros.integration.ode import ODE
 from sst_ros.integration.step_control import GROW, better_method, step_factor
 
 JACOBIAN_COST = 30

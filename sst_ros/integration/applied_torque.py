@@ -7,8 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sst_ros.dynamics.traced_dynamics import Dynamics, Function, compiled
-from sst_ros.integration.ode import ODE
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compiled
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamped
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
+from sst_ros.integration.codegen import combination
 from sst_ros.integration.methods import Tableau
-from sst_ros.integration.runge_kutta_source import combination
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
 
 SIMD_WIDTH = 32

@@ -11,15 +11,19 @@ from __future__ import annotations
 
 import atexit
 import grp
+import importlib.util
 import os
 import pickletools
 import pwd
 import shutil
 import stat
+import sys
 import tempfile
 import warnings
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 
@@ -63,6 +67,40 @@ def objection(folder: Path) -> str | None:
     return None
 
 
+def store(files: Mapping[str, bytes]) -> None:
+    """Write files of compiled code, by their names in the cache folder, where they are missing."""
+    folder = cache_folder()
+    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
+    for name, data in files.items():
+        if not (folder / name).exists():
+            _write(folder / name, data)
+
+
+def imported(name: str, text: str) -> ModuleType | None:
+    """Import a module of the cache folder, written if it is not there; None if it cannot be."""
+    try:
+        path, data = cache_folder() / f"{name}.py", text.encode()
+        if not path.exists() or not is_safe_file(path) or path.read_bytes() != data:
+            _write(path, data)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass  # numba can write there, too
+    except OSError:
+        return None
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(path):
+        return known
+    drop_damaged(path)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # numba finds the module again when it loads from its cache.
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    for function in vars(module).values():
+        warn_if_not_kept(function)
+    return module
+
+
 def is_safe_file(path: Path) -> bool:
     """Return whether a file belongs to the user or root, and no other user can write it."""
     return _objection(path, above=False) is None
@@ -102,6 +140,14 @@ def drop_damaged(path: Path) -> None:
     except Exception:  # what is damaged may raise anything
         for file in cached:
             file.unlink(missing_ok=True)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file as a whole: two processes may do so at once, each its own, then a rename."""
+    with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
+        file.write(data)
+    os.utime(file.name, (0, 0))  # numba's stamp is this time: the same for all, as the text is
+    Path(file.name).replace(path)
 
 
 def _objection(path: Path, *, above: bool) -> str | None:

@@ -9,28 +9,19 @@ and of all versions; a folder that cannot be written means compiling anew in thi
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import inspect
 import os
 import platform
 import sys
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration import step_loops
-from sst_ros.integration.cache_folder import (
-    cache_folder,
-    drop_damaged,
-    is_safe_file,
-    warn_if_not_kept,
-)
+from sst_ros.integration.cache_folder import cache_folder, imported
 from sst_ros.integration.methods import Rosenbrock, Tableau
-from sst_ros.integration.runge_kutta_source import explicit_step
 
 _EXPLICIT = (
     step_loops.size_of,
@@ -135,6 +126,59 @@ def source(
     return texts + [text.replace("attempt_linearly_implicit", "attempt") for text in functions]
 
 
+def explicit_step(tableau: Tableau, size: int, drive: int) -> str:
+    """Source of `step(t, h, y0, .., d0, ..)` of an explicit Runge-Kutta method, for scalars.
+
+    It calls `rhs(t, y0, .., d0, ..)` of the state y and of the drive d, which is constant over the
+    step, and returns the new state and the local error estimate of each number of the state, zero
+    where the method has none.
+
+    Args:
+        tableau: coefficients of the method.
+        size: numbers in the state.
+        drive: numbers in the drive.
+
+    """
+    y, d = _names("y", size), _names("d", drive)
+    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):"]
+    for stage, row in enumerate(tableau.a):
+        for j in range(size) if stage else ():
+            lines.append(f"    s{j} = y{j} + h * ({_combination(row, j)})")
+        inputs = _names("s", size) if stage else y
+        time = f"t + {tableau.c[stage]!r} * h" if tableau.c[stage] else "t"
+        outputs = ", ".join(f"k{stage}_{j}" for j in range(size))
+        lines.append(f"    {outputs} = rhs({', '.join([time, *inputs, *d])})")
+    for j in range(size):
+        lines.append(f"    n{j} = y{j} + h * ({_combination(tableau.b, j)})")
+        if not tableau.error:
+            lines.append(f"    e{j} = 0.0")
+        elif not tableau.damping:
+            lines.append(f"    e{j} = h * ({_combination(tableau.error, j)})")
+        else:
+            # Hairer's estimate for DOP853, each number of the state for itself.
+            lines.append(f"    fine = {_combination(tableau.error, j)}")
+            lines.append(f"    coarse = {_combination(tableau.damping, j)}")
+            lines.append("    both = fine * fine + 0.01 * (coarse * coarse)")
+            lines.append(f"    e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
+    results = ", ".join([*_names("n", size), *_names("e", size)])
+    lines.append(f"    return ({results},)")
+    return "\n".join(lines) + "\n"
+
+
+def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
+    """Sum of weights times words, without the zeros; "" where there is nothing else."""
+    terms = [f"{w!r} * {word(i)}" for i, w in enumerate(weights) if w]
+    return " + ".join(terms).replace("+ -", "- ")
+
+
+def _combination(weights: Sequence[float], j: int) -> str:
+    return combination(weights, lambda i: f"k{i}_{j}")
+
+
+def _names(letter: str, count: int) -> list[str]:
+    return [f"{letter}{i}" for i in range(count)]
+
+
 def load(
     texts: list[str],
     constants: dict[str, Any],
@@ -149,14 +193,13 @@ def load(
     reciprocal instead of dividing by the same number several times.
     """
     if not numba:
-        named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
-        return _executed("\n".join([_PLAIN, named, *texts]), "sst_ros_plain")
+        return _executed("\n".join([_PLAIN, _named(constants), *texts]), "sst_ros_plain")
     more = "" if rounding else _FREE_ROUNDING
-    path = _cached_file(_for_numba(texts, constants, nogil=nogil, more=more))
-    if path is None:
-        head = _NUMBA.format(cache=False, nogil=nogil, more=more)
-        return _executed(head + _body(texts, constants), "sst_ros_compiled")
-    return _imported(path)
+    text = _for_numba(texts, constants, nogil=nogil, more=more)
+    module = imported(_name_of(text), text)
+    if module is not None:
+        return module
+    return _executed(text.replace("cache=True", "cache=False", 1), "sst_ros_compiled")
 
 
 def _joints_of() -> str:
@@ -168,22 +211,6 @@ def _joints_of() -> str:
 def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
     call = f"step({', '.join(['t', 'h', *y, *d])})"
     return f"def attempt(t, h, y, near, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
-
-
-def _imported(path: Path) -> ModuleType:
-    known = sys.modules.get(path.stem)
-    if known is not None and known.__file__ == str(path):
-        return known
-    drop_damaged(path)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # numba finds the module again when it loads from its cache.
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    for function in vars(module).values():
-        warn_if_not_kept(function)
-    return module
 
 
 def _executed(text: str, name: str) -> ModuleType:
@@ -206,59 +233,29 @@ def has_code(
 ) -> bool:
     """Return whether machine code of these functions of the module is there to be loaded."""
     more = "" if rounding else _FREE_ROUNDING
+    module = _name_of(_for_numba(texts, constants, more=more))
     try:
-        path = _path_of(_for_numba(texts, constants, more=more))
+        cached = cache_folder() / "__pycache__"
     except OSError:
         return False
-    cached = path.parent / "__pycache__"
-    return all(any(cached.glob(f"{path.stem}.{name}-*.nbi")) for name in functions)
-
-
-def store(files: Mapping[str, bytes]) -> None:
-    """Write files of compiled code, by their names in the cache folder, where they are missing."""
-    folder = cache_folder()
-    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
-    for name, data in files.items():
-        path = folder / name
-        if path.exists():
-            continue
-        with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
-            file.write(data)
-        os.utime(file.name, (0, 0))  # the stamp of `_cached_file`
-        Path(file.name).replace(path)
+    return all(any(cached.glob(f"{module}.{name}-*.nbi")) for name in functions)
 
 
 def _for_numba(
     texts: list[str], constants: dict[str, Any], *, nogil: bool = False, more: str = ""
 ) -> str:
-    return _NUMBA.format(cache=True, nogil=nogil, more=more) + _body(texts, constants)
+    head = _NUMBA.format(cache=True, nogil=nogil, more=more)
+    return "\n".join([head + _named(constants), *(f"@jit\n{text}" for text in texts)])
 
 
-def _body(texts: list[str], constants: dict[str, Any]) -> str:
-    named = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
-    return "\n".join([named, *(f"@jit\n{text}" for text in texts)])
+def _named(constants: dict[str, Any]) -> str:
+    return "".join(f"{name} = {value!r}\n" for name, value in constants.items())
 
 
-def _path_of(text: str) -> Path:
+def _name_of(text: str) -> str:
+    """Name of the module with a text: a digest of it and of what its machine code depends on."""
     import numpy
 
     versions = (sys.version, numba_version(), numpy.__version__, platform.machine())
     digest = hashlib.sha256("\n".join([text, *map(str, versions)]).encode()).hexdigest()[:24]
-    return cache_folder() / f"sst_{digest}.py"
-
-
-def _cached_file(text: str) -> Path | None:
-    """File that holds `text`; None where no folder for it can be written."""
-    try:
-        path = _path_of(text)
-        if not path.exists() or not is_safe_file(path) or path.read_text(encoding="utf-8") != text:
-            # Two processes may write at once: each its own file, then one atomic rename.
-            with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
-                file.write(text)
-            # numba's stamp is this time: the same for all, as the text is.
-            os.utime(file.name, (0, 0))
-            Path(file.name).replace(path)
-        with tempfile.TemporaryFile(dir=path.parent):
-            return path
-    except OSError:
-        return None
+    return f"sst_{digest}"

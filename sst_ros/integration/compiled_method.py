@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import LAG
+from sst_ros.dynamics.traced_dynamics import LAG, ODE
 from sst_ros.integration import codegen
 from sst_ros.integration.methods import Rosenbrock, Tableau
-from sst_ros.integration.ode import ODE
 
 Method = Tableau | Rosenbrock
 Vector = Sequence[float]

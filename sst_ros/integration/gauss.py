@@ -13,43 +13,30 @@ scene; not for stiff scenes, nor for torques that jump, nor for contacts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen, gauss_source
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array
 
 NODES = 8
 """Two registers of AVX2; order 16."""
 
 
-class EndState(NamedTuple):
-    """Where a motion ends.
-
-    Attributes:
-        y: state.
-        change: of a rate [rad/s] over a step by its last iteration, the largest of all steps.
-
-    """
-
-    y: list[float]
-    change: float
-
-
 class PreparedMotion:
     """A motion whose arrays are prepared once, to be computed any number of times.
 
     Attributes:
-        run: compute it; returns the change of `EndState`, infinite where the motion has no finite
-            end. It takes no argument and allocates nothing.
+        run: compute it; returns the change of a rate [rad/s] over a step by its last iteration,
+            the largest of all steps, infinite where the motion has no finite end. It takes no
+            argument and allocates nothing.
 
     """
 
@@ -165,22 +152,6 @@ class Collocation:
         motion.set_step(h)
         motion.begin(t, y, d)
         return motion
-
-    def solve(
-        self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
-        *, iterations: int = 5,
-    ) -> EndState:  # fmt: skip
-        """Go on from t by `count` steps of h, see `prepare`.
-
-        Raises:
-            ArithmeticError: the motion has no finite end.
-
-        """
-        motion = self.prepare(t, h, count, y, d, iterations=iterations)
-        change = motion.run()
-        if not math.isfinite(change):
-            raise ArithmeticError(f"{count} steps of {h:g} s from t = {t:g} s: not finite")
-        return EndState(motion.end, change)
 
 
 def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> bool:

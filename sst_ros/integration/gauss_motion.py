@@ -13,11 +13,10 @@ import numpy as np
 from sst_ros.dynamics import energy
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
 from sst_ros.integration.limit_source import margins
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 

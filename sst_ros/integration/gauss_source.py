@@ -13,7 +13,7 @@ import re
 from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
-from sst_ros.integration.ode import ODE
+from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop, split
 from sst_ros.integration.sine_source import flat_sin
 

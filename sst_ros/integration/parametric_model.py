@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import energy, kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import QUATERNION, RATE, Dynamics, compiled_for_arrays
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_source import margins
-from sst_ros.integration.ode import ODE
 from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
-from sst_ros.dynamics.traced_dynamics import Dynamics, Function
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, ode_with_work
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
@@ -29,7 +29,6 @@ from sst_ros.integration.events import (
     may_occur,
 )
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
-from sst_ros.integration.ode import ODE, ode_with_work
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.state import Vector3

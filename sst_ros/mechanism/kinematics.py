@@ -87,15 +87,6 @@ def inverse(
     return gamma, mu, beta
 
 
-def assembly_of(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Assembly:
-    """Describe the assembly R at actuator angles gamma; R must close the loops."""
-    matrix = np.array(rotation, dtype=float)
-    r = carriage_directions(geometry, gamma)
-    mu, beta, det_j2, admissible = described(geometry, r, matrix)
-    _freeze(matrix, mu, beta)
-    return Assembly(matrix, mu, beta, float(det_j2), bool(admissible))
-
-
 def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     """All real assemblies at actuator angles gamma [rad], shape (3,); up to eight.
 

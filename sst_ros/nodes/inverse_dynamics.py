@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
-from sst_ros.mechanism.vec3 import ZERO, axpy
+from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.nodes import middleware, parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.messages import diagnostics

@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray
 
 from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.errors import SstError
-from sst_ros.mechanism.vec3 import ZERO
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation.simulation import Triple

@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.mechanism.vec3 import ZERO
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.torque_commands import TorqueCommands

@@ -20,8 +20,8 @@ from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import ZERO, axpy, dot
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.vec3 import ZERO, axpy, dot
 from sst_ros.runtime import joint_trajectory
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.scene.scene import Actuators, Scene

@@ -104,43 +104,13 @@ class Base(Section):
 
 
 @dataclass(frozen=True)
-class Star(Section):
-    """The moving spherical star."""
-
-    alpha_deg: Vector = number(
-        "angles between the planes of arcs 1-2, 2-3, 3-1", "deg", shape=(3,), above=0.0
-    )
-    radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
-    inertia: Inertia = section("inertia of the star in {E}", Inertia)
-    mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
-    centre: Vector = number("centre of mass in {E}", "m", shape=(3,), default=(0.0, 0.0, 0.0))
-    inertia_about: str = choice(
-        "point of the inertia; the scene that is read has it about O",
-        (ABOUT_O, ABOUT_CENTRE),
-        default=ABOUT_O,
-    )
-
-    def __post_init__(self) -> None:
-        """Check, and shift the inertia to O."""
-        super().__post_init__()
-        _shift_to_o(self)
-
-    def check(self) -> Iterator[Problem]:
-        """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
-        total = sum(self.alpha_deg)
-        if abs(total - 360.0) > 360.0 * RELATIVE_ROUNDING:
-            yield Problem("alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}")
-        yield from _mass_problems(self)
-
-
-@dataclass(frozen=True)
 class Link(Section):
     """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
 
     inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
     mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
     centre: Vector = number(
-        "centre of mass in the link's own frame", "m", shape=(3,), default=(0.0, 0.0, 0.0)
+        "centre of mass in the frame of the inertia", "m", shape=(3,), default=(0.0, 0.0, 0.0)
     )
     inertia_about: str = choice(
         "point of the inertia; the scene that is read has it about O",
@@ -149,13 +119,50 @@ class Link(Section):
     )
 
     def __post_init__(self) -> None:
-        """Check, and shift the inertia to O."""
+        """Check, and replace an inertia about the centre of mass by that about O."""
         super().__post_init__()
-        _shift_to_o(self)
+        if self.inertia_about == ABOUT_CENTRE and self.inertia is not None:
+            about_o = self.inertia.matrix + _of_point(self.mass, self.centre)
+            (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_o.tolist()
+            object.__setattr__(self, "inertia", Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz))
+            object.__setattr__(self, "inertia_about", ABOUT_O)
 
     def check(self) -> Iterator[Problem]:
         """Refuse centres and inertias that contradict the mass."""
-        yield from _mass_problems(self)
+        mass, centre, inertia = self.mass, self.centre, self.inertia
+        if self.inertia_about == ABOUT_CENTRE:
+            if mass == 0.0 or inertia is None:
+                yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
+        elif mass == 0.0 and any(centre):
+            yield Problem("centre", centre, "needs mass > 0 [kg]")
+        elif mass > 0.0:
+            about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
+            own = np.linalg.eigvalsh(about_o - _of_point(mass, centre))
+            scale = max(float(np.abs(about_o).max()), mass * float(np.dot(centre, centre)))
+            if own[0] < -1e-6 * scale or own[2] > own[0] + own[1] + 1e-6 * scale:
+                allowed = (
+                    f"must fit the inertia about O, which leaves {own} about this centre "
+                    f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
+                )
+                yield Problem("centre", centre, allowed)
+
+
+@dataclass(frozen=True)
+class Star(Link):
+    """The moving spherical star."""
+
+    inertia: Inertia = section("inertia of the star in {E}", Inertia)
+    alpha_deg: Vector = number(
+        "angles between the planes of arcs 1-2, 2-3, 3-1", "deg", shape=(3,), above=0.0
+    )
+    radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
+        total = sum(self.alpha_deg)
+        if abs(total - 360.0) > 360.0 * RELATIVE_ROUNDING:
+            yield Problem("alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}")
+        yield from super().check()
 
 
 @dataclass(frozen=True)
@@ -180,31 +187,3 @@ class Payload(Section):
 def _of_point(mass: float, centre: Vector) -> NDArray[np.float64]:
     c = np.array(centre)
     return np.asarray(mass * (c @ c * np.eye(3) - np.outer(c, c)))
-
-
-def _shift_to_o(body: Star | Link) -> None:
-    """Replace an inertia about the centre of mass by that about O (parallel axes)."""
-    if body.inertia_about == ABOUT_CENTRE and body.inertia is not None:
-        about_o = body.inertia.matrix + _of_point(body.mass, body.centre)
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_o.tolist()
-        object.__setattr__(body, "inertia", Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz))
-        object.__setattr__(body, "inertia_about", ABOUT_O)
-
-
-def _mass_problems(body: Star | Link) -> Iterator[Problem]:
-    mass, centre, inertia = body.mass, body.centre, body.inertia
-    if body.inertia_about == ABOUT_CENTRE:
-        if mass == 0.0 or inertia is None:
-            yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
-    elif mass == 0.0 and any(centre):
-        yield Problem("centre", centre, "needs mass > 0 [kg]")
-    elif mass > 0.0:
-        about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
-        own = np.linalg.eigvalsh(about_o - _of_point(mass, centre))
-        scale = max(float(np.abs(about_o).max()), mass * float(np.dot(centre, centre)))
-        if own[0] < -1e-6 * scale or own[2] > own[0] + own[1] + 1e-6 * scale:
-            allowed = (
-                f"must fit the inertia about O, which leaves {own} about this centre "
-                f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
-            )
-            yield Problem("centre", centre, allowed)

@@ -156,7 +156,7 @@ class Scene(Section):
             if not _has(type(self), key.split(".")):
                 yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
-    def _bodies(self) -> Iterator[tuple[str, Star | Link]]:
+    def _bodies(self) -> Iterator[tuple[str, Link]]:
         yield "star", self.star
         for key in ("actuated_links", "intermediate_links"):
             for k, link in enumerate(getattr(self, key)):

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.methods import METHODS, Rosenbrock
-from sst_ros.integration.ode import ode_with_work
 from sst_ros.scene.scene import SineTorque
 from sst_ros.state import finite_vector
 

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, Problem, RunStopped
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry

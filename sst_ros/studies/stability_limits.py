@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace

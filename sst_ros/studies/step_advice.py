@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.errors import SstError
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
-from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 

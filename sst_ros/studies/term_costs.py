@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import RK4
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import Link
 from sst_ros.scene.loads import Stroke

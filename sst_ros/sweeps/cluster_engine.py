@@ -17,8 +17,7 @@ from typing import Any
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
-from sst_ros.integration import codegen
-from sst_ros.integration.cache_folder import cache_folder
+from sst_ros.integration.cache_folder import cache_folder, store
 from sst_ros.sweeps.chunk_task import DONE, ChunkOutcome, ChunkTask, run_chunk
 from sst_ros.sweeps.local_engine import SweepFailed
 
@@ -69,7 +68,7 @@ def send_code(client: Any, module: Any) -> None:
         """Writes the files where they are missing."""
 
         def setup(self, worker: Any) -> None:
-            codegen.store(files)
+            store(files)
 
     client.register_plugin(SentCode(), name=f"sst_ros-{path.stem}")
 

@@ -20,9 +20,19 @@ from sst_ros.control.reference import REST
 from sst_ros.control.star_motions import product
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression
-from sst_ros.dynamics.math_functions import atan2, positive, sin, sqrt
+from sst_ros.mechanism.generic_math import (
+    ZERO,
+    added,
+    atan2,
+    axpy,
+    cross,
+    dot,
+    positive,
+    rotation_rows,
+    sin,
+    sqrt,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.vec3 import ZERO, added, axpy, cross, dot, rotation_rows
 from sst_ros.sweeps.controlled import ControlledRun
 
 NEWTON_STEPS = 5

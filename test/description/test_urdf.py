@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loaded_scenes import loaded
-from models import seeded_samples
+from models import assembly_of, seeded_samples
 
 from sst_ros.__main__ import main
 from sst_ros.description.tree import LEGS, STAR, STARS, actuated, intermediate
 from sst_ros.description.urdf import roll_pitch_yaw, urdf
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.mechanism import kinematics, rates, virtual_work
+from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load, names
@@ -54,7 +54,7 @@ def angles_of(gamma, mu, beta):
 
 
 def passive(geometry, gamma, rotation):
-    return kinematics.assembly_of(geometry, gamma, rotation)
+    return assembly_of(geometry, gamma, rotation)
 
 
 @pytest.mark.parametrize("isotropic", [False, True])

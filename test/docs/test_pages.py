@@ -14,19 +14,25 @@ from sst_ros.cli.main import NODES, parser
 
 PAGES = pages()
 LONG = (
+    "README",
     "batch",
+    "controller",
     "evaluate",
     "fast",
+    "faults",
     "follow",
+    "geometry",
     "identify",
     "lockstep",
     "look",
     "many",
     "plot",
     "record",
+    "simulate",
     "sweep",
+    "torque",
 )
-"""How-to pages whose commands are those of the tutorial in another order, or that compile."""
+"""Pages that start nodes or whole runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [
     pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG else page
     for page in PAGES

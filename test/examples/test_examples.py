@@ -48,6 +48,7 @@ def run(tmp_path, monkeypatch):
     pyplot.close("all")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_an_example_draws_its_picture(name, run):
     if "Batch" in (EXAMPLES / f"{name}.py").read_text():

@@ -13,7 +13,10 @@ from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
 
 EXACT = 1e-9
-SCENES = ("thin_arcs", "general", "payload")
+SCENES = (
+    "thin_arcs",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("general", "payload")),
+)
 
 
 @cache
@@ -71,6 +74,7 @@ def test_smooth_samples_without_a_hold_are_as_exact():
     assert np.abs(found.estimate - true).max() < EXACT * np.abs(true).max()
 
 
+@pytest.mark.slow
 def test_unknown_friction_and_offsets_are_found():
     plant = manipulators.sweeping(manipulators.thin_arcs(), 1.5).with_values(manipulators.FRICTION)
     motion = manipulators.run(plant)

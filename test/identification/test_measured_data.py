@@ -66,6 +66,7 @@ def improvement(case, seed):
     return np.linalg.norm(wrong - exact) / np.linalg.norm(right - exact)
 
 
+@pytest.mark.slow
 def test_ten_recordings_are_within_their_standard_deviations():
     z = errors(measured(), range(10))
     assert 0.9 < np.mean(np.abs(z) < NORMAL_95) < 0.99

@@ -140,6 +140,7 @@ def test_smoothing_and_lag_which_no_torque_is_linear_in_are_found():
     assert found.scene.actuators.time_constant == pytest.approx(0.02, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_standard_deviations_cover_the_errors_of_noisy_readings():
     plant = load_scene("example2_heavy")
     names = ("star.inertia.xx", "star.inertia.zz")

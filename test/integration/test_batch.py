@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from sst_ros import Simulation, load_scene, simulate
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
-from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import Actuators, Initial, Moment
 from sst_ros.state import QUANTITIES
 
@@ -22,10 +21,8 @@ N = 100
 
 
 @pytest.fixture(scope="module")
-def batch(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield Batch(EXAMPLE2, profile=True)
+def batch():
+    return Batch(EXAMPLE2, profile=True)
 
 
 @pytest.fixture(scope="module")
@@ -150,12 +147,13 @@ def test_scenes_that_a_batch_cannot_run_are_refused():
         Batch(load_scene("stiff"), profile=True)
 
 
-def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario(batch):
+def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario(interpreted):
     """Where a simulation refuses it: between gamma_1 = -0.01 and 0 there is an assembly."""
     outside = np.array([[0.8, 0.8, 0.8], [-0.01, 0.5, 0.6], [0.8, 0.8, 1.6]])
     for gamma in outside[1:]:
         with pytest.raises(InputError, match="must lie in the stroke"):
             Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
+    batch = Batch(EXAMPLE2, profile=True)
     found = batch.run(outside, (0.0, 0.0, 0.0), step=0.01, count=1)
     assert found.message == ("reached the end", *("initial gamma outside the stroke",) * 2)
     assert found.fault_time[1:].tolist() == [0.0, 0.0]
@@ -177,7 +175,7 @@ ELASTIC = {"stroke.at_end": "elastic", "stroke.stiffness": 100.0}
 
 
 @pytest.mark.parametrize("changes", [{}, LAGGING, ELASTIC])
-def test_the_result_has_the_quantities_of_simulate(changes):
+def test_the_result_has_the_quantities_of_simulate(changes, interpreted):
     """Scenario by scenario, with another inertia and amplitude in each."""
     scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
     parameters = {"star.inertia.zz": [0.25, 0.3], "torque.amplitude": [[1, 2, 3], [2, 0.1, 1]]}

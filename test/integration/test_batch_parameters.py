@@ -9,14 +9,13 @@ from loaded_scenes import IGNORE, REST, loaded
 from models import seeded_samples
 
 from sst_ros import Simulation, load_scene
-from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compiled
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.initial_states import NO_RATE
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4
-from sst_ros.integration.ode import ODE
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism import singularities, workspace
 from sst_ros.mechanism.geometry import Geometry
@@ -28,13 +27,6 @@ EXAMPLE2 = load_scene("example2_heavy")
 HOME = np.pi / 4
 N = batch_source.SIMD_WIDTH + 5
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 def tensors(name, samples, body):

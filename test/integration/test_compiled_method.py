@@ -14,11 +14,10 @@ from models import seeded_samples
 
 from sst_ros.dynamics.expression import trace, with_jacobian
 from sst_ros.dynamics.kernel import derivative
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
-from sst_ros.integration.ode import ODE
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
@@ -36,9 +35,8 @@ def system_of(scene, torque=None, work=False):
     return ODE(Dynamics.of(scene), torque, work=work)
 
 
-def both(scene, method, cache, monkeypatch):
+def both(scene, method):
     """Two pairs, then a march through contact and sliding, in plain Python and under numba."""
-    monkeypatch.setenv("SST_ROS_CACHE", str(cache))
     system = system_of(scene, work=True)
     y, drive = start(scene, len(system.state)), (*DRIVE, *MOMENT)[: len(system.drive)]
     results = []
@@ -55,8 +53,8 @@ needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba 
 
 
 @needs_numba
-def test_numba_gives_the_bits_of_plain_python(tmp_path, monkeypatch):
-    plain, fast = both(loaded(), DORMAND_PRINCE, tmp_path, monkeypatch)
+def test_numba_gives_the_bits_of_plain_python():
+    plain, fast = both(loaded(), DORMAND_PRINCE)
     assert plain == fast
     assert max(map(abs, plain[2])) > 0.1
 
@@ -79,8 +77,7 @@ class Top(ODE):
 
 
 @needs_numba
-def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method(tmp_path, monkeypatch):
-    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method():
     y = [0.0, 0.6, 0.0, 0.8, 1.0, -2.0, 30.0]
     ends = []
     for by_numba in (False, True):
@@ -94,9 +91,9 @@ def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method(tmp_path, 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 @pytest.mark.parametrize("name", ["loaded", "general", "friction", "elastic_stops", "fast_spin"])
-def test_numba_gives_the_bits_of_plain_python_everywhere(name, method, tmp_path, monkeypatch):
+def test_numba_gives_the_bits_of_plain_python_everywhere(name, method):
     scene = loaded() if name == "loaded" else load(name)
-    plain, fast = both(scene, method, tmp_path, monkeypatch)
+    plain, fast = both(scene, method)
     assert plain == fast
 
 

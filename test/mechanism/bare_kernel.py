@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.expression import Program, trace
-from sst_ros.dynamics.math_functions import sqrt
+from sst_ros.mechanism.generic_math import sqrt
 
 INPUTS = ("x", "y", "z", "w", "wx", "wy", "wz", "t1", "t2", "t3")
 

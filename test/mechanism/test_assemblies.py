@@ -17,6 +17,7 @@ from mechanism.closed_chains import (
     random_rotation,
     same_rotations,
 )
+from models import assembly_of
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -184,7 +185,7 @@ def test_every_branch_of_the_inverse_closes_the_loops(signs):
         geometry = random_geometry(rng)
         _, rotation = random_pose(rng, geometry)
         gamma, mu, beta = kinematics.inverse(geometry, rotation, signs)
-        described = kinematics.assembly_of(geometry, gamma, rotation)
+        described = assembly_of(geometry, gamma, rotation)
         r = kinematics.carriage_directions(geometry, gamma)
         assert np.abs(np.sum(r * (geometry.e @ rotation.T), axis=1)).max() < 1e-14
         np.testing.assert_allclose(described.mu, mu, atol=1e-12)

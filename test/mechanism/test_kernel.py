@@ -20,7 +20,7 @@ from mpmath import mp, mpf
 
 from sst_ros.dynamics import energy, kernel
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.vec3 import rotation_rows
+from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.scene.scene import Link
 
 TOLERANCE = 1e-12

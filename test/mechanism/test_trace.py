@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.dynamics.expression import trace, with_jacobian
-from sst_ros.dynamics.math_functions import atan2, exp, positive, sqrt, tanh
 from sst_ros.dynamics.traced_dynamics import compiled
+from sst_ros.mechanism.generic_math import atan2, exp, positive, sqrt, tanh
 
 FINITE = st.floats(-10.0, 10.0)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from lagrange import INNER, OUTER, Lagrange, columns, spin, times
-from models import FAST, samples, seeded_samples, star_orientation
+from models import FAST, assembly_of, samples, seeded_samples, star_orientation
 from mpmath import mpf
 from scipy.optimize import brentq
 
@@ -190,7 +190,7 @@ def wide_star_pose(numbers):
     """R, gamma and the assembly of the wide star with E inside the base triangle."""
     rotation = star_orientation(WIDE_STAR, numbers)
     gamma, _, _ = kinematics.inverse(WIDE_STAR, rotation)
-    return rotation, gamma, kinematics.assembly_of(WIDE_STAR, gamma, rotation)
+    return rotation, gamma, assembly_of(WIDE_STAR, gamma, rotation)
 
 
 def numbers_of_a_singular_pose():

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_pose
+from models import assembly_of
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, virtual_work, workspace
@@ -52,7 +53,7 @@ def test_the_map_is_the_inverse_kinematics(isotropic):
         gamma, _, beta = kinematics.inverse(ISOTROPIC, rotation)
         np.testing.assert_allclose(isotropic.measures.gamma[i, j], gamma, atol=1e-14)
         np.testing.assert_allclose(isotropic.measures.beta[i, j], beta, atol=1e-14)
-        described = kinematics.assembly_of(ISOTROPIC, gamma, rotation)
+        described = assembly_of(ISOTROPIC, gamma, rotation)
         inside = np.all((gamma >= 0) & (gamma <= ISOTROPIC.arc))
         assert isotropic.measures.admissible[i, j] == (described.admissible and inside)
 
@@ -100,7 +101,7 @@ def test_parallel_singularities_of_the_folding_geometry(folding):
     assert len(poses) > 20
     a1, a2, a3 = FOLDING.alpha
     for i in range(len(poses)):
-        described = kinematics.assembly_of(FOLDING, poses.gamma[i], poses.rotation[i])
+        described = assembly_of(FOLDING, poses.gamma[i], poses.rotation[i])
         assert described.admissible
         assert abs(described.det_j2) < 1e-13
         tangents = np.tan(poses.beta[i])

@@ -129,6 +129,7 @@ def test_a_loop_that_is_lost_says_so():
     assert len(track.time) == len(limited) < 400
 
 
+@pytest.mark.slow
 def test_the_same_bits_on_any_number_of_workers():
     plan = FeedforwardPlan(
         SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2), delays=(),

@@ -5,10 +5,9 @@ import re
 
 import pytest
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
-from sst_ros.integration.ode import ODE
 from sst_ros.report import states
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation

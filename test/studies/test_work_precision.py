@@ -6,6 +6,7 @@ import dataclasses
 import io
 import itertools
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -121,14 +122,18 @@ def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
     assert "| example2_heavy | intermediate links | 51 |" in page([short], terms)
 
 
+@cache
+def brief():
+    return work_precision(BRIEF, compiled=False, longest_s=0.0)
+
+
 def graded(*errors):
     """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
     rows = [
         {"method": "dop853", "kind": FIXED, "setting": 0.5**k, "wall_min_s": 1e-3 * (k + 1),
          ERROR: error} for k, error in enumerate(errors)
     ]  # fmt: skip
-    found = work_precision(BRIEF, compiled=False, longest_s=0.0)
-    return dataclasses.replace(found, rows=table(rows, COLUMNS))
+    return dataclasses.replace(brief(), rows=table(rows, COLUMNS))
 
 
 @pytest.mark.parametrize(

@@ -51,13 +51,6 @@ PreparedSweep.chunk = slow
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
     return run_study(STUDY, None)

@@ -12,10 +12,8 @@ from sst_ros.control.controller import MODES, Controller, Measurement
 from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.integration import batch_source, codegen
 from sst_ros.studies.channel import Channel, ChannelState
 from sst_ros.studies.control_loop import ControlLoop, run_loop
-from sst_ros.sweeps import controlled_batch
 from sst_ros.sweeps.counter_noise import gaussian
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.sweep import run_study
@@ -29,13 +27,6 @@ VARY = {"star.mass": ("uniform", 2.4, 2.8)}
 PERIOD, SAMPLES = 2e-3, 25
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 CASES = [
     *({"mode": mode} for mode in MODES),
     {"mode": "computed_torque", "space": "so3", "integral_rate": 3.0},
@@ -46,18 +37,6 @@ CASES = [
      "feedforward_at": "middle", "torque_limit": 6.0, "integral_rate": 4.0},
 ]  # fmt: skip
 CHANNEL = ("delay", "counts", "angle_noise", "rate_noise")
-
-
-@pytest.fixture
-def interpreted(monkeypatch):
-    """The same text without a compiler, in narrow blocks: no half minute for each case."""
-
-    def load(texts, constants, **_):
-        return codegen.load(["import numpy as np", *texts], constants, numba=False)
-
-    for module in (batch_source, controlled_batch):
-        monkeypatch.setattr(module, "SIMD_WIDTH", 4)
-    monkeypatch.setattr(controlled_batch, "codegen", SimpleNamespace(load=load))
 
 
 def name_of(case):
@@ -120,6 +99,7 @@ def check_torques(case):
             np.testing.assert_allclose(torques[k][:, lane], expected, rtol=0, atol=1e-12 * scale)
 
 
+@pytest.mark.slow
 def test_a_closed_loop_tracks_as_that_of_the_simulation():
     """Whole runs, each integrated by steps of its own."""
     control = {"mode": "feedforward_pd", "bandwidth": 40.0, "period": 0.01, "delay": 1}

@@ -27,13 +27,6 @@ VARY = {
 STUDY = SweepStudy(SCENE, VARY, n=300, seed=7, steps=40, chunk=64)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def table():
     return run_study(STUDY, None)
@@ -101,7 +94,7 @@ def test_extremes_and_trajectories_are_those_of_a_run():
         assert found["gamma_min_2"][row] == gamma.min()
 
 
-def test_constant_torques_take_the_place_of_the_scenes():
+def test_constant_torques_take_the_place_of_the_scenes(interpreted):
     found = sst_ros.sweep(
         SCENE, {"star.inertia.zz": [0.26, 0.3]}, torque=(0.1, 0.2, -0.1), duration=0.2, steps=20
     )
@@ -110,12 +103,12 @@ def test_constant_torques_take_the_place_of_the_scenes():
     np.testing.assert_allclose(found["gamma_1"][0], simulation.state.joints.gamma[0], atol=1e-11)
 
 
-def test_rows_that_make_no_scene_are_reported_and_stop_no_other():
+def test_rows_that_make_no_scene_are_reported_and_stop_no_other(interpreted):
     vary = {"star.inertia.zz": ("normal", 0.26, 0.2), "star.inertia.xx": ("uniform", 0.38, 0.39)}
-    found = sst_ros.sweep(SCENE, vary, n=200, steps=20)
+    found = sst_ros.sweep(SCENE, vary, n=40, steps=20)
     zz, xx = found["star.inertia.zz"], found["star.inertia.xx"]
     wrong = (zz <= 0.0) | (zz > xx + 0.39)
-    assert 0 < wrong.sum() < 200
+    assert 0 < wrong.sum() < 40
     assert found["reason"][wrong].str.startswith("no scene: star.inertia").all()
     assert found["gamma_1"][wrong].isna().all()
     assert not found["reason"][~wrong].str.startswith("no scene").any()
@@ -186,7 +179,8 @@ def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, m
     same(run_study(STUDY, out, resume=True), table)
 
 
-def test_a_scenario_that_diverges_keeps_to_itself(table):
+@pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value")
+def test_a_scenario_that_diverges_keeps_to_itself(interpreted):
     """Friction that fixed explicit steps cannot resolve makes its numbers infinite."""
     scene = SCENE.with_values({"friction.gamma.viscous": 0.1})
     vary = {"friction.gamma.viscous": [0.1, 1e8, 0.2]}

@@ -24,12 +24,10 @@ vary:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        path = tmp_path_factory.mktemp("sweep")
-        (path / "study.yaml").write_text(STUDY)
-        assert run(["sweep", str(path / "study.yaml"), "--out", str(path / "out")]) == 0
-        yield path
+    path = tmp_path_factory.mktemp("sweep")
+    (path / "study.yaml").write_text(STUDY)
+    assert run(["sweep", str(path / "study.yaml"), "--out", str(path / "out")]) == 0
+    return path
 
 
 def test_its_summary_names_reasons_and_causes(folder, capsys):
