@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility of a reference motion: torques, power and margins, before any torque is sent."""
+"""Feasibility of a reference motion: torques, power, distances from limits, before it is run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ActuatorDemand:
 
 
 @dataclass(frozen=True)
-class LimitMargin:
+class LimitDistance:
     """Distance of a motion to a limit.
 
     Attributes:
@@ -69,7 +69,7 @@ class LimitMargin:
     refused: bool
 
     @property
-    def margin(self) -> float:
+    def least(self) -> float:
         """The smallest distance to the limit, negative beyond it."""
         return self.sign * (self.reached.value - self.end)
 
@@ -85,7 +85,7 @@ class MotionPlan:
         references: the motion there.
         torques: actuator torques there [N m], shape (n, 3).
         demands: on the actuators, by leg.
-        margins: distances to all limits.
+        distances: from all limits.
         problems: reasons of a refusal; empty where it is feasible.
 
     """
@@ -96,7 +96,7 @@ class MotionPlan:
     references: tuple[Reference, ...]
     torques: Array
     demands: tuple[ActuatorDemand, ActuatorDemand, ActuatorDemand]
-    margins: tuple[LimitMargin, ...]
+    distances: tuple[LimitDistance, ...]
     problems: tuple[Problem, ...]
 
 
@@ -116,7 +116,7 @@ def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 
 
 def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Compute demands and margins of a motion, between samples too.
+    """Compute demands of a motion and its distances from all limits, between samples too.
 
     An external moment from a topic counts as zero; the lag of actuators is not included.
 
@@ -184,7 +184,7 @@ def _distances(
     geometry: Geometry,
     times: Array,
     desired: tuple[Reference, ...],
-) -> Iterator[LimitMargin]:
+) -> Iterator[LimitDistance]:
     coordinates = ActuatorSpaceMap(geometry)
     gammas = np.array([at.gamma for at in desired])
     postures = np.array([_posture(coordinates, at) for at in desired])
@@ -197,9 +197,9 @@ def _distances(
 
     def both(
         key: str, end: float, function: Callable[[float], float], values: Array, refused: bool
-    ) -> Iterator[LimitMargin]:
-        yield LimitMargin(key, 0.0, 1.0, "rad", minimum(function, times, values), refused)
-        yield LimitMargin(key, end, -1.0, "rad", maximum(function, times, values), refused)
+    ) -> Iterator[LimitDistance]:
+        yield LimitDistance(key, 0.0, 1.0, "rad", minimum(function, times, values), refused)
+        yield LimitDistance(key, end, -1.0, "rad", maximum(function, times, values), refused)
 
     held = scene.stroke.at_end != "ignore"
     for leg in range(3):
@@ -214,14 +214,14 @@ def _distances(
         if low.value < SINGULAR_MU:
             said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
-        yield LimitMargin(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
+        yield LimitDistance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
     sign = 1.0 if postures[0, 6] > 0.0 else -1.0
     low = minimum(lambda time: sign * posture(6)(time), times, sign * postures[:, 6])
     if low.value < SINGULAR_J2:
         end = low.time if low.value > 0.0 else brentq(posture(6), 0.0, low.time)
         said = f"parallel singularity at t = {end:.9g} s, det J2"
         raise SingularConfiguration(said, posture(6)(end))
-    yield LimitMargin("det J2", 0.0, sign, "1", Peak(sign * low.value, low.time), True)
+    yield LimitDistance("det J2", 0.0, sign, "1", Peak(sign * low.value, low.time), True)
 
 
 def _posture(coordinates: ActuatorSpaceMap, at: Reference) -> tuple[float, ...]:
@@ -235,9 +235,9 @@ def _posture(coordinates: ActuatorSpaceMap, at: Reference) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _beyond(distances: tuple[LimitMargin, ...]) -> Iterator[Problem]:
+def _beyond(distances: tuple[LimitDistance, ...]) -> Iterator[Problem]:
     for distance in distances:
-        if distance.refused and distance.margin < 0.0:
+        if distance.refused and distance.least < 0.0:
             side = "above" if distance.sign > 0.0 else "below"
             allowed = f"must stay {side} {distance.end:.9g} {distance.unit}"
             said = f"{allowed} (t = {distance.reached.time:.9g} s)"

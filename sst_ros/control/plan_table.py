@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.plan import ActuatorDemand, LimitMargin, MotionPlan, limits
+from sst_ros.control.plan import ActuatorDemand, LimitDistance, MotionPlan, limits
 from sst_ros.control.time_scaling import TimeScaling
 
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
@@ -27,7 +27,7 @@ def table(plan: MotionPlan, fastest: TimeScaling) -> str:
         *_demands(plan),
         "",
         _row("distance to an end", ["least", "at t [s]"]),
-        *map(_distance, plan.margins),
+        *map(_distance, plan.distances),
         "",
         *_verdict(plan, fastest),
     ]
@@ -51,12 +51,12 @@ def _row(name: str, cells: Sequence[str], end: str = "") -> str:
     return f"{name:<28}{''.join(f'{cell:>14}' for cell in cells)}{end:>14}".rstrip()
 
 
-def _distance(distance: LimitMargin) -> str:
+def _distance(distance: LimitDistance) -> str:
     side = "above" if distance.sign > 0.0 else "below"
     unit = f" [{distance.unit}]" if distance.unit != "1" else ""
     name = f"{distance.key} {side} {distance.end:.6g}{unit}"
     note = "" if distance.refused else "   ignored"
-    return _row(name, [f"{distance.margin:.6g}", f"{distance.reached.time:.6g}"]) + note
+    return _row(name, [f"{distance.least:.6g}", f"{distance.reached.time:.6g}"]) + note
 
 
 def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
@@ -67,7 +67,7 @@ def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
     if plan.scene.actuators is not None and plan.scene.actuators.time_constant is not None:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
-    if any(distance.refused and distance.margin < 0.0 for distance in plan.margins):
+    if any(distance.refused and distance.least < 0.0 for distance in plan.distances):
         yield "At no speed: the path itself leaves what is allowed."
     elif fastest.highest is None:
         yield "At no speed: the torque limit is too small for this path."
@@ -98,7 +98,7 @@ def as_json(plan: MotionPlan, fastest: TimeScaling) -> str:
             "limits": {name: limit for name, limit, _ in limits(plan.scene.actuators)},
             "actuators": [_plain(demand) for demand in plan.demands],
             "distances": [
-                {**_plain(distance), "least": distance.margin} for distance in plan.margins
+                {**_plain(distance), "least": distance.least} for distance in plan.distances
             ],
             "highest_speed": None if highest is None or math.isinf(highest) else highest,
             "any_speed": highest is not None and math.isinf(highest),
@@ -109,7 +109,7 @@ def as_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     )
 
 
-def _plain(part: ActuatorDemand | LimitMargin) -> dict[str, object]:
+def _plain(part: ActuatorDemand | LimitDistance) -> dict[str, object]:
     """Turn a part into a mapping; extremes become mappings, too."""
     values = ((field.name, getattr(part, field.name)) for field in dataclasses.fields(part))
     return {name: value._asdict() if hasattr(value, "_asdict") else value for name, value in values}

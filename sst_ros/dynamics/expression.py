@@ -148,26 +148,29 @@ class Program:
 
     def first(self, count: int) -> Program:
         """Return the program of the first `count` outputs alone."""
-        inputs = len(self.inputs)
-        outputs, needed = self.outputs[:count], set[int]()
-        waiting = [out.number for out in outputs if isinstance(out, Operand)]
+        return Program(self.inputs, self.steps, self.outputs[:count]).pruned()
+
+    def pruned(self) -> Program:
+        """Return the program without steps that no output needs."""
+        inputs, needed = len(self.inputs), set[int]()
+        waiting = [out.number for out in self.outputs if isinstance(out, Operand)]
         while waiting:
             number = waiting.pop()
             if number >= inputs and number not in needed:
                 needed.add(number)
                 operands = self.steps[number - inputs][1]
                 waiting += [x.number for x in operands if isinstance(x, Operand)]
-        numbers = {i: i for i in range(inputs)}
-        numbers |= {number: inputs + i for i, number in enumerate(sorted(needed))}
+        kept = sorted(needed)
+        numbers = {old: new for new, old in enumerate([*range(inputs), *kept])}
 
         def moved(operand: float | Operand) -> float | Operand:
             return Operand(numbers[operand.number]) if isinstance(operand, Operand) else operand
 
-        steps = [self.steps[number - inputs] for number in sorted(needed)]
+        steps = (self.steps[number - inputs] for number in kept)
         return Program(
             self.inputs,
             tuple((op, tuple(map(moved, operands))) for op, operands in steps),
-            tuple(map(moved, outputs)),
+            tuple(map(moved, self.outputs)),
         )
 
     def source(self, name: str) -> str:
@@ -197,82 +200,17 @@ def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Pr
     """Run `function` on one expression per input and return what it does."""
     graph = Graph()
     symbols = [graph.node("input", name) for name in inputs]
-    return _program(graph, tuple(inputs), tuple(function(*symbols)))
+    return program_of(graph, tuple(inputs), tuple(function(*symbols)))
 
 
-def with_jacobian(
-    function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
-) -> Program:
-    """Trace `function` and its exact derivatives; outputs are f, then df/dx for each x in `by`."""
-    graph = Graph()
-    symbols = [graph.node("input", name) for name in inputs]
-    outputs = tuple(function(*symbols))
-    last = len(graph.nodes)
-    everything = list(outputs)
-    for name in by:
-        slopes = _slopes(graph, last, symbols[list(inputs).index(name)])
-        everything += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
-    return _program(graph, tuple(inputs), tuple(everything))
-
-
-def _slopes(graph: Graph, last: int, by: Expression) -> list[Value]:
-    """Differentiate each of the first `last` nodes by one input (forward mode)."""
-    slopes: list[Value] = []
-    for index in range(last):
-        op, args = graph.nodes[index]
-        here = Expression(graph, index)
-        d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-        slopes.append(float(index == by.index) if op == "input" else _chain(op, args, d, here))
-    return slopes
-
-
-def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -> Value:
-    x = args[0]
-    if op in ("add", "sub"):
-        return d[0] + d[1] if op == "add" else d[0] - d[1]
-    if op == "mul":
-        return d[0] * args[1] + x * d[1]
-    if op == "div":
-        return (d[0] - here * d[1]) / args[1]
-    if op == "atan2":
-        return (d[0] * args[1] - x * d[1]) / (x * x + args[1] * args[1])
-    inner: dict[str, Callable[[], Value]] = {
-        "neg": lambda: -1.0,
-        "sqrt": lambda: 0.5 / here,
-        "tanh": lambda: 1.0 - here * here,
-        "exp": lambda: here,
-        "sin": lambda: x.traced("cos"),
-        "cos": lambda: -x.traced("sin"),
-        "positive": lambda: x.traced("step"),
-        "step": lambda: 0.0,
-    }
-    return 0.0 if _is(d[0], 0.0) else inner[op]() * d[0]
-
-
-def _program(graph: Graph, inputs: tuple[str, ...], outputs: tuple[Value, ...]) -> Program:
-    """Keep what the outputs need, in order."""
-    needed: set[int] = set()
-    waiting = [out.index for out in outputs if isinstance(out, Expression)]
-    while waiting:
-        index = waiting.pop()
-        if index not in needed:
-            needed.add(index)
-            op, args = graph.nodes[index]
-            if op != "input":
-                waiting += [a.index for a in args if isinstance(a, Expression)]
-    numbers = {i: i for i in range(len(inputs))}
-    for index in sorted(needed - numbers.keys()):
-        numbers[index] = len(numbers)
+def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) -> Program:
+    """Return what a graph computes, whose first nodes are the inputs."""
 
     def operand(value: Value) -> float | Operand:
-        return Operand(numbers[value.index]) if isinstance(value, Expression) else float(value)
+        return Operand(value.index) if isinstance(value, Expression) else float(value)
 
-    steps = []
-    for index in sorted(needed):
-        op, args = graph.nodes[index]
-        if op != "input":
-            steps.append((op, tuple(map(operand, args))))
-    return Program(inputs, tuple(steps), tuple(map(operand, outputs)))
+    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
+    return Program(inputs, steps, tuple(map(operand, outputs))).pruned()
 
 
 def _is_constant(value: Value) -> bool:

@@ -38,7 +38,7 @@ class Limit(NamedTuple):
         """Leg of the joint, 0 to 2."""
         return self.joint % 3
 
-    def margin(self, joints: Sequence[float]) -> float:
+    def distance(self, joints: Sequence[float]) -> float:
         """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
         return self.sign * (joints[self.joint] - self.end)
 
@@ -49,7 +49,7 @@ class Limit(NamedTuple):
     def may_be_crossed(self, begin: Sequence[float], end: Sequence[float]) -> bool:
         """Cheap test before a search: it ends beyond, or it went in and came back."""
         turned = self.slope(begin) < 0.0 < self.slope(end)
-        return self.margin(end) < 0.0 or turned or self.margin(begin) <= 0.0
+        return self.distance(end) < 0.0 or turned or self.distance(begin) <= 0.0
 
 
 def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import energy, kernel
-from sst_ros.dynamics.expression import Program, trace, with_jacobian
+from sst_ros.dynamics.differentiation import with_jacobian
+from sst_ros.dynamics.expression import Program, trace
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, SineTorque

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel, loads
-from sst_ros.dynamics.expression import with_jacobian
+from sst_ros.dynamics.differentiation import with_jacobian
 from sst_ros.dynamics.traced_dynamics import QUATERNION, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.measured_motion import Measured, measured_motion

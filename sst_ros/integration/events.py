@@ -18,7 +18,7 @@ TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 
 GRAZING = 1e-12
-"""A margin below this [rad] counts as zero: closure and rounding reach 1e-15."""
+"""A distance below this [rad] counts as zero: closure and rounding reach 1e-15."""
 
 CONTACT_BAND = 1e-9
 """Farther beyond than this [rad], an actuator has not just reached the contact."""
@@ -38,11 +38,11 @@ def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> boo
 
     A contact event that the step starts on does not count again.
     """
-    if event.margin(begin) <= GRAZING and not (
-        event.margin(begin) > -CONTACT_BAND and event.slope(begin) > 0.0
+    if event.distance(begin) <= GRAZING and not (
+        event.distance(begin) > -CONTACT_BAND and event.slope(begin) > 0.0
     ):
         return False
-    return event.margin(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
+    return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
 
 
 def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> float:
@@ -56,30 +56,30 @@ def free_range(events: Sequence[Limit]) -> list[Limit]:
     return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]
 
 
-def first_crossing(margin: Signal, slope: Signal, h: float) -> float | None:
-    """Time x in [0, h] at which `margin` becomes negative, or None.
+def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
+    """Time x in [0, h] at which `distance` becomes negative, or None.
 
     Both signals are smooth functions of the time since the step began and `slope` is the rate of
-    `margin`. A dip below zero and back inside the step is found where the slope changes sign once.
-    A margin that starts at zero and grows does not count, one that starts at zero and shrinks does.
+    `distance`. A dip below zero and back inside the step is found where the slope changes sign
+    once. A distance that starts at zero counts if it shrinks, and not if it grows.
     """
     begin, end = 0.0, h
     rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
-    if margin(0.0) <= GRAZING:
+    if distance(0.0) <= GRAZING:
         if not rising:
-            leaves = slope(0.0) < 0.0 or margin(h) < -GRAZING  # from rest, the latter
-            return 0.0 if margin(0.0) < -GRAZING or leaves else None
-        if margin(h) >= 0.0 or (margin(h) >= -GRAZING and not falling):
+            leaves = slope(0.0) < 0.0 or distance(h) < -GRAZING  # from rest, the latter
+            return 0.0 if distance(0.0) < -GRAZING or leaves else None
+        if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):
             return None
         # It grew first: the crossing lies behind the maximum.
         begin = _root(slope, 0.0, h) if falling else 0.0
-    elif margin(h) >= 0.0:
+    elif distance(h) >= 0.0:
         if rising or falling:
             return None
         end = _root(slope, 0.0, h)
-        if margin(end) >= 0.0:
+        if distance(end) >= 0.0:
             return None
-    return _root(margin, begin, end)
+    return _root(distance, begin, end)
 
 
 def first_event(
@@ -89,7 +89,7 @@ def first_event(
     found = []
     for limit in limits:
         x = first_crossing(
-            lambda x, at=limit: at.margin(joints(x)),  # type: ignore[misc]
+            lambda x, at=limit: at.distance(joints(x)),  # type: ignore[misc]
             lambda x, at=limit: at.slope(joints(x)),  # type: ignore[misc]
             h,
         )

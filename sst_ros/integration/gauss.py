@@ -85,8 +85,8 @@ class PreparedMotion:
         return [float(value) for value in self._states[-size:]]
 
     @property
-    def least_margins(self) -> Array:
-        """Least margin of each limit at all nodes of the last run, shape (limits,)."""
+    def least_distances(self) -> Array:
+        """Least distance from each limit at all nodes of the last run, shape (limits,)."""
         least = np.asarray(self._block[self._at.least])
         return np.asarray(least.reshape(-1, self._nodes).min(axis=1))
 
@@ -97,7 +97,7 @@ class Collocation:
     Args:
         ode: what is integrated.
         nodes: of a step; the order is twice as many.
-        limits: margins of the state's first seven numbers, monitored at all nodes; none by default.
+        limits: `limit_distances` of the first seven numbers, monitored at all nodes, or none.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
 
     Raises:

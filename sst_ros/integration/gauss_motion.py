@@ -16,12 +16,12 @@ from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
-from sst_ros.integration.limit_source import margins
+from sst_ros.integration.limit_distances import limit_distances
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 
 NEAR = 0.05
-"""Margin above which no limit is met between nodes that resolve the motion to the tolerance."""
+"""Distance above which no limit is met between nodes that resolve the motion to the tolerance."""
 
 _ROUNDING = 1e-14
 _ITERATIONS = (5, 6, 8)
@@ -115,7 +115,7 @@ class GaussMotion:
     @cached_property
     def ending(self) -> Ending | None:
         """Where the first limit is met; None where none is."""
-        if not self._limits or self._motion.least_margins.min() > NEAR:
+        if not self._limits or self._motion.least_distances.min() > NEAR:
             return None
         for k in range(self.count):
             met = first_event(self._limits, lambda x: self._joints(k, x), self.h)  # noqa: B023
@@ -242,7 +242,8 @@ def _collocation(
     if limits:
         ends = [(math.cos(limit.end), math.sin(limit.end)) for limit in limits]
         program = trace(
-            lambda *state: margins(limits, ends, dynamics.model, state), (*QUATERNION, *RATE)
+            lambda *state: limit_distances(limits, ends, dynamics.model, state),
+            (*QUATERNION, *RATE),
         )
     ode = ODE(dynamics, sine)
     if compiled is None:

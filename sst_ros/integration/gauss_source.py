@@ -22,7 +22,7 @@ HEAD = 3
 
 
 class Places(NamedTuple):
-    """Where in `block` is what: counts and step, time with state and drive, tables, margins."""
+    """Layout of `block`: counts and step, time with state and drive, tables, limit distances."""
 
     numbers: int
     counts: slice
@@ -143,7 +143,7 @@ def _march(system: ODE, nodes: int, limits: Program | None) -> str:
             ],
         ),
     ]
-    margins = range(len(limits.outputs) if limits else 0)
+    distances = range(len(limits.outputs) if limits else 0)
 
     def nearer(m: int) -> str:
         far, least = at.lane("far", m), at.lane("least", m)
@@ -153,14 +153,16 @@ def _march(system: ODE, nodes: int, limits: Program | None) -> str:
         *kept(range(2)),
         *kept(range(2, 4)),
         *evaluated(limits, at.rows("s", 7), at, "far"),
-        *loop(at, [nearer(m) for m in margins]),
+        *loop(at, [nearer(m) for m in distances]),
     ]  # fmt: skip
     lines = [
         "def march(block, states):",
         "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
         *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
         *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
-        *indented(4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in margins] or ["pass"])),
+        *indented(
+            4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in distances] or ["pass"])
+        ),
         "    worst = 0.0",
         "    for step in range(count):",
         f"        begin = {at.lane('begin', 0, 0)} + step * h",

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many scenarios as one program: a number that differs between them becomes an input.
 
-What is the same in all scenarios stays a constant that `trace` folds, so a batch pays for what
-varies and for nothing else. A term whose coefficients are zero in some scenarios changes no bit
-there.
+What is the same in all scenarios stays a constant that `trace` folds, so a batch computes only
+what varies. A term whose coefficients are zero in some scenarios changes no bit there.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.limit_source import margins
+from sst_ros.integration.limit_distances import limit_distances
 from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -136,7 +135,7 @@ class ParametricModel:
 
         def distances(*inputs: Expression) -> tuple[Any, ...]:
             at = self.constants(inputs[7:])
-            return margins(self._limits, at.ends, at.model, inputs[:7])
+            return limit_distances(self._limits, at.ends, at.model, inputs[:7])
 
         return trace(distances, (*QUATERNION, *RATE, *self.names))
 

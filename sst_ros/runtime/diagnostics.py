@@ -213,7 +213,7 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     margins: dict[bool, list[float]] = {True: [], False: []}
     for limit in limits_of(simulation.scene, simulation.geometry):
         if limit.joint < 3 or limit.joint >= 6:
-            margins[limit.joint < 3].append(limit.margin(angles))
+            margins[limit.joint < 3].append(limit.distance(angles))
     values: dict[str, object] = {
         "error_estimate": simulation.error_estimate,
         "rate_error_estimate": simulation.rate_error_estimate,

@@ -24,7 +24,7 @@ TARGET, TARGETS = 1e-9, (1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is marked in figures."""
 
 INTRODUCTION = """\
-# Accuracy and what it costs
+# Accuracy and computing time
 
 Written by `python -m sst_ros report accuracy --all`; all figures are from the machine and the date
 below the tables. [Control rate and accuracy](control_rate.md) has the error of held torques.

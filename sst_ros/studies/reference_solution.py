@@ -206,7 +206,7 @@ class HighPrecisionDop853:
         return result
 
     def evaluate(self, start: Sequence[float]) -> tuple[Any, ...]:
-        """Evaluate the derivative once, at time zero: for measuring what it costs."""
+        """Evaluate the derivative once, at time zero, to measure its computing time."""
         number = self.numbers.number
         return self._rhs(number(0), *map(number, start), *self._drive)
 

@@ -141,7 +141,7 @@ class Cost:
 
 
 def costs(scene: Scene) -> list[Cost]:
-    """Count for every term what it costs in a scene, in the sources with it and without it."""
+    """Count the operations and the time of every term: the source with it less that without it."""
     total, found = operations(scene), []
     for term in TERMS:
         without = operations(term.without(scene))

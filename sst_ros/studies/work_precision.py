@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work-precision study: the error of every method and setting on a scene, and what it costs."""
+"""Work-precision study: error and computing time of every method and setting on a scene."""
 
 from __future__ import annotations
 

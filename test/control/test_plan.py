@@ -222,11 +222,11 @@ def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
     times = np.linspace(0.0, 1.0, 2001)
     turned = Rotation.from_quat([motion.at(time).quaternion for time in times.tolist()])
     beta = kinematics.inverse(geometry, turned.as_matrix())[2]
-    for distance in plan.margins:
+    for distance in plan.distances:
         if distance.key.startswith("beta"):
             mine = distance.sign * (beta[:, int(distance.key[-1]) - 1] - distance.end)
-            assert distance.margin == pytest.approx(mine.min(), abs=1e-6)
-            assert distance.margin <= mine.min() + 1e-12
+            assert distance.least == pytest.approx(mine.min(), abs=1e-6)
+            assert distance.least <= mine.min() + 1e-12
 
 
 def test_limits_are_held_between_samples_and_told_with_the_instant():
@@ -280,7 +280,7 @@ def test_shipped_motions_are_feasible_and_end_where_they_should(name):
     plan = check(reference_motion(scene), scene)
     assert scene.duration == plan.motion.duration
     assert time_scaling(plan).highest > 1.0
-    assert min(distance.margin for distance in plan.margins if distance.sign > 0.0) > 0.1
+    assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
 
 
 def test_the_command_tells_verdict_and_status(capsys, tmp_path):
@@ -308,7 +308,7 @@ def test_json_says_what_the_table_says(capsys):
     for found, demand in zip(told["actuators"], plan.demands, strict=True):
         assert found["torque"] == {"value": demand.torque.value, "time": demand.torque.time}
         assert found["torque_rms"] == demand.torque_rms
-    assert len(told["distances"]) == len(plan.margins) == 16
+    assert len(told["distances"]) == len(plan.distances) == 16
 
 
 def test_written_torques_do_the_motion(tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limits of a scene without an angle: numbers that lanes compute beside the dynamics."""
+"""Distances from the limits of a scene, traced: event functions without an inverse tangent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sst_ros.dynamics.loads import LegMotion
 from sst_ros.mechanism.generic_math import Scalar, dot, rotation_rows
 
 
-def margins(
+def limit_distances(
     limits: Sequence[Limit],
     ends: Sequence[tuple[Scalar, Scalar]],
     model: Model,
@@ -31,12 +31,12 @@ def margins(
     rows = rotation_rows((x, y, z, w))
     legs = [leg_motion(leg, rows, (rate[0], rate[1], rate[2])) for leg in model.legs]
     return tuple(
-        _margin(limit, *end, legs[limit.leg], model.legs[limit.leg])
+        _distance(limit, *end, legs[limit.leg], model.legs[limit.leg])
         for limit, end in zip(limits, ends, strict=True)
     )
 
 
-def _margin(limit: Limit, cosine: Scalar, sine: Scalar, at: LegMotion, leg: Leg) -> Scalar:
+def _distance(limit: Limit, cosine: Scalar, sine: Scalar, at: LegMotion, leg: Leg) -> Scalar:
     """sin(sign * (angle - end)) times something positive."""
     if limit.joint < 3:
         along, across = dot(at.outward, leg.v), dot(at.outward, leg.across)
