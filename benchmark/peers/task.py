@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
@@ -107,8 +109,10 @@ class Task:
     def kernel_answer(self, y: list[float], torque: Array) -> Array:
         """gamma_ddot [rad/s^2] of the kernel that sst_ros runs."""
         rate = np.array(self.dynamics.derivative(*y, *torque)[4:7])
-        reach = np.array(self.dynamics.reach(*y))
-        return np.asarray(reach[:9].reshape(3, 3) @ rate + reach[9:])
+        rows, body_rate = rotation_rows(tuple(y[:4])), tuple(y[4:7])
+        legs = [kernel.leg_motion(leg, rows, body_rate) for leg in self.dynamics.model.legs]
+        at_rest = [kernel.rest_accelerations(at, body_rate)[1] for at in legs]
+        return np.array([at.g for at in legs]) @ rate + at_rest
 
     def at_once(self, at: Moving, mean: Array, begin: float, end: float) -> Array:
         """Acceleration at a moving state from its mean over begin .. end after it.

@@ -64,13 +64,13 @@ class Balance(NamedTuple):
     Attributes:
         inertia: M (xx, yy, zz, xy, xz, yz) [kg m^2].
         force: moment of all that acts at W_dot = 0, velocity products included [N m].
-        reach: rows g_k; gamma_dot_k = g_k.W, and a torque at gamma_k acts as tau_k g_k.
+        jacobian: rows g_k; gamma_dot_k = g_k.W, and a torque at gamma_k acts as tau_k g_k.
 
     """
 
     inertia: tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
     force: Triple
-    reach: Rows
+    jacobian: Rows
 
 
 def derivative(model: Model, state: State, torque: Triple, moment: Triple | None = None) -> State:
@@ -126,7 +126,7 @@ def actuator_torque(
         xy * x + yy * y + yz * z - at.force[1],
         xz * x + yz * y + zz * z - at.force[2],
     )
-    first, second, third = at.reach
+    first, second, third = at.jacobian
     others = (cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, others[0])
     tau = tuple(dot(missing, other) / determinant for other in others)
@@ -141,11 +141,11 @@ def balance(
     mxx, myy, mzz, mxy, mxz, myz = model.star
     fx, fy, fz = _on_star(model, rows, rate, moment)
     field = field_of(model, rows)
-    reach = []
+    jacobian = []
     for leg, drive in zip(model.legs, torque, strict=True):
         at = leg_motion(leg, rows, rate)
         a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
-        reach.append(g)
+        jacobian.append(g)
         a_rest, gamma_rest = rest_accelerations(at, rate)
         # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
         a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
@@ -176,7 +176,9 @@ def balance(
         mxy = mxy + toward_a[0] * p[1] + toward_gamma[0] * g[1]
         mxz = mxz + toward_a[0] * p[2] + toward_gamma[0] * g[2]
         myz = myz + toward_a[1] * p[2] + toward_gamma[1] * g[2]
-    return Balance((mxx, myy, mzz, mxy, mxz, myz), (fx, fy, fz), (reach[0], reach[1], reach[2]))
+    return Balance(
+        (mxx, myy, mzz, mxy, mxz, myz), (fx, fy, fz), (jacobian[0], jacobian[1], jacobian[2])
+    )
 
 
 def joints(model: Model, state: State) -> Joints:

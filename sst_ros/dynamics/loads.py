@@ -85,21 +85,21 @@ def joint_torques(
     loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
 ) -> Triple:
     """Torques [N m] at gamma, mu and beta; `field` is gravity in {E}."""
-    rubbing = tuple(
-        0.0 if friction is None else -resistance(friction, rate(leg, kind))
-        for kind, friction in enumerate(loads.friction)
+    friction = tuple(
+        0.0 if one is None else -friction_torque(one, rate(leg, kind))
+        for kind, one in enumerate(loads.friction)
     )
-    pulling = tuple(
+    springs = tuple(
         0.0 if spring is None else -spring.stiffness * (angle(leg, kind, across, v) - spring.rest)
         for kind, spring in enumerate(loads.springs)
     )
     at_gamma, at_mu = _weight(loads, leg, field)
     if loads.stops is not None:
-        at_gamma = at_gamma + _push(loads.stops, angle(leg, 0, across, v), leg.gamma_dot)
+        at_gamma = at_gamma + _stop_torque(loads.stops, angle(leg, 0, across, v), leg.gamma_dot)
     return (
-        rubbing[0] + pulling[0] + at_gamma,
-        rubbing[1] + pulling[1] + at_mu,
-        rubbing[2] + pulling[2],
+        friction[0] + springs[0] + at_gamma,
+        friction[1] + springs[1] + at_mu,
+        friction[2] + springs[2],
     )
 
 
@@ -128,16 +128,16 @@ def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> S
     total: Scalar = 0.0
     for kind, friction in enumerate(loads.friction):
         if friction is not None:
-            total = total + resistance(friction, rate(leg, kind)) * rate(leg, kind)
+            total = total + friction_torque(friction, rate(leg, kind)) * rate(leg, kind)
     if loads.stops is not None and loads.stops.damping:
         gamma, speed = angle(leg, 0, across, v), leg.gamma_dot
         elastic = loads.stops._replace(damping=0.0)
-        excess = _push(elastic, gamma, speed) - _push(loads.stops, gamma, speed)
+        excess = _stop_torque(elastic, gamma, speed) - _stop_torque(loads.stops, gamma, speed)
         total = total + excess * speed
     return total
 
 
-def resistance(friction: Friction, v: Scalar) -> Scalar:
+def friction_torque(friction: Friction, v: Scalar) -> Scalar:
     """Friction torque [N m] against the rate v [rad/s]."""
     torque = friction.viscous * v
     if friction.coulomb or friction.static:
@@ -186,7 +186,7 @@ def _directions(
     return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
 
 
-def _push(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+def _stop_torque(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
     """Torque of compliant stops; the damping grows from zero with the depth (Hunt-Crossley)."""
     low, high = positive(-gamma), positive(gamma - stops.arc)
     if not stops.damping:

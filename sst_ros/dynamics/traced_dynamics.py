@@ -86,11 +86,6 @@ class Dynamics:
         return compiled(trace(self._inverse, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
 
     @cached_property
-    def reach(self) -> Function:
-        """Rows g_k (nine numbers) and gamma_ddot at W_dot = 0, of the first seven numbers."""
-        return compiled(trace(self._reach, (*QUATERNION, *RATE)))
-
-    @cached_property
     def energies(self) -> Function:
         """Kinetic and potential energy [J] and power put in [W], of state and drive."""
         return compiled(trace(self._energies, (*self.state, *self.drive)))
@@ -107,12 +102,6 @@ class Dynamics:
         rows = rotation_rows(q)
         squares = (kernel.leg_motion(leg, rows, rate).u for leg in self.model.legs)
         return (*torque, determinant, *squares)
-
-    def _reach(self, *state: Any) -> tuple[Any, ...]:
-        rows, rate = rotation_rows(state[:4]), state[4:7]
-        legs = [kernel.leg_motion(leg, rows, rate) for leg in self.model.legs]
-        flat = [number for at in legs for number in at.g]
-        return (*flat, *(kernel.rest_accelerations(at, rate)[1] for at in legs))
 
     def _energies(self, *inputs: Any) -> tuple[Any, ...]:
         state, torque, moment = self._split(inputs)

@@ -23,8 +23,8 @@ from sst_ros.integration.step_control import GROW, better_method, step_factor
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
-_LOOK_EVERY = 16
-_LOOK_AFTER_REJECTIONS = 3
+_CHOOSE_EVERY = 16
+_CHOOSE_AFTER_REJECTIONS = 3
 
 
 class AcceptedStep(NamedTuple):
@@ -91,7 +91,7 @@ class AdaptiveStepper:
         self._methods: dict[str, CompiledMethod] = {}
         self._current = self._method_of(DORMAND_PRINCE if self._auto else METHODS[method])
         self._h = float("inf")
-        self._since_look = 0
+        self._since_choice = 0
 
     @property
     def method(self) -> Method:
@@ -119,11 +119,11 @@ class AdaptiveStepper:
 
     def checkpoint(self) -> StepperCheckpoint:
         """Return what the next steps depend on, to go back to."""
-        return self._current, self._h, self._since_look, len(self.history)
+        return self._current, self._h, self._since_choice, len(self.history)
 
     def restore(self, checkpoint: StepperCheckpoint) -> None:
         """Forget what has happened since `checkpoint`."""
-        self._current, self._h, self._since_look, changes = checkpoint
+        self._current, self._h, self._since_choice, changes = checkpoint
         del self.history[changes:]
 
     def accepted_steps(
@@ -152,14 +152,14 @@ class AdaptiveStepper:
                 if self._h < 1e-15 * max(abs(t), end - t) or self._h < 1e-200:
                     raise CannotStep(f"steps of {self._h:.1e} s do not resolve it")
                 rejected += 1
-                self._look(t, h, y, d, rejected)
+                self._choose_method(t, h, y, d, rejected)
                 continue
             rejected = 0
             if h < left or factor < 1.0 or self._h < float("inf"):
                 self._h = max(self._h, h * factor) if h == left else h * factor
             yield AcceptedStep(t, h, new_y, new_z, order)
             if h < left or isinstance(self.method, Rosenbrock):
-                self._look(t + h, h, new_y, d)
+                self._choose_method(t + h, h, new_y, d)
             if h == left:
                 return
             t, y, z = t + h, new_y, new_z
@@ -179,7 +179,7 @@ class AdaptiveStepper:
             count = min(count, max(self.budget.per_period // self.pair_cost, 1))
         implicit = isinstance(self.method, Rosenbrock)
         if implicit and self._auto:
-            count = min(count, _LOOK_EVERY - 1 - self._since_look)
+            count = min(count, _CHOOSE_EVERY - 1 - self._since_choice)
         if order != self.method.order:
             at = (at[0], coarse_solution.rescaled(at[0], at[1], order, self.method.order), at[2])
         done, end = self._current.step_many(h, count, self.tolerance, at, d)
@@ -188,7 +188,7 @@ class AdaptiveStepper:
             for size in self._current.sizes[:done]:
                 self._h = max(self._h, h * self._factor(float(size)))
         if implicit:
-            self._since_look += done
+            self._since_choice += done
         return done, end
 
     def step_sequence(
@@ -216,20 +216,20 @@ class AdaptiveStepper:
     def _factor(self, size: float) -> float:
         return step_factor(size / self.tolerance, self.method.error_order)
 
-    def _look(self, t: float, h: float, y: Vector, d: Vector, rejected: int = 0) -> None:
-        """Ask the spectrum whether another method would take longer steps.
+    def _choose_method(self, t: float, h: float, y: Vector, d: Vector, rejected: int = 0) -> None:
+        """Change the method if, by the eigenvalues of the Jacobian, another takes longer steps.
 
         After every 16 attempts, and after 3 rejections in a row: a Coulomb torque that changes sign
         sharply would otherwise shrink explicit steps below its time constant before it is seen.
         """
-        self._since_look += 1
-        early = rejected == _LOOK_AFTER_REJECTIONS and not isinstance(self.method, Rosenbrock)
+        self._since_choice += 1
+        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(self.method, Rosenbrock)
         if not self._auto or self._derivative is not None:
             return
-        if self._since_look < _LOOK_EVERY and not early:
+        if self._since_choice < _CHOOSE_EVERY and not early:
             return
         if not early:
-            self._since_look = 0
+            self._since_choice = 0
         self.budget.charge(JACOBIAN_COST)
         try:
             eigenvalues = self._ode.eigenvalues(t, y, d)

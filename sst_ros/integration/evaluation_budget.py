@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bound of what a period may cost, in evaluations of the right-hand side."""
+"""A bound on the evaluations of the right-hand side in a period."""
 
 from __future__ import annotations
 

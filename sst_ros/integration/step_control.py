@@ -37,14 +37,14 @@ def better_method(
         only_stiff: look for stiffness alone.
 
     """
-    reach, decay = abs(steps).max(), -steps.real.min()
+    radius, decay = abs(steps).max(), -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
-    if not implicit and decay > _STIFF and decay > 0.5 * reach:
+    if not implicit and decay > _STIFF and decay > 0.5 * radius:
         return RODAS4, f"stiff: step times fastest decay is {decay:.2g}"
     if only_stiff:
         return method, ""
-    if implicit and reach < _EASY:
-        return DORMAND_PRINCE, f"no longer stiff: step times rate is {reach:.2g}"
+    if implicit and radius < _EASY:
+        return DORMAND_PRINCE, f"no longer stiff: step times rate is {radius:.2g}"
     if method is DORMAND_PRINCE and tolerance < 1e-7 and decay <= _STIFF:
         return DOP853, "many small steps that accuracy asks for"
     return method, ""

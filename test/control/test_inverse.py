@@ -39,7 +39,7 @@ def rounding(scene, sample, acceleration, torque, moment=None):
         kernel.model_of(scene), sample.quaternion, sample.body_rate, (0.0,) * 3, moment
     )
     xx, yy, zz, xy, xz, yz = at.inertia
-    m, reach = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.array(at.reach)
+    m, reach = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.array(at.jacobian)
     terms = np.abs(m) @ np.abs(acceleration) + np.abs(at.force) + np.abs(reach.T) @ np.abs(torque)
     return 16.0 * EPS * np.linalg.cond(reach) * np.linalg.norm(np.linalg.inv(m)) * terms.sum()
 

@@ -197,9 +197,9 @@ def test_friction_is_the_documented_torque_of_its_rate(v):
     friction = Friction(viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01)
     fading = 0.2 + 0.3 * np.exp(-((v / 0.1) ** 2))
     expected = 0.3 * v + fading * np.tanh(v / 0.01)
-    assert loads.resistance(friction, v) == pytest.approx(expected, rel=1e-14)
-    assert loads.resistance(friction, -v) == -loads.resistance(friction, v)
-    assert loads.resistance(friction, v) * v >= 0.0
+    assert loads.friction_torque(friction, v) == pytest.approx(expected, rel=1e-14)
+    assert loads.friction_torque(friction, -v) == -loads.friction_torque(friction, v)
+    assert loads.friction_torque(friction, v) * v >= 0.0
 
 
 def test_springs_at_one_joint_add_up():
