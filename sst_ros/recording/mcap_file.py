@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The messages of an MCAP file, verified by its checksums; damaged and cut files included.
 
-The records are those of https://mcap.dev/spec: one byte opcode, eight bytes length, content.
 Chunks carry a CRC-32 of their records, the summary (index) one of itself, and the end of the data
 section one of all bytes before it. Files are read from the beginning, because one that was cut has
 no index; after a damaged part reading resumes at the next chunk that is intact.
@@ -11,39 +10,31 @@ from __future__ import annotations
 
 import mmap
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from io import BytesIO
+from collections.abc import Iterator
 from pathlib import Path
-from struct import Struct
-from struct import error as StructError
 from typing import NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, Header, MessageIndex, Schema, Statistics
+
+from sst_ros.recording.mcap_records import (
+    ERRORS,
+    MESSAGE,
+    RECORD,
+    Damage,
+    frame,
+    next_chunk,
+    reason,
+    records_of,
+    stream,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "sst_ros"
 """Name of the writer in files of ours, whose messages are numbered from 1 on in each channel."""
 
-_RECORD, _MESSAGE = Struct("<BQ"), Struct("<HIQQ")
-_BODY = _RECORD.size + _MESSAGE.size
-_FOOTER_SIZE = _RECORD.size + 20
-_DATA_OPCODES = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
-_ERRORS = (
-    McapError, StructError, ValueError, KeyError, EOFError, RuntimeError, MemoryError,
-    zstandard.ZstdError,
-)  # fmt: skip
-
-_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
-    "": lambda content: content,
-    "zstd": lambda content: bytes(zstandard.ZstdDecompressor().decompressobj().decompress(content)),
-    "lz4": lambda content: bytes(lz4.frame.decompress(content)),
-}
+_BODY = RECORD.size + MESSAGE.size
+_FOOTER_SIZE = RECORD.size + 20
 
 
 class McapMessage(NamedTuple):
@@ -53,41 +44,6 @@ class McapMessage(NamedTuple):
     type: str
     received_ns: int
     data: bytes
-
-
-@dataclass
-class Damage:
-    """A part of a file that cannot be used.
-
-    Attributes:
-        offset: first byte of the part.
-        reason: what is wrong with it.
-        messages: number of messages in it, 0 where that is not known.
-        begin_ns, end_ns: first and last reception of them [ns], 0 where that is not known.
-
-    """
-
-    offset: int
-    reason: str
-    messages: int = 0
-    begin_ns: int = 0
-    end_ns: int = 0
-
-    def add(self, index: MessageIndex) -> None:
-        """Count the messages that the index of a chunk lists for one channel."""
-        times = [time for time, _ in index.records]
-        if times:
-            self.begin_ns = min([self.begin_ns or times[0], *times])
-            self.end_ns = max([self.end_ns, *times])
-            self.messages += len(times)
-
-    def describe(self, origin_ns: int) -> str:
-        """Name offset, reason and time range, in seconds after `origin_ns`."""
-        text = f"byte {self.offset}: {self.reason}"
-        if self.messages:
-            first, last = ((time - origin_ns) / 1e9 for time in (self.begin_ns, self.end_ns))
-            text += f" ({self.messages} messages, {first:.3f} s to {last:.3f} s)"
-        return text
 
 
 class McapFile:
@@ -158,9 +114,9 @@ class McapFile:
         if data[: len(MAGIC)] != MAGIC:
             self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
         while position < end:
-            opcode, stop = _frame(data, position, end)
+            opcode, stop = frame(data, position, end)
             if not stop:
-                resumed = _next_chunk(data, position, end)
+                resumed = next_chunk(data, position, end)
                 if not resumed and self.cut:
                     yield from self._cut_chunk(data, position)
                     return
@@ -169,7 +125,7 @@ class McapFile:
                     return
                 broken, position = self.damage[-1], resumed
                 continue
-            content = data[position + _RECORD.size : stop]
+            content = data[position + RECORD.size : stop]
             if opcode == Opcode.DATA_END:
                 self._check_data_end(content, checksum, position)
                 return
@@ -180,42 +136,35 @@ class McapFile:
                     yield from self._records(self._verified(content))
                 elif opcode == Opcode.MESSAGE_INDEX:
                     if broken:
-                        broken.add(MessageIndex.read(_stream(content)))
+                        broken.add(MessageIndex.read(stream(content)))
                 else:
                     yield from self._records(data[position:stop])
-            except _ERRORS as error:
-                broken = Damage(position, _reason(error))
+            except ERRORS as error:
+                broken = Damage(position, reason(error))
                 self.damage.append(broken)
             position = stop
         if not self.cut:
             self.damage.append(Damage(position, "the end of the data section is missing"))
 
     def _verified(self, content: bytes) -> bytes:
-        """Return the records of a chunk after checking size and checksum."""
-        chunk = Chunk.read(_stream(content))
+        """Return the records of a chunk; counts it if it has no checksum."""
+        chunk = Chunk.read(stream(content))
         self._origin_ns = self._origin_ns or chunk.message_start_time
-        records = _DECOMPRESS[chunk.compression](chunk.data)
-        if len(records) != chunk.uncompressed_size:
-            raise ValueError("chunk of wrong size")
-        if not chunk.uncompressed_crc:
-            self.unverified += 1
-        elif zlib.crc32(records) != chunk.uncompressed_crc:
-            raise ValueError("chunk with wrong checksum")
+        records = records_of(chunk)
+        self.unverified += not chunk.uncompressed_crc
         return records
 
     def _records(self, records: bytes) -> Iterator[McapMessage]:
         """Yield the messages among records; schemas and channels are remembered."""
         position, end = 0, len(records)
-        while position + _RECORD.size <= end:
-            opcode, length = _RECORD.unpack_from(records, position)
-            begin, stop = position, position + _RECORD.size + length
+        while position + RECORD.size <= end:
+            opcode, length = RECORD.unpack_from(records, position)
+            begin, stop = position, position + RECORD.size + length
             position = stop
             if stop > end:
                 raise ValueError("record longer than its chunk")
             if opcode == Opcode.MESSAGE:
-                number, sequence, received_ns, _ = _MESSAGE.unpack_from(
-                    records, begin + _RECORD.size
-                )
+                number, sequence, received_ns, _ = MESSAGE.unpack_from(records, begin + RECORD.size)
                 channel = self.channels.get(number)
                 self._follow(number, sequence)
                 if channel is None:
@@ -224,17 +173,17 @@ class McapFile:
                 self.count += 1
                 yield McapMessage(*channel, received_ns, records[begin + _BODY : stop])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER):
-                self._describe(opcode, records[begin + _RECORD.size : stop])
+                self._describe(opcode, records[begin + RECORD.size : stop])
 
     def _describe(self, opcode: int, content: bytes) -> None:
-        stream = _stream(content)
+        fields = stream(content)
         if opcode == Opcode.HEADER:
-            self._numbered = Header.read(stream).library.startswith(LIBRARY)
+            self._numbered = Header.read(fields).library.startswith(LIBRARY)
         elif opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
+            schema = Schema.read(fields)
             self._schemas[schema.id] = schema.name
         else:
-            channel = Channel.read(stream)
+            channel = Channel.read(fields)
             self.channels[channel.id] = (channel.topic, self._schemas.get(channel.schema_id, ""))
 
     def _follow(self, number: int, sequence: int) -> None:
@@ -246,21 +195,21 @@ class McapFile:
     def _cut_chunk(self, data: mmap.mmap, position: int) -> Iterator[McapMessage]:
         """Yield the whole messages of an uncompressed chunk that the file ends in."""
         content = data[position : len(data)]
-        if len(content) > _RECORD.size and content[0] == Opcode.CHUNK:
-            head = _RECORD.size + 28
+        if len(content) > RECORD.size and content[0] == Opcode.CHUNK:
+            head = RECORD.size + 28
             if len(content) >= head + 12 and content[head : head + 4] == bytes(4):
                 position += head + 12
                 content = content[head + 12 :]
         end, complete = len(content), 0
         while True:
-            opcode, stop = _frame(content, complete, end)
+            opcode, stop = frame(content, complete, end)
             if not stop or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
                 break
             complete = stop
         try:
             yield from self._records(content[:complete])
-        except _ERRORS as error:
-            self.damage.append(Damage(position, _reason(error)))
+        except ERRORS as error:
+            self.damage.append(Damage(position, reason(error)))
 
     def _check_data_end(self, content: bytes, checksum: int, position: int) -> None:
         expected = int.from_bytes(content, "little")
@@ -275,8 +224,8 @@ class McapFile:
             self.cut = True
             return size
         try:
-            opcode, length = _RECORD.unpack_from(data, footer_at)
-            footer = Footer.read(_stream(data[footer_at + _RECORD.size : size - len(MAGIC)]))
+            opcode, length = RECORD.unpack_from(data, footer_at)
+            footer = Footer.read(stream(data[footer_at + RECORD.size : size - len(MAGIC)]))
             begin = footer.summary_start or footer_at
             if (opcode, length) != (Opcode.FOOTER, 20) or not len(MAGIC) <= begin <= footer_at:
                 raise ValueError("index with wrong position")
@@ -284,49 +233,16 @@ class McapFile:
                 raise ValueError("index with wrong checksum")
             position = begin
             while position < footer_at:
-                opcode, stop = _frame(data, position, footer_at)
+                opcode, stop = frame(data, position, footer_at)
                 if not stop:
                     raise ValueError("index with unreadable bytes")
-                content = data[position + _RECORD.size : stop]
+                content = data[position + RECORD.size : stop]
                 if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                     self._describe(opcode, content)
                 elif opcode == Opcode.STATISTICS:
-                    self._expected = Statistics.read(_stream(content)).message_count
+                    self._expected = Statistics.read(stream(content)).message_count
                 position = stop
-        except _ERRORS as error:
-            self.damage.append(Damage(footer_at, _reason(error)))
+        except ERRORS as error:
+            self.damage.append(Damage(footer_at, reason(error)))
             return size
         return begin
-
-
-def _frame(data: mmap.mmap | bytes, position: int, end: int) -> tuple[int, int]:
-    """Return opcode and end of the record at a position; the end is 0 where there is none."""
-    if position + _RECORD.size > end:
-        return 0, 0
-    opcode, length = _RECORD.unpack_from(data, position)
-    stop = position + _RECORD.size + int(length)
-    return (opcode, stop) if opcode in _DATA_OPCODES and stop <= end else (opcode, 0)
-
-
-def _next_chunk(data: mmap.mmap, position: int, end: int) -> int:
-    """Find the next chunk whose checksum is right; 0 where there is none."""
-    while (position := data.find(bytes([Opcode.CHUNK]), position + 1, end)) > 0:
-        _, stop = _frame(data, position, end)
-        if stop > position + 49:
-            try:
-                chunk = Chunk.read(_stream(data[position + _RECORD.size : stop]))
-                records = _DECOMPRESS[chunk.compression](chunk.data)
-                right = chunk.uncompressed_crc in (0, zlib.crc32(records))
-                if right and records and len(records) == chunk.uncompressed_size:
-                    return position
-            except _ERRORS:
-                continue
-    return 0
-
-
-def _stream(content: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(content))
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
