@@ -170,7 +170,7 @@ class Simulator:
             for name in graph.publishers(self.node, topic, best_effort=True):
                 yield f"{topic} of {name} is best effort and not received: publish it reliably"
         own = self.node.get_fully_qualified_name()
-        # Not by the names of the graph: there a node that has ended may stay for ever.
+        # Not by the names of the graph: a node that has ended may stay there.
         if self.node.count_publishers(topics.PHASE.at(own)) > 1:
             yield f"another node is named {own}, too"
 
