@@ -21,15 +21,15 @@ def test_skipped():
 
 
 @pytest.mark.parametrize(
-    ("reason", "ci", "status"),
+    ("reason", "ci", "workers", "status"),
     [
-        ("no chromium with chromedriver on the PATH", "true", 0),
-        ("numba is missing", "true", 1),
-        ("numba is missing", "false", 0),
+        ("no chromium with chromedriver on the PATH", "true", [], 0),
+        ("numba is missing", "true", [], 1),
+        ("numba is missing", "true", ["-n", "1"], 1),
+        ("numba is missing", "false", [], 0),
     ],
 )
-@pytest.mark.parametrize("workers", [[], ["-n", "1"]], ids=["one process", "xdist"])
-def test_an_unexpected_skip_fails(reason, ci, status, workers, tmp_path):
+def test_an_unexpected_skip_fails(reason, ci, workers, status, tmp_path):
     (tmp_path / "test_it.py").write_text(TESTS.format(reason=reason))
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "unexpected_skips", *workers, tmp_path],

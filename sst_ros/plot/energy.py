@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from sst_ros.dynamics import energy as physics
 from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot.style import BLUE, GREY, lines, scaled, span, stack
-from sst_ros.recording.body_rates import body_rates
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import Integers
 from sst_ros.scene.scene import Scene

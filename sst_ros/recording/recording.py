@@ -12,9 +12,9 @@ import numpy as np
 
 from sst_ros.errors import InputError
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import signals
 from sst_ros.recording.bag_reader import refused
-from sst_ros.recording.body_rates import body_rates
 from sst_ros.recording.export import table_of
 from sst_ros.recording.run_torques import Commands, Ticks, commands_of, finite, ticks_of
 from sst_ros.recording.signals import Signals

@@ -11,7 +11,7 @@ from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.recording.body_rates import body_rates
+from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import Integers
 from sst_ros.scene.scene import Scene
