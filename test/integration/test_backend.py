@@ -82,7 +82,8 @@ def cut_off(cache, pattern, left):
 
 
 @needs_numba
-@pytest.mark.parametrize("left", [40, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("left", [40, 0])
 def test_cut_off_files_are_repaired(left, cache, truth):
     """Source, index and machine code; at the end all can be loaded again."""
     files = [path for kind in ("sst_*.py", "*.nbi", "*.nbc") for path in cut_off(cache, kind, left)]
