@@ -95,7 +95,7 @@ def joint_torques(
     )
     at_gamma, at_mu = _weight(loads, leg, field)
     if loads.stops is not None:
-        at_gamma = at_gamma + _stop_torque(loads.stops, angle(leg, 0, across, v), leg.gamma_dot)
+        at_gamma = at_gamma + stop_torque(loads.stops, angle(leg, 0, across, v), leg.gamma_dot)
     return (
         friction[0] + springs[0] + at_gamma,
         friction[1] + springs[1] + at_mu,
@@ -132,7 +132,7 @@ def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> S
     if loads.stops is not None and loads.stops.damping:
         gamma, speed = angle(leg, 0, across, v), leg.gamma_dot
         elastic = loads.stops._replace(damping=0.0)
-        excess = _stop_torque(elastic, gamma, speed) - _stop_torque(loads.stops, gamma, speed)
+        excess = stop_torque(elastic, gamma, speed) - stop_torque(loads.stops, gamma, speed)
         total = total + excess * speed
     return total
 
@@ -186,7 +186,7 @@ def _directions(
     return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
 
 
-def _stop_torque(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+def stop_torque(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
     """Torque of compliant stops; the damping grows from zero with the depth (Hunt-Crossley)."""
     low, high = positive(-gamma), positive(gamma - stops.arc)
     if not stops.damping:

@@ -285,7 +285,7 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
 
 
 REFUSED = [
-    ({"star.weight": [1.0]}, r"star.weight = \[1.0\]: unknown key; allowed are alpha_deg, radius"),
+    ({"star.weight": [1.0]}, r"star.weight = \[1.0\]: unknown key; allowed are inertia, mass"),
     ({"payload.mass": [1.0]}, "payload.mass = .*: the scene has no payload"),
     ({"springs[0].rest": [1.0]}, "the scene has 0 springs"),
     ({"actuated_links[3].mass": [1.0]}, "the scene has 3 actuated_links"),

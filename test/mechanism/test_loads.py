@@ -185,11 +185,11 @@ def test_elastic_ends_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
     scene = only(sample, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
     stops = model.loads_of_leg(scene, sample.geometry, 0).stops
-    assert loads._push(stops, 0.5 * stops.arc, 1.0) == 0.0
-    assert loads._push(stops, -0.01, 0.0) == pytest.approx(1.0)
-    assert loads._push(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)
-    assert loads._push(stops, -0.01, -0.1) == pytest.approx(1.5)
-    assert loads._push(stops, -0.01, 10.0) == 0.0
+    assert loads.stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
+    assert loads.stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
+    assert loads.stop_torque(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)
+    assert loads.stop_torque(stops, -0.01, -0.1) == pytest.approx(1.5)
+    assert loads.stop_torque(stops, -0.01, 10.0) == 0.0
 
 
 @pytest.mark.parametrize("v", [-2.0, -0.05, 0.0, 0.003, 0.4])
