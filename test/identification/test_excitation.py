@@ -82,4 +82,4 @@ def test_bad_arguments_are_refused():
     # Gravity alone asks for more than these actuators have.
     weak = scene.with_values({"actuators.torque_limit": 1e-3, "initial.gamma": [0.7, 0.8, 0.9]})
     with pytest.raises(MotionRefused):
-        design(weak, iterations=1, harmonics=3)
+        design(weak, duration=1.0, iterations=1, harmonics=3)

@@ -26,7 +26,7 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
 
 def test_a_scene_becomes_a_motion(tmp_path, capsys):
     out = tmp_path / "exciting.yaml"
-    words = ["identify", "design", "example2", "--duration", "3", "--harmonics", "3"]
+    words = ["identify", "design", "example2", "--duration", "1", "--harmonics", "3"]
     assert run([*words, "--parameters", "star", "--out", str(out)]) == 0
     assert "condition number" in capsys.readouterr().out
     assert load_scene(out).motion.kind == "waypoints"

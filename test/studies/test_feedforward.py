@@ -5,13 +5,12 @@ import csv
 import dataclasses
 import io
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from matplotlib import image
 
+from sst_ros.cli.main import run
 from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
@@ -190,15 +189,10 @@ def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
     )
 
 
-def command(*words):
-    return subprocess.run(
-        [sys.executable, "-m", "sst_ros", "study", "feedforward", *words],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-
-
-def test_the_command_tells_what_it_takes():
-    said = command("--help").stdout
+def test_the_command_tells_what_it_takes(capsys):
+    with pytest.raises(SystemExit):
+        run(["study", "feedforward", "--help"])
+    said = capsys.readouterr().out
     assert all(word in said for word in ("--scene", "--period", "--bandwidths", "--out", "[rad/s]"))
 
 
@@ -212,7 +206,7 @@ def test_the_command_tells_what_it_takes():
         (["--scene", "example2_heavy"], "the scene has no desired motion"),
     ],
 )
-def test_what_is_not_allowed_is_told_without_a_traceback(words, said):
-    done = command(*words)
-    assert done.returncode == 1
-    assert said in done.stderr and "Traceback" not in done.stderr
+def test_what_is_not_allowed_is_told_without_a_traceback(words, said, capsys):
+    assert run(["study", "feedforward", *words]) == 1
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
