@@ -84,7 +84,7 @@ class CompiledMethod:
     def step_many(
         self, h: float, count: int, tolerance: float, at: StepPoint, d: Vector
     ) -> tuple[int, StepPoint]:
-        """Go on by up to `count` periods of h, each one pair of steps; stop before what asks more.
+        """Advance by up to `count` periods of h, a pair of steps each, as long as that suffices.
 
         Args:
             h: length of a period [s].
@@ -120,12 +120,12 @@ class CompiledMethod:
         at: StepPoint,
         reached: Any,
     ) -> tuple[int, StepPoint]:
-        """Go on from period `first` by a pair of steps a period; stop before what asks more.
+        """Advance from period `first` by a pair of steps a period; stop before one that needs more.
 
         Args:
             first: number of the period that begins.
             periods: of n periods the lengths [s], shape (n,), the drives, (n, m), and the states
-                (n, size) at which they begin, NaN where they go on; lists in plain Python.
+                (n, size) at which they begin, NaN where they continue; lists in plain Python.
             tolerance: largest local error estimate of a period.
             at: where the period begins.
             reached: takes solution and coarse solution at the ends, shape (n, 2, size).

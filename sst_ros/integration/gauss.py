@@ -42,14 +42,14 @@ class PreparedMotion:
 
     def __init__(
         self,
-        march: Callable[..., float],
+        integrate: Callable[..., float],
         block: Any,
         states: Any,
         at: gauss_source.Places,
         nodes: int,
     ) -> None:
         self._block, self._states, self._at, self._nodes = block, states, at, nodes
-        self.run: Callable[[], float] = partial(march, block, states)
+        self.run: Callable[[], float] = partial(integrate, block, states)
 
     def begin(self, t: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
         """Set where `run` begins: time [s], state, and a drive that is constant.
@@ -144,11 +144,11 @@ class Collocation:
         block[at.counts] = count, iterations, h
         states = np.zeros(count * self._size)
         if self._compiled:
-            march = _machine_code(self._module.march)
-            motion = PreparedMotion(march, block, states, at, self._nodes)
+            integrate = _machine_code(self._module.integrate)
+            motion = PreparedMotion(integrate, block, states, at, self._nodes)
         else:
             lists = block.tolist(), states.tolist()
-            motion = PreparedMotion(self._module.march, *lists, at, self._nodes)
+            motion = PreparedMotion(self._module.integrate, *lists, at, self._nodes)
         motion.set_step(h)
         motion.begin(t, y, d)
         return motion
@@ -158,7 +158,7 @@ def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> boo
     """Return whether the machine code of a `Collocation` is there to be loaded."""
     texts = gauss_source.source(ode, nodes, limits)
     known = codegen.numba_version() is not None
-    return known and codegen.has_code(texts, {}, ("march",), rounding=False)
+    return known and codegen.has_code(texts, {}, ("integrate",), rounding=False)
 
 
 @lru_cache(maxsize=16)

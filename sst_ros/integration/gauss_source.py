@@ -32,7 +32,7 @@ class Places(NamedTuple):
 
 
 def places(system: ODE, nodes: int, limits: Program | None) -> Places:
-    """Allocate what `march` reads and writes."""
+    """Allocate what `integrate` reads and writes."""
     at, inputs = _layout(system, nodes, limits), len(system.program.inputs)
     begin, table, least = (at.first(group) for group in ("begin", "node", "least"))
     return Places(
@@ -45,8 +45,8 @@ def places(system: ODE, nodes: int, limits: Program | None) -> Places:
 
 
 def source(system: ODE, nodes: int, limits: Program | None) -> list[str]:
-    """Texts of flat_sin and of `march(block, states)`, see `gauss.PreparedMotion`."""
-    return [inspect.getsource(flat_sin), _march(system, nodes, limits)]
+    """Texts of flat_sin and of `integrate(block, states)`, see `gauss.PreparedMotion`."""
+    return [inspect.getsource(flat_sin), _integrate(system, nodes, limits)]
 
 
 def _layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
@@ -73,7 +73,7 @@ def _time_only(system: ODE) -> list[bool]:
     return [True, *(False,) * len(system.state), *(True,) * len(system.drive)]
 
 
-def _march(system: ODE, nodes: int, limits: Program | None) -> str:
+def _integrate(system: ODE, nodes: int, limits: Program | None) -> str:
     at, size, inputs = _layout(system, nodes, limits), len(system.state), len(system.program.inputs)
     everything, quaternion, rates = range(size), range(4), range(4, size)
     known = _known(system)
@@ -156,7 +156,7 @@ def _march(system: ODE, nodes: int, limits: Program | None) -> str:
         *loop(at, [nearer(m) for m in distances]),
     ]  # fmt: skip
     lines = [
-        "def march(block, states):",
+        "def integrate(block, states):",
         "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
         *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
         *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
