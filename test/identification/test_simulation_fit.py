@@ -128,6 +128,7 @@ def test_the_slope_of_the_damping_by_the_restitution():
         assert damping_slope(scene) == pytest.approx((high - low) / 2e-6, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_smoothing_and_lag_which_no_torque_is_linear_in_are_found():
     plant = rubbing()
     names = ("friction.gamma.smoothing", "actuators.time_constant", "initial.gamma_dot[0]")
@@ -159,6 +160,7 @@ def test_the_standard_deviations_cover_the_errors_of_noisy_readings():
     assert np.abs(off).max() < 4.0
 
 
+@pytest.mark.slow
 def test_one_reading_of_example_1_fixes_only_a_product():
     """No drift over a period: I_eff gamma_dot(0) = -1.13 / 12, and neither of the two alone."""
     scene, period = load_scene("example1"), math.pi / 6

@@ -138,7 +138,13 @@ class Planted:
 
 @as_root
 @with_numba
-@pytest.mark.parametrize("mine", [False, True], ids=["folder of another user", "own folder"])
+@pytest.mark.parametrize(
+    "mine",
+    [
+        pytest.param(False, id="folder of another user"),
+        pytest.param(True, id="own folder", marks=pytest.mark.slow),
+    ],
+)
 def test_the_code_of_another_user_does_not_run(mine, tmp_path):
     """numba unpickles its index: what another user has put there must not be read."""
     assert run(tmp_path / "cache").stdout == "42.0\n"
@@ -164,6 +170,7 @@ def test_the_code_of_another_user_does_not_run(mine, tmp_path):
 
 
 @with_numba
+@pytest.mark.slow
 def test_a_full_disk_costs_the_cache_and_nothing_else(tmp_path):
     def limited():
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))

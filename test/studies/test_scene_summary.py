@@ -25,7 +25,11 @@ from sst_ros.studies.step_advice import step_advice
 from sst_ros.studies.term_costs import TERMS, costs, operations
 
 EXAMPLE2 = load("example2_heavy")
-every_scene = pytest.mark.parametrize("name", names())
+QUICK = ("example2", "elastic_stops", "friction", "general", "gravity_payload", "stiff", "swing")
+every_scene = pytest.mark.parametrize(
+    "name",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names()],
+)
 
 
 def everything() -> Scene:
