@@ -8,6 +8,7 @@ ALLOWED = (
     "needs /dev/full",
     "needs root to act as a second user",
     "of a ROS installation",
+    "no C++ compiler",
     "no chromium with chromedriver on the PATH",
     # Engines of the extra `peers`, a gigabyte: `python -m benchmark.peers` runs them.
     "No module named 'pydrake'",

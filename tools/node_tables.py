@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sst_ros.nodes import inverse_dynamics, topics
-from sst_ros.nodes.topics import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.runtime import diagnostics
 from sst_ros.runtime.settings import (
     ControllerNodeParameters,
@@ -129,6 +129,7 @@ def policy(node: Described) -> str:
             *_rules("topics", "topic", "subscribe", subscribe),
             *_rules("services", "service", "reply", reply),
             *_rules("services", "service", "request", _names(node, CALLS)),
+            *_rules("actions", "action", "execute", _names(node, EXECUTES)),
             "        </profile>",
             "      </profiles>",
             "    </enclave>",

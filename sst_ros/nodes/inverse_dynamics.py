@@ -18,6 +18,7 @@ from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.nodes import middleware, parameters, topics
 from sst_ros.nodes.clocks import STEADY
+from sst_ros.nodes.follow_joint_trajectory import FollowJointTrajectoryServer
 from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
@@ -56,12 +57,16 @@ class InverseDynamicsController:
         self._began = self._finished = False
         topics.CONTROLLER_PHASE.subscription(self.node, self._hear, simulator=given.simulator)
         topics.CONTROLLED.subscription(self.node, self._answer)
-        topics.JOINT_TRAJECTORY.subscription(self.node, self._take)
+        topics.JOINT_TRAJECTORY.subscription(self.node, self._replace)
+        self._goals = FollowJointTrajectoryServer(
+            self.node, self._follower, given, self._take, self._refuse
+        )
         self.node.create_timer(0.5, self._watch, clock=STEADY)
         self.node.create_timer(1.0, self._report, clock=STEADY)
 
     def close(self) -> None:
         """Leave the actuators without torque, and print the tracking errors."""
+        self._goals.close()
         if self._began and not self.done.is_set():
             self._commands.send(ZERO)
         self._report()
@@ -77,6 +82,7 @@ class InverseDynamicsController:
             self._finished = True
         if phase.data == "waiting" and self._began:
             self.node.get_logger().info("the simulator was reset: beginning anew")
+            self._goals.interrupt("the simulator was reset")
             self._print()
             self._follower.restart()
             self._began = False
@@ -99,6 +105,7 @@ class InverseDynamicsController:
         self._began = True
         self._commands.send(command.torque)
         self._publish(state, self._seen, command)
+        self._goals.sample(state, self._seen, command)
         if self._follower.stage is Stage.ENDED:
             self.done.set()
 
@@ -142,21 +149,31 @@ class InverseDynamicsController:
             message.effort = array("d", effort)
             publisher.publish(message)
 
-    def _take(self, trajectory: JointTrajectory) -> None:
-        """Follow a trajectory, or log why not."""
-        log = self.node.get_logger()
+    def _replace(self, trajectory: JointTrajectory) -> None:
+        """Follow a trajectory of the topic, and no goal any more."""
+        if self._take(trajectory):
+            self._goals.interrupt("replaced by a trajectory of ~/joint_trajectory")
+
+    def _take(self, trajectory: JointTrajectory) -> bool:
+        """Follow a trajectory, or log why not; return whether it is followed."""
         try:
             tracking = self._follower.tracking()
             self._follower.take(trajectory, self._seen)
         except SstError as error:
-            log.error(f"trajectory refused: {error}")
-            self._report()
-            return
+            self._refuse(error)
+            return False
         finally:
             self._commands.received()  # no message could be received during the check
         if tracking is not None:
             print(table(tracking), flush=True)
-        log.info(f"trajectory of {len(trajectory.points)} points taken")
+        self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
+        return True
+
+    def _refuse(self, error: SstError) -> None:
+        """Count, log and publish a refusal."""
+        self._follower.refuse(error)
+        self.node.get_logger().error(f"trajectory refused: {error}")
+        self._report()
 
     def _watch(self) -> None:
         if self._finished:

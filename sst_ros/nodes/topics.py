@@ -23,6 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
+EXECUTES = "executes"
 
 SERVICE_QOS = QoSProfile(depth=1000)
 """Of services and of our clients: with ten, the default, the eleventh request that waits displaces
@@ -34,9 +35,9 @@ class Endpoint:
     """One topic or service of a node.
 
     Attributes:
-        use: PUBLISHES, SUBSCRIBES, SERVES or CALLS.
+        use: PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action.
         name: its name; {simulator} stands for the player's parameter.
-        kind: type of its messages.
+        kind: type of its messages; by name, where its package is in no wheel.
         doc: what it carries.
         depth: messages kept for slow readers; 0 for two seconds of them.
         latched: the last message is kept for late joiners.
@@ -55,6 +56,8 @@ class Endpoint:
     @property
     def type_name(self) -> str:
         """The type as ROS writes it."""
+        if isinstance(self.kind, str):
+            return self.kind
         package, form, *_ = self.kind.__module__.split(".")
         return f"{package}/{form}/{self.kind.__name__}"
 
@@ -259,6 +262,13 @@ JOINT_TRAJECTORY = Endpoint(
     "motion to follow, from now on and in place of the present one; refused as a whole where it "
     "cannot be followed, and where motion is not topic",
 )
+FOLLOW_JOINT_TRAJECTORY = Endpoint(
+    EXECUTES,
+    "~/follow_joint_trajectory",
+    "control_msgs/action/FollowJointTrajectory",
+    "the same with tolerances, feedback and a result",
+    when="control_msgs is installed",
+)
 
 CONTROLLED = Endpoint(
     SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1
@@ -279,6 +289,7 @@ INVERSE_DYNAMICS = (
     CONTROLLED,
     CONTROLLER_PHASE,
     JOINT_TRAJECTORY,
+    FOLLOW_JOINT_TRAJECTORY,
 )
 
 RECORDER: tuple[Endpoint, ...] = ()

@@ -22,6 +22,13 @@ def _rate(doc: str, default: int) -> Any:
     return integer(doc, "Hz", default=default, least=1, most=100000)
 
 
+def _tolerance(doc: str, unit: str, default: float) -> Any:
+    return number(
+        f"{doc}, where the goal does not give it; 0 for none", unit, default=default, least=0.0,
+        most=1e6,
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class SimulatorParameters(Section):
     """Parameters of sst_simulator."""
@@ -186,8 +193,8 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
 
     scene: str = text("scene of the controller's model, by name or by path", default="reach")
     motion: str = choice(
-        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory, until it is "
-        "stopped",
+        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory and goals of "
+        "~/follow_joint_trajectory, until it is stopped",
         ("scene", "topic"),
         default="scene",
     )
@@ -198,6 +205,21 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         default=0.05,
         above=0.0,
         most=1.0,
+    )
+    path_tolerance: float = _tolerance(
+        "largest error of gamma while a goal of ~/follow_joint_trajectory moves", "rad", 0.0
+    )
+    goal_tolerance: float = _tolerance("largest error of gamma at its end", "rad", 0.0)
+    stopped_velocity_tolerance: float = _tolerance(
+        "largest error of the rate of gamma at its end", "rad/s", 0.01
+    )
+    goal_time_tolerance: float = _tolerance(
+        "longest time after its end until both are met, else it is aborted", "s", 1.0
+    )
+    stop_time: float = _seconds(
+        "time in which a goal that is cancelled or aborted comes to rest, on its path",
+        0.2,
+        least=0.001,
     )
     wait_for_recorder: bool = flag(
         "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",

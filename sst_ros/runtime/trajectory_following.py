@@ -16,6 +16,7 @@ from sst_ros.control.controller import Command, Controller, Measurement
 from sst_ros.control.plan import check
 from sst_ros.control.reference import Reference
 from sst_ros.control.reference_motions import MotionSamples, ReferenceMotion, reference_motion
+from sst_ros.control.stopping_motion import StoppingMotion
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
@@ -87,27 +88,36 @@ class TrajectoryFollower:
             InputError, AssemblyError, SingularConfiguration: it is refused; nothing has changed.
 
         """
-        try:
-            if self._settings.motion != "topic":
-                allowed = "must be topic, for trajectories to be taken"
-                raise InputError("joint_trajectory", [Problem("motion", "scene", allowed)])
-            begin = self._standing(seen) if self._last is None else self._last.desired
-            moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
-            if moving and not self._settings.stamped:
-                # The check takes longer than a control period; in lockstep the plant waits.
-                allowed = "must come when the motion has ended, outside lockstep"
-                raise InputError("joint_trajectory", [Problem("points", "", allowed)])
-            motion = joint_trajectory.motion_of(message, self._geometry, begin)
-            check(motion, self._model)
-            if self._last is None:
-                self._prepare(motion)
-                return
-        except SstError as error:
-            self.refused, self.last_refusal = self.refused + 1, str(error)
-            raise
+        if self._settings.motion != "topic":
+            allowed = "must be topic, for trajectories to be taken"
+            raise InputError("joint_trajectory", [Problem("motion", "scene", allowed)])
+        begin = self._standing(seen) if self._last is None else self._last.desired
+        moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
+        if moving and not self._settings.stamped:
+            # The check takes longer than a control period; in lockstep the plant waits.
+            allowed = "must come when the motion has ended, outside lockstep"
+            raise InputError("joint_trajectory", [Problem("points", "", allowed)])
+        motion = joint_trajectory.motion_of(message, self._geometry, begin)
+        check(motion, self._model)
+        if self._last is None:
+            self._prepare(motion)
+            return
         self._controller.follow(motion)
         self._begin(motion, self._last_ns if moving else None)
         self.stage = Stage.FOLLOWING
+
+    def refuse(self, error: SstError) -> None:
+        """Count a trajectory that is refused."""
+        self.refused, self.last_refusal = self.refused + 1, str(error)
+
+    def stop(self) -> None:
+        """Come to rest on the path in `stop_time`, and hold; before the run, forget the motion."""
+        if self.stage is Stage.READY:
+            self.restart()
+        elif self.stage is Stage.FOLLOWING and self._start_ns is not None:
+            motion = StoppingMotion(self._motion, self.time, self._settings.stop_time)
+            self._controller.follow(motion)
+            self._begin(motion, self._last_ns)
 
     def preview(self, measured: Measurement) -> Command | None:
         """Answer a sample before the run; None as long as there is nothing to follow."""
@@ -160,6 +170,11 @@ class TrajectoryFollower:
         rows = np.array(self._rows).reshape(-1, _COLUMNS)
         time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
         return evaluate(TrackingRecord(time[:, 0], *columns), self.limited)
+
+    @property
+    def time(self) -> float:
+        """Time of the motion at the last sample [s]; 0 before its first one."""
+        return (self._last_ns - (self._start_ns or self._last_ns)) / NANOSECONDS
 
     @property
     def rms(self) -> float:

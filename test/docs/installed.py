@@ -7,9 +7,11 @@ from functools import cache
 from itertools import pairwise
 
 import yaml
+from builtin_interfaces.msg import Duration
 from docs.blocks import ROOT
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.nodes.topics import PUBLISHES, SERVES, SUBSCRIBES
+from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
 from sst_ros.scene.schema import specs
 from tools.node_tables import NODES
 
@@ -57,6 +59,9 @@ def _ros2(words):
     elif words[0] == "service":
         assert words[1] == "call", words
         _service(*words[2:])
+    elif words[0] == "action":
+        assert words[1] == "send_goal", words
+        _goal(*(word for word in words[2:] if not word.startswith("-")))
     elif words[0] == "param":
         assert words[1] in ("get", "set"), words
         (node,) = (node for node in NODES if f"/{node.name}" == words[2])
@@ -114,6 +119,15 @@ def _topic(verb, words):
     if rest:
         assert rest[0] == topics()[name].type_name, rest[0]
         _message(topics()[name].kind, rest[1])
+
+
+def _goal(name, kind, content):
+    assert kind == names(EXECUTES)[name].type_name, kind
+    trajectory = yaml.safe_load(content)["trajectory"]
+    for point in trajectory.pop("points"):
+        Duration(check_fields=True, **point.pop("time_from_start"))
+        JointTrajectoryPoint(check_fields=True, **point)
+    JointTrajectory(check_fields=True, **trajectory)
 
 
 def _service(name, kind, content="{}"):

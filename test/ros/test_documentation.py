@@ -46,6 +46,7 @@ def test_the_policies_have_the_form_of_sros2(node):
     assert (profiles.tag, profile.tag) == ("profiles", "profile")
     assert profile.attrib == {"ns": "/", "node": node.name}
     rights = {"topics": {"publish", "subscribe"}, "services": {"reply", "request"}}
+    rights["actions"] = {"execute"}
     for group in profile:
         assert set(group.attrib) <= rights[group.tag]
         assert set(group.attrib.values()) == {"ALLOW"}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sst_ros.control.controller import ControlStopped, Measurement
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.settings import ControllerNodeParameters
@@ -127,3 +128,30 @@ def test_what_is_not_finite_is_nowhere_near():
     follower.answer(START_NS, here)
     with pytest.raises(ControlStopped, match="must be finite"):
         follower.answer(START_NS + PERIOD_NS, dataclasses.replace(here, gamma_dot=(np.nan,) * 3))
+
+
+def test_a_stop_comes_to_rest_on_the_path_and_holds():
+    settings = ControllerNodeParameters(mode="computed_torque", stop_time=0.02, hold=1.0)
+    follower, simulation = TrajectoryFollower(MODEL, settings), Simulation(MODEL)
+    references = []
+    for k in range(40):
+        if k == 10:
+            follower.stop()
+        command = follower.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
+        references.append(command.desired)
+        simulation.step(command.torque, PERIOD_NS)
+    path = reference_motion(MODEL)
+    moving, rest = references[9], references[-1]
+    assert moving == path.at(0.018)
+    assert rest.gamma == pytest.approx(path.at(0.028).gamma, abs=1e-15)
+    assert rest.gamma_dot == (0.0, 0.0, 0.0)
+    rates = np.array([one.gamma_dot for one in references[9:]])
+    assert (np.abs(np.diff(rates[:, 2])) < 0.2 * abs(rates[0, 2])).all()  # without a jump
+    assert np.array(simulation.state.joints.gamma) == pytest.approx(rest.gamma, abs=1e-4)
+    assert follower.stage is Stage.HOLDING
+
+
+def test_a_stop_before_the_run_forgets_the_trajectory():
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
+    follower.stop()
+    assert follower.stage is Stage.READY  # the scene's own motion stays
