@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from sst_ros.nodes import inverse_dynamics, topics
+from sst_ros.nodes import inverse_dynamics, simulation_interfaces, topics
 from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.runtime import diagnostics
 from sst_ros.runtime.settings import (
@@ -37,13 +37,7 @@ PARAMETER_SERVICES = (
     "set_parameters",
     "set_parameters_atomically",
 )
-SIMULATION_INTERFACES = (
-    "get_simulation_state",
-    "get_simulator_features",
-    "reset_simulation",
-    "set_simulation_state",
-    "step_simulation",
-)
+SIMULATION_INTERFACES = tuple(simulation_interfaces.SERVICES)
 
 
 class Described(NamedTuple):
@@ -108,9 +102,11 @@ def policy(node: Described) -> str:
     publish = {*LOG_AND_EVENTS, *_names(node, PUBLISHES)}
     subscribe = set(_names(node, SUBSCRIBES))
     reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES} | set(_names(node, SERVES))
+    executed = set(_names(node, EXECUTES))
     if node.command == "simulator":
         subscribe.add("/clock")  # with use_sim_time
         reply |= {f"/{node.name}/{name}" for name in SIMULATION_INTERFACES}
+        executed.add(f"/{node.name}/simulate_steps")
     if node.command == "recorder":
         subscribe |= {*default_topics(), "/clock"}
     if node.command in ("torque_player", "inverse_dynamics", "viewer"):
@@ -129,7 +125,7 @@ def policy(node: Described) -> str:
             *_rules("topics", "topic", "subscribe", subscribe),
             *_rules("services", "service", "reply", reply),
             *_rules("services", "service", "request", _names(node, CALLS)),
-            *_rules("actions", "action", "execute", _names(node, EXECUTES)),
+            *_rules("actions", "action", "execute", executed),
             "        </profile>",
             "      </profiles>",
             "    </enclave>",

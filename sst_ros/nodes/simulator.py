@@ -56,7 +56,7 @@ class Simulator:
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         Services(self.node, self._loop)
-        simulation_interfaces.offer(self.node, self._loop)
+        simulation_interfaces.offer(self.node, self._loop, self.done.set)
         self.node.create_timer(1.0, self._report, clock=STEADY)
         self.node.create_timer(_WATCH_S, self._watch, clock=STEADY)
         self._read_gauges()

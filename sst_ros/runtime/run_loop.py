@@ -170,6 +170,7 @@ class RunLoop:
             self._resume()
         else:
             self._to(Phase.WAITING)
+            self._start()
         return Reply(True, self.phase.value)
 
     def step(self, samples: int = 1) -> Reply:
@@ -238,17 +239,24 @@ class RunLoop:
 
     def _wait_for_start(self) -> None:
         """Show the state until the run starts: by itself, or by a command."""
-        shown, by_itself = -math.inf, not self._owner.parameters.waits
+        shown = -math.inf
         while not self._ticks.requested.is_set():
-            if not self._recorded():
-                pass
-            elif (by_itself or self._input.starts_run()) and self._ticks.begin():
-                self._resume()
+            if self._start():
                 return
             if time.monotonic() - shown > IDLE_PERIOD_S:
                 shown = time.monotonic()
                 self._show()
             time.sleep(_POLL_S)
+
+    def _start(self) -> bool:
+        """Start the run, unless it has to wait; return whether it runs."""
+        by_itself = not self._owner.parameters.waits
+        if not (self._recorded() and (by_itself or self._input.starts_run())):
+            return False
+        if not self._ticks.begin():
+            return False
+        self._resume()
+        return True
 
     def _recorded(self) -> bool:
         """Whether the topics of wait_for_subscribers have had subscribers."""

@@ -104,15 +104,16 @@ class TrajectoryGoal:
         }
         late = time - self._times[-1]
         if late < 0.0:
-            violation = next(_violations("path tolerance", self.path, errors), None)
-            return violation and Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, violation)
-        violation = next(_violations("goal tolerance", self.goal, errors), None)
-        if violation is None:
+            for violation in _violations("path tolerance", self.path, errors):
+                return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, violation)
+            return None
+        unmet = next(_violations("goal tolerance", self.goal, errors), None)
+        if unmet is None:
             return Outcome(ErrorCode.SUCCESSFUL, "goal reached")
         if not 0.0 < self.goal_time < late:
             return None
         when = f"{late:.3f} s after the end, goal_time_tolerance {self.goal_time:g} s"
-        return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{violation} {when}")
+        return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{unmet} {when}")
 
 
 def _violations(

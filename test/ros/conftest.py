@@ -177,7 +177,7 @@ class Observer:
 
         self.until(published, what)
 
-    def call(self, kind, name, **fields):
+    def call(self, kind, name, /, **fields):
         client = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f"service {name}")
         future = client.call_async(kind.Request(**fields))

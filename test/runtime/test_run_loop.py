@@ -434,6 +434,16 @@ def test_requests_after_the_end_are_refused():
     assert not bench.loop.ask(bench.loop.reset).success
 
 
+@pytest.mark.parametrize(("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)])
+def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(waits, phase):
+    bench = Bench(wait_for_command=waits)
+    with bench.running() as loop:
+        for request in (partial(loop.pause, True), loop.reset):
+            assert loop.ask(request).success
+        assert loop.ask(partial(loop.pause, False)) == Reply(True, phase.value)
+        assert loop.phase is phase
+
+
 def test_simulation_interfaces_are_the_same_machine():
     """The handlers with plain objects for messages: the package is in no wheel."""
 
@@ -442,20 +452,30 @@ def test_simulation_interfaces_are_the_same_machine():
 
     bench = Bench()
     with bench.running() as loop:
-        answers = SimulationInterfaces(loop)
+        left = threading.Event()
+        answers = SimulationInterfaces(loop, left.set)
         bench.until(lambda: loop.phase is Phase.RUNNING)
-        assert answers.get_state(None, response()).state.state == 1
-        assert answers.step(Box(steps=1), response()).result.result == 4
-        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 1
-        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 101
+        assert answers.get_simulation_state(None, response()).state.state == 1
+        assert answers.step_simulation(Box(steps=1), response()).result.result == 4
+        assert answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 1
+        assert (
+            answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 101
+        )
         before = len(bench.output.samples)
-        assert answers.step(Box(steps=3), response()).result.result == 1
+        assert answers.step_simulation(Box(steps=3), response()).result.result == 1
         assert len(bench.output.samples) == before + 3
-        assert answers.reset(Box(scope=1), response()).result.result == 0
-        assert answers.reset(Box(scope=255), response()).result.result == 1
-        assert answers.get_state(None, response()).state.state == 0
-        assert answers.set_state(Box(state=Box(state=2)), response()).result.result == 103
-        assert answers.set_state(Box(state=Box(state=1)), response()).result.result == 1
-        assert answers.set_state(Box(state=Box(state=0)), response()).result.result == 1
-        assert answers.get_state(None, response()).state.state == 0
-        assert answers.set_state(Box(state=Box(state=3)), response()).result.result == 0
+        assert answers.reset_simulation(Box(scope=1), response()).result.result == 0
+        assert answers.reset_simulation(Box(scope=255), response()).result.result == 1
+        assert answers.get_simulation_state(None, response()).state.state == 0
+        assert (
+            answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 103
+        )
+        assert answers.set_simulation_state(Box(state=Box(state=1)), response()).result.result == 1
+        assert answers.set_simulation_state(Box(state=Box(state=0)), response()).result.result == 1
+        assert answers.get_simulation_state(None, response()).state.state == 0
+        assert answers.set_simulation_state(Box(state=Box(state=4)), response()).result.result == 0
+        assert answers.reset_simulation(Box(scope=3), response()).result.result == 0
+        assert answers.reset_simulation(Box(scope=6), response()).result.result == 1
+        assert not left.is_set()
+        assert answers.set_simulation_state(Box(state=Box(state=3)), response()).result.result == 1
+        assert left.is_set()
