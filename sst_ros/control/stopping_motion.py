@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from sst_ros.control.reference import Reference, ReferenceMotion, Triple, equal_pieces
-from sst_ros.mechanism.vec3 import axpy, scaled
+from sst_ros.mechanism.generic_math import axpy, scaled
 
 
 class StoppingMotion(ReferenceMotion):

@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.control.controller import Command, Measurement
 from sst_ros.errors import SstError
-from sst_ros.mechanism.vec3 import axpy
+from sst_ros.mechanism.generic_math import axpy
 from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.runtime.settings import ControllerNodeParameters

@@ -21,7 +21,7 @@ from sst_ros.description.headers import BASE_FRAME
 from sst_ros.errors import AssemblyError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
-from sst_ros.mechanism.vec3 import ZERO
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.run_loop import RunLoop
 
 NAME = "star"

@@ -17,7 +17,7 @@ from sst_ros.control.controller import Measurement
 from sst_ros.control.reference import Reference
 from sst_ros.description.headers import nanoseconds
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism.vec3 import axpy
+from sst_ros.mechanism.generic_math import axpy
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.state import NANOSECONDS
