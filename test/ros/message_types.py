@@ -48,8 +48,8 @@ def folder():
             made = tempfile.mkdtemp(prefix=final.name)
             command = [sys.executable, __file__, made]
             env = {**os.environ, "AMENT_PREFIX_PATH": sys.prefix}
-            told = subprocess.run(command, env=env, text=True, capture_output=True, check=False)
-            assert told.returncode == 0, told.stdout + told.stderr
+            made_by = subprocess.run(command, env=env, text=True, capture_output=True, check=False)
+            assert made_by.returncode == 0, made_by.stdout + made_by.stderr
             Path(made).rename(final)
     return final
 

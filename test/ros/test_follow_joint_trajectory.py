@@ -119,8 +119,8 @@ def test_what_cannot_be_followed_is_refused_with_a_reason(client):
     before = len(companion_told(client.observer, "last_refusal"))
 
     def reason():
-        told = companion_told(client.observer, "last_refusal")[before:]
-        return told[-1] if told else ""
+        refusals = companion_told(client.observer, "last_refusal")[before:]
+        return refusals[-1] if refusals else ""
 
     assert not client.send((1.0, np.add(HOME, (0.9, 0.0, 0.0)))).accepted
     client.observer.until(lambda: "gamma_1" in reason(), "the reason")
