@@ -7,7 +7,7 @@ public call that takes a message; this is what its executors do.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -40,14 +40,30 @@ def take(subscription: Subscription[Any], *, raw: bool) -> tuple[Any, dict[str, 
     return taken
 
 
-def reader(node: Node, topic: Endpoint) -> Callable[[], Any]:
-    """Subscribe to a topic; the function returns its next message, or None."""
-    subscription = node.create_subscription(
-        topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
-    )
+class Reader:
+    """Messages of a topic, each as soon as it has arrived."""
 
-    def next_message() -> Any:
-        taken = take(subscription, raw=False)
-        return None if taken is None else taken[0]
+    def __init__(self, node: Node, topic: Endpoint) -> None:
+        self._subscription = node.create_subscription(
+            topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
+        )
+        self._next: tuple[Any, int] | None = None
 
-    return next_message
+    @property
+    def waiting(self) -> bool:
+        """Whether a message is known that arrived after the time of the last `take`."""
+        return self._next is not None
+
+    def take(self, until_ns: float) -> Any:
+        """Return the next message if it arrived until this monotonic time [ns], or None."""
+        if self._next is None:
+            if (taken := take(self._subscription, raw=False)) is None:
+                return None
+            message, information = taken
+            ago = max(0, time.time_ns() - information["received_timestamp"])
+            self._next = message, time.monotonic_ns() - ago
+        message, arrived_ns = self._next
+        if arrived_ns > until_ns:
+            return None
+        self._next = None
+        return message

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -15,7 +15,7 @@ from sst_ros.nodes import graph, parameters, simulation_interfaces, topics
 from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
 from sst_ros.nodes.compiled_code import CodeCompiler
 from sst_ros.nodes.messages import diagnostics
-from sst_ros.nodes.polling import reader
+from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import SimulatorTopics
 from sst_ros.nodes.services import Services
 from sst_ros.runtime import realtime
@@ -93,7 +93,7 @@ class Simulator:
             self.done.set()
 
     def _quiet(self) -> Reply:
-        """Served by the run as its first request: when the code of all methods is loaded."""
+        """Settle the process once the code of all methods is loaded: the run's first request."""
         realtime.quiet()
         return Reply(True, "")
 
@@ -120,11 +120,11 @@ class Simulator:
             return Pacer(given.period_ns, given.real_time_factor, clock, FOLLOWED_STEP_NS)
         return Pacer(given.period_ns, given.real_time_factor, SteadyTime())
 
-    def _readers(self, simulated: Scene) -> list[Callable[[], Any]]:
+    def _readers(self, simulated: Scene) -> list[Reader]:
         inputs = [topics.COMMANDS, topics.COMMANDS_STAMPED]
         if simulated.moment is not None and simulated.moment.topic:
             inputs.append(topics.EXTERNAL_MOMENT)
-        return [reader(self.node, topic) for topic in inputs]
+        return [Reader(self.node, topic) for topic in inputs]
 
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""

@@ -53,6 +53,18 @@ class Pacer:
         self.speed = speed
         self.missed = self.overruns = self.jumps = self.late_ns = 0
 
+    def ticks_within(self, ns: int) -> int:
+        """Return how many ticks one sleep of this length may end in, 1 at least.
+
+        It is 1 on a clock that is followed: the next deadline is not known by it.
+        """
+        return 1 if self._tolerance_ns else max(1, int(ns * self.speed // self._period_ns))
+
+    @property
+    def interval_ns(self) -> int:
+        """Time between deadlines [ns]; 0 without any."""
+        return round(self._period_ns / self.speed) if self.speed else 0
+
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
         self._anchor = self._seen = self._source.now_ns()

@@ -20,6 +20,8 @@ _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.steps`, after which requests are served."""
+_LONGEST_SLEEP_NS = 2_000_000
+"""Bounds the ticks that one sleep ends in: the queue of commands keeps ten messages."""
 _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
@@ -171,8 +173,9 @@ class TickLoop:
     def to_next_sample(self, *, paced: bool) -> bool:
         """Tick to the next sample and publish it; False if it was interrupted before.
 
-        Ticks between which nothing can change are one call: in lockstep, without deadlines, and
-        when a paused run is stepped.
+        Ticks between which nothing changes are one call. With deadlines compiled ticks are done
+        together at the deadline of the last of them, at most 2 ms later than its own; a command
+        acts from the tick on that begins after its arrival.
 
         Raises:
             RunStopped: the run ends before; the ticks before it are done and logged.
@@ -192,11 +195,20 @@ class TickLoop:
             return late or self.stopped.is_set()
 
         while True:
-            ticks = self._ticks_left() if at_once else 1
+            ticks, interval_ns = self._ticks_left(), 0
+            if not at_once:
+                interval_ns = self._pacer.interval_ns
+                longest_ns = _LONGEST_SLEEP_NS if self.simulation.compiled else 0
+                ticks = min(ticks, self._pacer.ticks_within(longest_ns))
             if paced and not self._pacer.wait(interrupted, ticks):
                 return False
-            torque = self._kept or self._input.torque(self.simulation)
-            self._advance(torque, 1 if self._input.depends_on_state else ticks)
+            now = time.monotonic_ns()
+            while ticks:
+                begins = now - (ticks - 1) * interval_ns
+                torque = self._kept or self._input.torque(self.simulation, begins)
+                equal = ticks if self._kept or self._input.constant(now) else 1
+                self._advance(torque, equal)
+                ticks -= equal
             if self._tick % self._ticks_per_sample == 0 or self.complete:
                 self._kept = None
                 self._publish()

@@ -13,7 +13,7 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.state import Vector3, clamped, finite_vector
+from sst_ros.state import NANOSECONDS, Vector3, clamped, finite_vector
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
@@ -21,8 +21,16 @@ ACTUATORS = JOINTS[:3]
 _MESSAGES_PER_TICK = 10
 """Bounds what a flood of commands costs per tick."""
 
-Take = Callable[[], Any]
-"""Returns the next message that has arrived, or None."""
+
+class Arrivals(Protocol):
+    """Messages of a topic."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a message is known that arrived after the time of the last `take`."""
+
+    def take(self, until_ns: float) -> Any:
+        """Return the next message if it arrived until this monotonic time [ns], or None."""
 
 
 class HasParameters(Protocol):
@@ -56,9 +64,9 @@ class TorqueInput:
         self,
         owner: HasParameters,
         actuators: Actuators | None,
-        commands: Take,
-        stamped: Take,
-        moments: Take | None = None,
+        commands: Arrivals,
+        stamped: Arrivals,
+        moments: Arrivals | None = None,
     ) -> None:
         self._owner = owner
         self._limit = actuators.torque_limit if actuators else None
@@ -71,8 +79,8 @@ class TorqueInput:
 
     def clear(self) -> None:
         """Forget the command and what has arrived: zero torque until the next command."""
-        for take in filter(None, (self._commands, self._stamped, self._moments)):
-            for _ in _arrived(take):
+        for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
+            for _ in _arrived(arrivals):
                 pass
         self._forget()
 
@@ -85,17 +93,26 @@ class TorqueInput:
 
     def refresh(self) -> None:
         """Count the age of the command from now on: a pause does not make it older."""
-        self._since = self._moment_since = time.monotonic()
+        self._since = self._moment_since = time.monotonic_ns()
 
     @property
     def age(self) -> float | None:
         """Time since the last valid command [s], or None."""
-        return time.monotonic() - self._since if self.begun else None
+        return (time.monotonic_ns() - self._since) / NANOSECONDS if self.begun else None
 
-    @property
-    def depends_on_state(self) -> bool:
-        """Whether idle damping acts, so that the torque is that of one tick only."""
-        return self.stale and self._damping > 0.0
+    def constant(self, until_ns: int) -> bool:
+        """Whether the torque and moment of the last tick act until this monotonic time [ns]."""
+        if self.stale and self._damping > 0.0:  # the torque depends on the state
+            return False
+        moments = self._moments
+        if self._commands.waiting or self._stamped.waiting or (moments and moments.waiting):
+            return False
+        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
+        expires = (
+            (self.begun and not self.stale and until_ns - self._since > timeout_ns)
+            or (self.moment != ZERO and until_ns - self._moment_since > timeout_ns)
+        )  # fmt: skip
+        return not (expires and timeout_ns)
 
     def idle_shown(self, stamp_ns: int) -> None:
         """Accept answers to a state that was published with this stamp before the run."""
@@ -106,13 +123,13 @@ class TorqueInput:
         if self._lockstep:
             self.answer(None)
         else:
-            self._take()
+            self._take(time.monotonic_ns())
         return self.begun
 
-    def torque(self, simulation: HasState) -> Vector3:
-        """Return the torques of the tick that begins now [N m]."""
-        self._take()
-        if not self._expired():
+    def torque(self, simulation: HasState, now_ns: int) -> Vector3:
+        """Return the torques of the tick that begins at this monotonic time [ns], in N m."""
+        self._take(now_ns)
+        if not self._expired(now_ns):
             return self._held
         if not self._damping:
             return ZERO
@@ -134,25 +151,26 @@ class TorqueInput:
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             try:
                 if found is None and (to_idle if stamp_ns is None else stamp == stamp_ns):
-                    found = self._accept(torque_by_name(message))
+                    found = self._accept(torque_by_name(message), time.monotonic_ns())
                 elif not to_idle:
                     reason = f"stamp {stamp} ns answers no sample that waits"
                     raise MessageRefused("stamp", reason)
             except MessageRefused as refused:
                 self._drop(refused)
-        self._take_moments()
+        self._take_moments(time.monotonic_ns())
         return found
 
-    def _take(self) -> None:
-        for message in _arrived(self._commands):
-            self._use(three, message.data)
-        for message in self._commanded():
-            self._use(torque_by_name, message)
-        self._take_moments()
+    def _take(self, now_ns: int) -> None:
+        for message in _arrived(self._commands, now_ns):
+            self._use(three, message.data, now_ns)
+        for message in self._commanded(now_ns):
+            self._use(torque_by_name, message, now_ns)
+        if self._moments is not None:
+            self._take_moments(now_ns)
 
-    def _commanded(self) -> Iterator[Any]:
+    def _commanded(self, until_ns: float = math.inf) -> Iterator[Any]:
         """Yield stamped commands; with partial_commands nan is zero torque, all nan no command."""
-        for message in _arrived(self._stamped):
+        for message in _arrived(self._stamped, until_ns):
             if self._owner.parameters.partial_commands:
                 missing = [*map(math.isnan, message.effort)]
                 if missing and all(missing):
@@ -163,31 +181,31 @@ class TorqueInput:
                 ]
             yield message
 
-    def _take_moments(self) -> None:
+    def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
             return
-        for message in _arrived(self._moments):
+        for message in _arrived(self._moments, math.inf if self._lockstep else now_ns):
             vector = message.wrench.torque
             try:
                 self.moment = three((vector.x, vector.y, vector.z), "moments [N m]")
-                self._moment_since = time.monotonic()
+                self._moment_since = now_ns
             except MessageRefused as refused:
                 self._drop(refused)
-        timeout = self._owner.parameters.command_timeout
-        if timeout and not self._lockstep and time.monotonic() - self._moment_since > timeout:
+        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
+        if timeout_ns and not self._lockstep and now_ns - self._moment_since > timeout_ns:
             self.moment = ZERO
 
-    def _use(self, check: Callable[[Any], Vector3], content: Any) -> None:
+    def _use(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> None:
         try:
-            self._accept(check(content))
+            self._accept(check(content), now_ns)
         except MessageRefused as refused:
             self._drop(refused)
 
-    def _accept(self, torque: Vector3) -> Vector3:
+    def _accept(self, torque: Vector3, now_ns: int) -> Vector3:
         self._held = clamped(torque, self._limit)
         self.clamped += self._held != torque
         self.received += 1
-        self._since, self.begun = time.monotonic(), True
+        self._since, self.begun = now_ns, True
         return self._held
 
     def _drop(self, refused: MessageRefused) -> None:
@@ -195,18 +213,18 @@ class TorqueInput:
         self.reasons[refused.kind] = self.reasons.get(refused.kind, 0) + 1
         self.last_refusal = str(refused)
 
-    def _expired(self) -> bool:
-        timeout = self._owner.parameters.command_timeout
-        old = self.begun and 0.0 < timeout < time.monotonic() - self._since
+    def _expired(self, now_ns: int) -> bool:
+        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
+        old = self.begun and 0.0 < timeout_ns < now_ns - self._since
         self.timeouts += old and not self.stale
         self.stale = old
         return old
 
 
-def _arrived(take: Take) -> Iterator[Any]:
-    """Yield what has arrived, within bounds."""
+def _arrived(arrivals: Arrivals, until_ns: float = math.inf) -> Iterator[Any]:
+    """Yield what has arrived until this monotonic time [ns], within bounds."""
     for _ in range(_MESSAGES_PER_TICK):
-        if (message := take()) is None:
+        if (message := arrivals.take(until_ns)) is None:
             return
         yield message
 

@@ -41,6 +41,18 @@ def test_deadlines_are_absolute(hand):
     assert pacer.missed == 0
 
 
+def test_one_sleep_may_end_in_several_ticks(hand):
+    pacer = Pacer(MS, 1.0, hand)
+    pacer.start()
+    assert [pacer.ticks_within(ns) for ns in (0, MS - 1, 2 * MS, 5 * MS)] == [1, 1, 2, 5]
+    assert Pacer(MS, 0.5, hand).ticks_within(2 * MS) == 1
+    assert Pacer(MS, 1.0, hand, tolerance_ns=200 * MS).ticks_within(2 * MS) == 1
+    assert pacer.wait(never, 2) and hand.now == 7 * MS
+    hand.now += 3 * MS + 100_000  # 1.1 ms after the last of the next two
+    assert pacer.wait(never, 2)
+    assert (pacer.missed, pacer.late_ns) == (1, 1_100_000)
+
+
 def test_an_overrun_drops_time_without_a_burst(hand):
     pacer = Pacer(MS, 1.0, hand)
     pacer.start()

@@ -51,12 +51,28 @@ class Output:
         self.phases.append(phase)
 
 
+class Queue(list):
+    """Messages that have arrived; with `waiting` the first arrives after the third request."""
+
+    waiting = False
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def take(self, until_ns):
+        self.asked.append(until_ns)
+        if self.waiting and len(self.asked) <= 3:
+            return None
+        self.waiting = False
+        return self.pop(0) if self else None
+
+
 class Bench:
     def __init__(self, scene="example1", build=Simulation, **given):
         self.parameters = SimulatorParameters(scene=scene, **{"real_time_factor": 0.0, **given})
-        self.queue, self.stamped, self.output = [], [], Output()
-        takes = [lambda q=q: q.pop(0) if q else None for q in (self.queue, self.stamped)]
-        self.input = TorqueInput(self, None, *takes)
+        self.queue, self.stamped, self.output = Queue(), Queue(), Output()
+        self.input = TorqueInput(self, None, self.queue, self.stamped)
         pacer = Pacer(self.parameters.period_ns, self.parameters.real_time_factor, SteadyTime())
         self.loop = RunLoop(load_scene(scene), build, self, self.input, pacer, self.output)
         self.thread = threading.Thread(target=self.loop.run, daemon=True)
@@ -96,6 +112,28 @@ def test_a_run_ends_after_its_duration_with_every_sample():
     assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
     assert len(bench.output.acted) == bench.loop.counters.ticks == 11
     assert bench.output.phases == ["waiting", "running", "finished"]
+
+
+def test_compiled_ticks_between_samples_are_done_together_and_commands_keep_their_tick():
+    """The command comes between the beginnings of two ticks that are done together."""
+
+    class Compiled(Simulation):
+        @property
+        def compiled(self):  # plain Python here, done together all the same
+            return True
+
+        @compiled.setter
+        def compiled(self, value):
+            pass
+
+    torque = (1.0, 2.0, 3.0)
+    bench = Bench(build=Compiled, real_time_factor=1.0, duration=0.02, publish_rate=500)
+    bench.queue.append(Box(data=torque))
+    bench.queue.waiting = True
+    bench.loop.run()
+    assert bench.output.acted == 3 * [ZERO] + 17 * [torque]
+    first, second = bench.queue.asked[2:4]  # the first two are done alone, to measure them
+    assert second - first == 1_000_000
 
 
 def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
