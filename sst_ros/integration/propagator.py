@@ -43,11 +43,12 @@ class LimitReached(Exception):
 
 
 class Checkpoint(NamedTuple):
-    """All that the next steps depend on beside the point at which they begin."""
+    """All that a period changes beside the point, and the stepper in use before it."""
 
     growth: ErrorGrowth
+    in_use: AdaptiveStepper
     stepper: AdaptiveStepper
-    steppers: dict[AdaptiveStepper, StepperCheckpoint]
+    kept: StepperCheckpoint
 
 
 class Propagator:
@@ -106,7 +107,8 @@ class Propagator:
             budget=budget,
         )
         self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
-        self._first = self._before = self._checkpoint()
+        self._first = self._growth, self._constant.checkpoint(), self._function.checkpoint()
+        self._before = self._checkpoint(self._constant)
 
     @property
     def method(self) -> str:
@@ -158,25 +160,28 @@ class Propagator:
                 and nothing has changed.
 
         """
-        before = self._before = self._checkpoint()
+        stepper = self._stepper_for(torque)
+        before = self._checkpoint(stepper)
+        self._stepper = stepper
         drive = (*self._torque.begin(torque, start), *moment)
-        self._stepper = self._stepper_for(torque)
         try:
-            if self._stepper is self._constant:
+            done = 0
+            if stepper is self._constant:
                 end, done = self._step_many(at, h, count, drive)
-                if done:
-                    return end, done
-            return self._adaptive(at, start, h, drive), 1
+            if not done:
+                end, done = self._adaptive(at, start, h, drive), 1
         except Exception:
             self._restore(before)
             raise
+        self._before = before
+        return end, done
 
     def within(
         self, at: Point, start: float, h: float, torque: Torque, moment: tuple[float, ...]
     ) -> Point:
         """Advance through a part of the last period again, and leave everything as it is now."""
-        now, before = self._checkpoint(), self._before
-        stepper, history = self._stepper, list(self._stepper.history)
+        stepper, before = self._stepper, self._before
+        now, history = self._checkpoint(stepper), list(stepper.history)
         self._restore(before)
         try:
             return self.advance(at, start, h, 1, torque, moment)[0]
@@ -187,8 +192,12 @@ class Propagator:
 
     def reset(self) -> None:
         """Forget what has happened."""
-        self._restore(self._first)
-        self._before = self._first
+        self._growth, constant, function = self._first
+        self._stepper = self._constant
+        self._constant.restore(constant)
+        self._function.restore(function)
+        self._sines.clear()
+        self._before = self._checkpoint(self._constant)
 
     def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
         """Have the code loaded that periods of h [s] under constant torques may need."""
@@ -203,16 +212,13 @@ class Propagator:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
         return self._growth.errors(at)
 
-    def _checkpoint(self) -> Checkpoint:
-        every = (self._constant, self._function, *self._sines.values())
-        steppers = {stepper: stepper.checkpoint() for stepper in every}
-        return Checkpoint(self._growth, self._stepper, steppers)
+    def _checkpoint(self, stepper: AdaptiveStepper) -> Checkpoint:
+        """Return what to go back to after a period by this stepper."""
+        return Checkpoint(self._growth, self._stepper, stepper, stepper.checkpoint())
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        self._growth, self._stepper, steppers = checkpoint
-        self._sines = {sine: x for sine, x in self._sines.items() if x in steppers}
-        for stepper, kept in steppers.items():
-            stepper.restore(kept)
+        self._growth, self._stepper, stepper, kept = checkpoint
+        stepper.restore(kept)
 
     def _stepper_for(self, torque: Torque) -> AdaptiveStepper:
         """Return the stepper of constant torques, of a function, or of a sine, which is traced."""

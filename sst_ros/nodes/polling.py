@@ -12,6 +12,7 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from sst_ros.nodes.topics import Endpoint
@@ -57,9 +58,11 @@ class Reader:
     def take(self, until_ns: float) -> Any:
         """Return the next message if it arrived until this monotonic time [ns], or None."""
         if self._next is None:
-            if (taken := take(self._subscription, raw=False)) is None:
+            # As bytes: otherwise an empty message is made each time that there is none.
+            if (taken := take(self._subscription, raw=True)) is None:
                 return None
-            message, information = taken
+            data, information = taken
+            message = deserialize_message(data, self._subscription.msg_type)
             ago = max(0, time.time_ns() - information["received_timestamp"])
             self._next = message, time.monotonic_ns() - ago
         message, arrived_ns = self._next

@@ -52,6 +52,10 @@ class RunOutput(Protocol):
     def missing_subscribers(self) -> list[str]:
         """Return the topics whose subscribers the run has to wait for."""
 
+    @property
+    def unread(self) -> bool:
+        """Whether nothing receives samples, so that only the last of several has to be made."""
+
     def start(self) -> None:
         """Forget the torques of the run before."""
 

@@ -58,6 +58,8 @@ def refuse_bad_options(
 
 def refuse_bad_step(torque: Any, dt_ns: int, moment: Any) -> None:
     """Raise InputError for arguments of a step that are not allowed; names each."""
+    if dt_ns > 0 and finite_vector(torque) and finite_vector(moment):
+        return
     problems = []
     if not (callable(torque) or isinstance(torque, SineTorque)) and finite_vector(torque) is None:
         allowed = "must be three finite numbers [N m], a SineTorque or a function of t [s]"

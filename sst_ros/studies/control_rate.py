@@ -82,17 +82,24 @@ class ControlRun:
     tick_s: float
 
 
+class _NoMessages:
+    waiting = False
+
+    def take(self, until_ns: float) -> None:
+        return None
+
+
 class ProfileInput(TorqueInput):
     """Torque input that reads a profile at the time of the simulation instead of messages."""
 
     def __init__(self, owner: Any, scene: Scene, hold: str, period_ns: int) -> None:
-        super().__init__(owner, scene.actuators, lambda: None, lambda: None)
+        super().__init__(owner, scene.actuators, _NoMessages(), _NoMessages())
         assert scene.torque is not None
         self._profile, self._sine = scene.torque.at, scene.torque
         self._exact = hold == EXACT
         self._shift_ns = period_ns // 2 if hold == MIDDLE else 0
 
-    def torque(self, simulation: HasState) -> Any:
+    def torque(self, simulation: HasState, now_ns: int) -> Any:
         """Return the torques of the tick that begins now [N m], or the profile itself."""
         if self._exact:
             return self._sine
@@ -109,6 +116,8 @@ class _Output:
 
     def now_ns(self) -> int:
         return NANOSECONDS
+
+    unread = False
 
     def missing_subscribers(self) -> list[str]:
         return []

@@ -32,6 +32,8 @@ class Output:
     def now_ns(self):
         return self.now
 
+    unread = False
+
     def missing_subscribers(self):
         return self.missing
 
@@ -134,6 +136,18 @@ def test_compiled_ticks_between_samples_are_done_together_and_commands_keep_thei
     assert bench.output.acted == 3 * [ZERO] + 17 * [torque]
     first, second = bench.queue.asked[2:4]  # the first two are done alone, to measure them
     assert second - first == 1_000_000
+
+
+def test_a_free_run_passes_over_samples_that_nothing_receives():
+    bench = Bench(duration=0.2, publish_rate=500)
+    bench.output.unread = True
+    bench.loop.run()
+    first, last = stamps(bench)[0], stamps(bench)[-1]
+    assert (last - first, bench.loop.counters.ticks) == (200_000_000, 200)
+    assert len(stamps(bench)) < bench.loop.counters.published == 101
+    simulation = Simulation("example1")
+    simulation.steps(ZERO, 1_000_000, 200)
+    assert bench.output.samples[-1][1] == simulation.state
 
 
 def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):

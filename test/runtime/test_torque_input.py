@@ -134,7 +134,7 @@ def test_damping_takes_over_within_the_limit():
     rates = bench.moving.state.joints.gamma_dot
     expected = tuple(min(max(-2.0 * rate, -0.5), 0.5) for rate in rates)
     assert any(rates) and bench.torque() == expected
-    assert not bench.board.constant(time.monotonic_ns())  # by the rates of this tick, so for no more than this tick
+    assert not bench.board.constant(time.monotonic_ns())  # it depends on the rates
 
 
 def test_limits_clamp_and_count():
