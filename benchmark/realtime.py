@@ -12,9 +12,7 @@ simulator runs alone as fast as possible, then a fleet. Commands of zero torque 
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -27,84 +25,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
-from benchmark import machine
-from sst_ros import child_process
+from benchmark import bare_loops, machine
+from benchmark.nodes import Process, Watch, markdown
 from sst_ros.runtime import realtime
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 
 PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
-TICK = os.sysconf("SC_CLK_TCK")
 Figures = dict[str, str]
-
-
-class Watch:
-    """Hears the diagnostics of every simulator, by its full name."""
-
-    def __init__(self) -> None:
-        self.node = rclpy.create_node("benchmark")
-        self.said: dict[str, dict[str, str]] = {}
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 100)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        name = message.status[0].name.removesuffix(": run")
-        self.said[name] = {pair.key: pair.value for pair in message.status[0].values}
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
-
-    def until(self, condition: Any, what: str, timeout: float = 120.0) -> None:
-        end = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > end:
-                raise SystemExit(f"no {what} within {timeout:g} s")
-            self._executor.spin_once(timeout_sec=0.1)
-
-    def phase(self, name: str) -> str:
-        return self.said.get(name, {}).get("phase", "")
-
-
-class Process:
-    """A node in a process of its own, and the kernel's account of it."""
-
-    def __init__(self, command: str, namespace: str = "/", **given: Any) -> None:
-        if command == "simulator":  # by default it would end with the scene's duration
-            given.setdefault("duration", 0.0)
-        argv = [sys.executable, "-m", "sst_ros", command, "--ros-args", *child_process.words(given)]
-        argv += ["-r", f"__ns:={namespace}"]
-        self._process = subprocess.Popen(
-            argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-
-    def line(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
-
-    def processor_s(self) -> float:
-        text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8")
-        fields = text.rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / TICK
-
-    def memory_kb(self) -> int:
-        text = Path(f"/proc/{self._process.pid}/status").read_text(encoding="utf-8")
-        return next(int(row.split()[1]) for row in text.splitlines() if row.startswith("VmRSS"))
-
-    def end(self) -> None:
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
-        try:
-            self._process.communicate(timeout=60)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
 
 
 @contextmanager
@@ -159,7 +88,7 @@ def beside(seconds: float, priority: int) -> Iterator[Figures]:
 def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
     """1 kHz with the recorder attached."""
     name, folder = "/sst_simulator", Path(tempfile.mkdtemp())
-    watch.said.clear()
+    watch.values.clear()
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
         recorder = Process("recorder", output=folder / "bag")
@@ -179,7 +108,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
         simulator.end()
         watch.spin(1.5)
         recorder.end()
-        said = watch.said[name]
+        said = watch.values[name]
         return {
             "scheduling": said["scheduling"],
             "length [min]": f"{wall / 60.0:.1f}",
@@ -196,12 +125,12 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
 def free_run(watch: Watch, seconds: float, publish_rate: int, given: dict[str, Any]) -> Figures:
     """As fast as possible, without a recorder."""
     name = "/sst_simulator"
-    watch.said.clear()
+    watch.values.clear()
     simulator = Process("simulator", real_time_factor=0.0, publish_rate=publish_rate, **given)
     try:
         watch.until(lambda: watch.phase(name) == "running", "run")
         watch.spin(seconds)
-        said = watch.said[name]
+        said = watch.values[name]
         return {
             "publish_rate [Hz]": str(publish_rate),
             "real-time factor": f"{float(said['real_time_factor_now']):.0f}",
@@ -214,7 +143,7 @@ def free_run(watch: Watch, seconds: float, publish_rate: int, given: dict[str, A
 def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str, Any]) -> Figures:
     """Namespaced simulators side by side, each publishing at its rate."""
     names = [f"/sst_{k}/sst_simulator" for k in range(number)]
-    watch.said.clear()
+    watch.values.clear()
     nodes = [
         Process("simulator", name.rpartition("/")[0], rate=rate, publish_rate=rate, **given)
         for name in names
@@ -222,15 +151,15 @@ def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str,
     try:
         watch.until(lambda: all(watch.phase(name) == "running" for name in names), "fleet", 240.0)
         watch.spin(5.0)  # until all have found each other
-        before, used = dict(watch.said), sum(node.processor_s() for node in nodes)
+        before, used = dict(watch.values), sum(node.processor_s() for node in nodes)
         watch.spin(seconds)
         used = sum(node.processor_s() for node in nodes) - used
-        since = [_since(before[name], watch.said[name]) for name in names]
+        since = [_since(before[name], watch.values[name]) for name in names]
         worst = max(since, key=_missed)
         return {
             "simulators": str(number),
             "rate [Hz]": str(rate),
-            "scheduling": watch.said[names[0]]["scheduling"],
+            "scheduling": watch.values[names[0]]["scheduling"],
             "length [min]": f"{seconds / 60.0:.1f}",
             "missed ticks, all [%]": f"{_missed_of(since):.3f}",
             "missed ticks, worst of them [%]": f"{_missed(worst):.3f}",
@@ -282,9 +211,7 @@ def _recorded(bag: Path) -> str:
 def table(columns: list[Figures]) -> str:
     """Markdown: a row for each key, a column for each run."""
     keys = list(dict.fromkeys(key for column in columns for key in column))
-    rows = [[key, *(column.get(key, "") for column in columns)] for key in keys]
-    rows.insert(1, ["---", *("---" for _ in columns)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown([[key, *(column.get(key, "") for column in columns)] for key in keys])
 
 
 def main() -> None:
@@ -298,25 +225,23 @@ def main() -> None:
     parser.add_argument("--priority", type=int, default=20, help="of SCHED_FIFO")
     parser.add_argument("--fleet", type=int, default=0, help="only so many simulators at once")
     parser.add_argument("--rate", type=int, default=200, help="of the fleet [Hz]")
+    parser.add_argument("--rounds", type=int, default=3, help="beside the bare loops; 0: none")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each run of those")
     parser.add_argument("--write", action="store_true", help="write docs/realtime.md")
     options = parser.parse_args()
-    os.environ.setdefault("ROS_DOMAIN_ID", str(101 - os.getpid() % 50))
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     given = {"scene": options.scene, "compiled": str(not options.plain).lower()}
     if not options.plain:
         made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
-    parts = list(_parts(options, given))
+    with Watch.started() as watch:
+        parts = list(_parts(watch, options, given))
     if options.write:
         PAGE.write_text("\n\n".join([_HEAD, *parts]) + "\n", encoding="utf-8")
 
 
-def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
-    rclpy.init()
-    watch = Watch()
-
-    def told(title: str, columns: list[Figures]) -> str:
-        part = f"## {title}\n\n{table(columns)}"
+def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
+    def printed(title: str, text: str) -> str:
+        part = f"## {title}\n\n{text}"
         print(part, end="\n\n", flush=True)
         return part
 
@@ -329,24 +254,31 @@ def _parts(options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
                     ("not", options.usual or options.minutes / 2.0, 0),
                 )
             ]
-            yield told("1 kHz, 500 samples a second, recorder attached", both)
+            yield printed("1 kHz, 500 samples a second, recorder attached", table(both))
+        if options.rounds:
+            costs = bare_loops.compare(watch, options.seconds, options.rounds)
+            yield printed("Processor time beside bare loops", f"{_COST}\n\n{costs}")
         runs = [
             {"": f"run {k + 1}", **free_run(watch, 8.0, rate, given)}
             for k, rate in enumerate((1000, 500, 100, 50))
         ]
-        yield told("As fast as possible, 1 kHz control, no recorder", runs)
+        yield printed("As fast as possible, 1 kHz control, no recorder", table(runs))
     number = options.fleet or (10 if options.minutes else 0)
     if number:
         seconds = min(60.0 * options.minutes, 60.0) or 20.0
         found = fleet(watch, number, options.rate, seconds, given)
-        yield told("Namespaced simulators side by side", [{"": "fleet", **found}])
+        yield printed("Namespaced simulators side by side", table([{"": "fleet", **found}]))
     packages = ("rclpy", "numba", "numpy", "ros-rclpy", "ros-rmw-fastrtps-cpp")
     said = f"Scene {options.scene}. {machine.line(machine.described(*packages))}."
     print(said, flush=True)
     yield said
-    watch.node.destroy_node()
-    rclpy.try_shutdown()
 
+
+_COST = """\
+Scene swing, compiled, 1 kHz, 500 samples a second, with a recorder, by
+`python -m benchmark.bare_loops`: each in a process of its own, in turn. The recorder subscribes to
+four topics: the loop that publishes four is the least that a program costs here that publishes by
+rclpy."""
 
 _HEAD = """\
 # Real-time performance: missed ticks, lateness, processor load

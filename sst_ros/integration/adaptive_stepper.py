@@ -101,8 +101,8 @@ class AdaptiveStepper:
     @property
     def pair_cost(self) -> int:
         """Evaluations of `step_pair`, which takes three steps."""
-        stages = len(self.method.a)
-        return 3 * (stages + (JACOBIAN_COST if isinstance(self.method, Rosenbrock) else 0))
+        method = self._current.method
+        return 3 * (len(method.a) + (JACOBIAN_COST if isinstance(method, Rosenbrock) else 0))
 
     def load(self, h: float, at: StepPoint, d: Vector) -> None:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
@@ -175,15 +175,16 @@ class AdaptiveStepper:
         """
         if self._h < h or self._derivative is not None:
             return 0, at
+        method, cost = self._current.method, self.pair_cost
         if self.budget.per_period is not None:
-            count = min(count, max(self.budget.per_period // self.pair_cost, 1))
-        implicit = isinstance(self.method, Rosenbrock)
+            count = min(count, max(self.budget.per_period // cost, 1))
+        implicit = isinstance(method, Rosenbrock)
         if implicit and self._auto:
             count = min(count, _CHOOSE_EVERY - 1 - self._since_choice)
-        if order != self.method.order:
-            at = (at[0], coarse_solution.rescaled(at[0], at[1], order, self.method.order), at[2])
+        if order != method.order:
+            at = (at[0], coarse_solution.rescaled(at[0], at[1], order, method.order), at[2])
         done, end = self._current.step_many(h, count, self.tolerance, at, d)
-        self.budget.spent += done * self.pair_cost
+        self.budget.spent += done * cost
         if self._h < GROW * h:
             for size in self._current.sizes[:done]:
                 self._h = max(self._h, h * self._factor(float(size)))

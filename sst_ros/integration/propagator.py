@@ -31,7 +31,7 @@ from sst_ros.integration.events import (
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.state import Vector3
+from sst_ros.state import Vector3, clamped
 
 
 class LimitReached(Exception):
@@ -130,14 +130,18 @@ class Propagator:
         full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
         return Point(full, list(full), self.dynamics.joints(*full[:7]), self._stepper.method.order)
 
-    def traced(self, torque: Torque) -> Torque:
-        """Return a sine that is no part of the program as a function; all others as they are.
+    def acting(self, torque: Torque) -> Torque:
+        """Return what acts: numbers within the limit of the actuators; functions as they are.
 
-        The actuators clamp it, or the derivative was given.
+        A sine becomes a function where it is no part of the program: the actuators clamp it, or
+        the derivative was given.
         """
-        if isinstance(torque, SineTorque) and (self._untraced or self._limit_of(torque)):
-            return torque.at
-        return torque
+        if isinstance(torque, SineTorque):
+            return torque.at if self._untraced or self._limit_of(torque) else torque
+        if callable(torque):
+            return torque
+        first, second, third = torque
+        return clamped((first, second, third), self._torque_limit)
 
     def advance(
         self,
@@ -149,6 +153,8 @@ class Propagator:
         moment: tuple[float, ...],
     ) -> tuple[Point, int]:
         """Advance by `count` periods of h [s] from `start` [s], or by fewer, but by one at least.
+
+        The torque is one of `acting`.
 
         Periods that take one pair of steps each are one call; another period is done by itself.
 
@@ -163,7 +169,8 @@ class Propagator:
         stepper = self._stepper_for(torque)
         before = self._checkpoint(stepper)
         self._stepper = stepper
-        drive = (*self._torque.begin(torque, start), *moment)
+        numbers = torque if type(torque) is tuple else self._torque.begin(torque, start)
+        drive = (*numbers, *moment)
         try:
             done = 0
             if stepper is self._constant:

@@ -167,7 +167,7 @@ class Simulation:
             refuse_bad_step(*arguments)
             if type(torque) is tuple and type(moment) is tuple:
                 self._checked = arguments  # tuples do not change
-        torque = self._propagator.traced(torque)
+        torque = self._propagator.acting(torque)
         if callable(torque) and not self._warned:
             self._warned = True
             text = "a torque function runs in plain Python, slower than compiled=True; same digits"
@@ -310,6 +310,8 @@ class Simulation:
         y = at.point.y
         if len(self.dynamics.state) > 7:  # the torques of the actuators lag
             torque = (y[7], y[8], y[9])
+        elif type(at.torque) is tuple:
+            torque = at.torque
         else:
             torque = self._propagator.torque_at(at.torque, at.time_ns / NANOSECONDS, y)
         return State.of(at.time_ns, y, at.point.joints, torque)

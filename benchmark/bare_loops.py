@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processor time of the simulator's node, beside loops that only sleep, or sleep and publish.
+
+python -m benchmark.bare_loops [--seconds 20] [--rounds 3]   # scene swing, compiled, 1 kHz
+
+All keep the deadlines of the node, one after the other, several times in turn, each with a recorder
+of its own where messages are published. The loops publish what the node publishes, as serialised
+bytes with a new stamp, and do nothing else: no program that publishes by rclpy costs less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import mean
+
+import rclpy
+
+from benchmark.nodes import Process, Watch, markdown
+from sst_ros.nodes import middleware, topics
+from sst_ros.nodes.messages import StateMessages, TorqueLog
+from sst_ros.runtime import realtime
+from sst_ros.runtime.torque_input import ZERO
+from sst_ros.simulation.simulation import Simulation
+
+TICK_NS = 1_000_000
+NODE = "the node"
+LOOPS: dict[str, tuple[int, str, int]] = {
+    "sleeps every tick": (1, "python", 0),
+    "the same, in C": (1, "libc", 0),
+    "sleeps every sample": (2, "python", 0),
+    "and publishes 3 topics": (2, "python", 3),
+    "the same, sleep in C": (2, "libc", 3),
+    "and publishes 4 topics": (2, "python", 4),
+}
+"""Ticks from one deadline to the next, what sleeps, and how many topics are published."""
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def python_sleep(until_ns: int) -> None:
+    """Sleep until a monotonic time [ns] by time.sleep."""
+    if (left := until_ns - time.monotonic_ns()) > 0:
+        time.sleep(left / 1e9)
+
+
+def libc_sleep() -> Callable[[int], None]:
+    """Return a function that sleeps until a monotonic time [ns] by clock_nanosleep."""
+    sleep, at, absolute = ctypes.CDLL(None).clock_nanosleep, _Timespec(), 1
+    given = time.CLOCK_MONOTONIC, absolute, ctypes.byref(at), None
+
+    def until(until_ns: int) -> None:
+        at.seconds, at.nanoseconds = divmod(until_ns, 1_000_000_000)
+        sleep(*given)
+
+    return until
+
+
+def publisher(number: int) -> Callable[[int], None]:
+    """Return a function that publishes a sample with this stamp [ns] on the first topics."""
+    middleware.configure()
+    rclpy.init()
+    node = rclpy.create_node("sst_simulator")
+    named = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ, topics.APPLIED_TORQUES)
+    publishers = [topic.publisher(node, 1000) for topic in named]
+    messages, log = StateMessages(), TorqueLog(2, TICK_NS)
+    messages.fill(Simulation("swing").state)
+    states = (messages.joints, messages.orientation, messages.euler)
+    end = time.monotonic() + 60.0
+    while not all(one.get_subscription_count() for one in publishers):
+        if time.monotonic() > end:
+            raise SystemExit("no recorder within 60 s")
+        time.sleep(0.01)
+
+    def publish(stamp_ns: int) -> None:
+        if number > 3:
+            log.append(ZERO, ZERO, 2)
+            publishers[3].publish(log.take(stamp_ns))
+        for one, message in zip(publishers, states, strict=False):
+            one.publish(message.stamped(stamp_ns))
+
+    return publish
+
+
+def run_loop(name: str, seconds: float) -> dict[str, float]:
+    """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
+    ticks, sleeper, number = LOOPS[name]
+    publish = publisher(number) if number else None
+    sleep = python_sleep if sleeper == "python" else libc_sleep()
+    time.sleep(1.0)  # until discovery is quiet
+    realtime.schedule(20)
+    realtime.quiet()
+    missed, step_ns, used = 0, ticks * TICK_NS, time.process_time()
+    began = deadline = time.monotonic_ns()
+    while deadline < began + seconds * 1e9:
+        deadline += step_ns
+        sleep(deadline)
+        late = time.monotonic_ns() - deadline
+        if late >= TICK_NS:
+            missed += late // TICK_NS
+            deadline += late // TICK_NS * TICK_NS
+        if publish is not None:
+            publish(deadline)
+    wall_ns, used = time.monotonic_ns() - began, time.process_time() - used
+    return {"processor": 1e11 * used / wall_ns, "missed": 100.0 * missed * TICK_NS / wall_ns}
+
+
+@contextmanager
+def recorder() -> Iterator[None]:
+    """Record whatever is published, into a folder that is deleted."""
+    folder = Path(tempfile.mkdtemp())
+    process = Process("recorder", output=folder / "bag")
+    try:
+        yield
+    finally:
+        process.end()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def measure(watch: Watch, name: str, seconds: float) -> dict[str, float]:
+    """Measure a loop, or the node, in a process of its own."""
+    with recorder():
+        if name != NODE:
+            command = [sys.executable, "-m", "benchmark.bare_loops", "--loop", name]
+            command += ["--seconds", str(seconds)]
+            found = subprocess.run(command, check=True, capture_output=True, text=True)
+            return dict(json.loads(found.stdout))
+        full = "/sst_simulator"
+        watch.values.clear()
+        simulator = Process("simulator", scene="swing", compiled="true")
+        try:
+            watch.until(lambda: watch.phase(full) == "running", "run")
+            watch.spin(2.5)
+            before, used, began = watch.values[full], simulator.processor_s(), time.monotonic()
+            watch.spin(seconds)
+            wall = time.monotonic() - began
+            used, now = simulator.processor_s() - used, watch.values[full]
+        finally:
+            simulator.end()
+    ticks, missed = (int(now[key]) - int(before[key]) for key in ("ticks", "ticks_missed"))
+    return {"processor": 100.0 * used / wall, "missed": 100.0 * missed / max(1, ticks + missed)}
+
+
+def compare(watch: Watch, seconds: float, rounds: int) -> str:
+    """Measure all in turn; Markdown, a row for each."""
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in (NODE, *LOOPS)}
+    for _ in range(rounds):
+        for name, runs in found.items():
+            runs.append(measure(watch, name, seconds))
+    rows = [["", "processor [% of a core]", "of each run", "missed ticks [%]"]]
+    for name, runs in found.items():
+        used = [run["processor"] for run in runs]
+        each = ", ".join(f"{one:.1f}" for one in used)
+        rows.append([name, f"{mean(used):.1f}", each, f"{mean(run['missed'] for run in runs):.3f}"])
+    return markdown(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each run")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--loop", choices=LOOPS, help="run this loop alone, in this process")
+    options = parser.parse_args()
+    if options.loop:
+        print(json.dumps(run_loop(options.loop, options.seconds)))
+        return
+    with Watch.started() as watch:
+        print(compare(watch, options.seconds, options.rounds))
+
+
+if __name__ == "__main__":
+    main()
