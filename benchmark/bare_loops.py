@@ -148,6 +148,7 @@ def measure(watch: Watch, name: str, seconds: float) -> dict[str, float]:
             used, now = simulator.processor_s() - used, watch.values[full]
         finally:
             simulator.end()
+            watch.spin(1.5)  # until its last diagnostics have come
     ticks, missed = (int(now[key]) - int(before[key]) for key in ("ticks", "ticks_missed"))
     return {"processor": 100.0 * used / wall, "missed": 100.0 * missed / max(1, ticks + missed)}
 
