@@ -196,9 +196,10 @@ class TickLoop:
             return late or self.stopped.is_set()
 
         while True:
-            ticks, interval_ns = self._ticks_left(), 0
+            ticks, interval_ns, unread = self._ticks_left(), 0, 0
             if at_once and paced and not self._lockstep and self._output.unread:
-                ticks = self._unread_ticks(ticks)
+                unread = self._unread_samples(ticks)
+                ticks += unread * self._ticks_per_sample
             if not at_once:
                 interval_ns = self._pacer.interval_ns
                 longest_ns = _LONGEST_SLEEP_NS if self.simulation.compiled else 0
@@ -212,6 +213,7 @@ class TickLoop:
                 equal = ticks if self._kept or self._input.constant(now) else 1
                 self._advance(torque, equal)
                 ticks -= equal
+            self.counters.published += unread
             if self._tick % self._ticks_per_sample == 0 or self.complete:
                 self._kept = None
                 self._publish()
@@ -241,13 +243,11 @@ class TickLoop:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
         return min(left, self._ticks_at_once())
 
-    def _unread_ticks(self, ticks: int) -> int:
-        """Ticks to the last sample within what is done at once."""
-        samples = (self._ticks_at_once() - ticks) // self._ticks_per_sample
-        if samples <= 0 or (self._tick + ticks) % self._ticks_per_sample:
-            return ticks
-        self.counters.published += samples
-        return ticks + samples * self._ticks_per_sample
+    def _unread_samples(self, ticks: int) -> int:
+        """Samples after the one that so many ticks lead to, within what is done at once."""
+        if (self._tick + ticks) % self._ticks_per_sample:
+            return 0
+        return (self._ticks_at_once() - ticks) // self._ticks_per_sample
 
     def _ticks_at_once(self) -> int:
         most = max(1.0, _AT_ONCE_S / (self.counters.step_max_s or _AT_ONCE_S))
