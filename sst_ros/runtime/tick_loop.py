@@ -244,7 +244,7 @@ class TickLoop:
         return min(left, self._ticks_at_once())
 
     def _unread_samples(self, ticks: int) -> int:
-        """Count the samples behind the one that so many ticks lead to, within what is done at once."""
+        """Count samples behind the one that these ticks lead to, within what is done at once."""
         if (self._tick + ticks) % self._ticks_per_sample:
             return 0
         return (self._ticks_at_once() - ticks) // self._ticks_per_sample
