@@ -16,6 +16,7 @@ needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
 
 
 @needs_gcc
+@pytest.mark.slow
 def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monkeypatch):
     pytest.importorskip("numba", reason="a batch needs numba")
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
