@@ -73,6 +73,7 @@ def load():
         process.wait()
 
 
+@pytest.mark.slow
 def test_a_closed_loop_is_the_same_on_a_loaded_machine(nodes, observer, tmp_path, request):
     idle = closed_loop(nodes, observer, tmp_path / "idle")
     disturb = partial(request.getfixturevalue, "load")
