@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 Value = Any  # an Expression or a float
 
@@ -189,8 +189,7 @@ class Program:
         return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True)
-class Operand:
+class Operand(NamedTuple):
     """Reference to an input or to the result of a step."""
 
     number: int
