@@ -32,14 +32,8 @@ WITHOUT_KEY = {"dask", "pyarrow", "viser", "xarray"}
 """Python packages of setup.py that have no key there: `pip install sst_ros[all]`."""
 
 ROS_KEYS = {
-    *(
-        "ament_index_python",
-        "builtin_interfaces",
-        "control_msgs",
-        "diagnostic_msgs",
-        "geometry_msgs",
-        "launch",
-    ),
+    *("ament_copyright", "ament_flake8", "ament_index_python", "ament_pep257", "ament_xmllint"),
+    *("builtin_interfaces", "control_msgs", "diagnostic_msgs", "geometry_msgs", "launch"),
     *("launch_ros", "launch_testing", "rcl_interfaces", "rclpy", "robot_state_publisher"),
     *("ros2bag", "ros2launch", "rosbag2_storage_mcap", "rosgraph_msgs", "rviz2", "sensor_msgs"),
     *("simulation_interfaces", "std_msgs", "std_srvs", "trajectory_msgs"),

@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from sst_ros.child_process import orphaned
 from sst_ros.errors import InputError, SstError
-from sst_ros.nodes import arguments, middleware, signals
+from sst_ros.nodes import arguments, middleware, shared_memory, signals
 
 _SPIN_PERIOD_S = 0.1
 """Longest delay of a signal; to spin once takes half a millisecond, asked for or not."""
@@ -51,6 +51,7 @@ def run(words: Sequence[str]) -> int:
         print(arguments.help_text(command))
         return 0
     middleware.configure()
+    shared_memory.remove_dead()
     try:
         ros = arguments.ros_arguments(command, given)
         for line in arguments.params_file_warnings(command, ros):

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a killed node leaves in shared memory: the next start removes it, and nothing else."""
+
+import contextlib
+import fcntl
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from sensor_msgs.msg import JointState
+
+from sst_ros.nodes import shared_memory
+
+pytestmark = pytest.mark.ros
+NAME = "fastdds_0123456789abcdef"
+PORT = "fastdds_port7413"
+
+
+def locks(pid):
+    """Segments and ports whose lock files a process has open."""
+    targets = set()
+    for path in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # the listing itself had one
+            targets.add(os.readlink(path))
+    found = (re.fullmatch(r"/dev/shm/(fast\w+)_el", target) for target in targets)
+    return {match[1] for match in found if match}
+
+
+def files(names):
+    present = {path.name for path in shared_memory.FOLDER.iterdir()}
+    wanted = {form.format(name) for name in names for form in ("{}", "{}_el", "sem.{}_mutex")}
+    return present & wanted
+
+
+def test_the_next_start_removes_what_a_killed_node_left(nodes, observer):
+    states = observer.listen(JointState, "/joint_states")
+    killed = nodes.run("simulator")
+    observer.until(lambda: states, "states")
+    left = locks(killed.pid)
+    assert len(left) >= 2  # a segment and a port
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert len(files(left)) >= 5
+    mine = locks("self")
+    states.clear()
+    nodes.run("simulator")
+    observer.until(lambda: states, "states of the next simulator")
+    # The observer is alive, and so are a port that the new simulator has taken and its own segment.
+    assert not {name for name in files(left) if "port" not in name}
+    assert locks("self") == mine
+    assert {f"{name}_el" for name in mine} <= files(mine)
+
+
+def test_what_is_locked_or_has_no_lock_or_is_no_file_of_fast_dds_stays(tmp_path):
+    dead = {NAME, f"{NAME}_el", PORT, f"{PORT}_el", f"sem.{PORT}_mutex", "fastrtps_port7_sl"}
+    stays = {"fastdds_port7415", "sem.fastdds_port7415_mutex", "fastdds_fedcba9876543210_el",
+             "fastdds_fedcba9876543210", "other_el", f"{NAME}_elx", "lttng-ust-wait-8"}  # fmt: skip
+    for name in dead | stays:
+        (tmp_path / name).touch()
+    with (tmp_path / "fastdds_fedcba9876543210_el").open() as alive:
+        fcntl.flock(alive, fcntl.LOCK_EX)
+        assert set(shared_memory.remove_dead(tmp_path)) == {NAME, PORT, "fastrtps_port7"}
+        assert {path.name for path in tmp_path.iterdir()} == stays
+    assert shared_memory.remove_dead(tmp_path / "none") == []
+
+
+def test_files_of_another_user_stay(tmp_path, monkeypatch):
+    (tmp_path / f"{NAME}_el").touch()
+    monkeypatch.setattr(os, "geteuid", lambda: 4321)
+    assert shared_memory.remove_dead(tmp_path) == []
+    assert (tmp_path / f"{NAME}_el").exists()
