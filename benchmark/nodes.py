@@ -83,6 +83,14 @@ class Process:
             argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
     def line(self) -> str:
         assert self._process.stdout is not None
         return self._process.stdout.readline()

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hours of use in one command: what grows, what is lost, what is left behind.
+
+python -m benchmark.soak --minutes 10
+
+A simulator and a controller at 1 kHz, a recorder, the viewer and a subscriber with the queues of
+robot_state_publisher and RViz run side by side in a ROS domain of their own. Then the memory of
+each process must be flat, the recording complete, and no shared memory of theirs left; neither
+after all have been killed by SIGKILL and a simulator has been started again. Else the status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from benchmark import machine
+from benchmark.campaign.processes import domain
+from benchmark.realtime import Process, table
+from sst_ros.nodes import shared_memory
+from sst_ros.recording import recording
+
+SCENE = "reach"
+FLAT_MB = 2.0
+"""Largest growth of a process after the first minute, or third, of the run."""
+_SUBSCRIBER = """
+import rclpy
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("subscriber")
+def read(message): pass
+latched = QoSProfile(depth=1, durability=rclpy.qos.DurabilityPolicy.TRANSIENT_LOCAL)
+node.create_subscription(JointState, "joint_states", read, qos_profile_sensor_data)
+node.create_subscription(QuaternionStamped, "sst_simulator/orientation", read, 5)
+node.create_subscription(String, "robot_description", read, latched)
+node.create_subscription(DiagnosticArray, "/diagnostics", read, 10)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+"""
+
+
+class Subscriber(Process):
+    """Reads what robot_state_publisher, which makes /tf from it, and RViz read."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _SUBSCRIBER], stdout=subprocess.PIPE, text=True
+        )
+
+
+def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> dict[str, Process]:
+    """Start all processes; those that record and control only with `control`."""
+    processes: dict[str, Process] = {}
+
+    def add(name: str, make: Callable[[], Process]) -> None:
+        processes[name] = make()
+        stack.callback(processes[name].end)
+
+    rates = {"scene": SCENE, "rate": 1000, "publish_rate": 1000}
+    waits = {"wait_for_command": "true", "publish_description": "true"}
+    if control:
+        add("recorder", lambda: Process("recorder", output=folder / "bag"))
+    add("simulator", lambda: Process("simulator", **rates, **(waits if control else {})))
+    add("viewer", lambda: Process("viewer"))
+    add("subscriber", Subscriber)
+    if control:
+        processes["recorder"].line()  # it has subscribed to the topics of the simulator
+        given = {"scene": SCENE, "rate": 1000, "mode": "computed_torque", "hold": seconds + 60.0}
+        add("controller", lambda: Process("inverse_dynamics", min_subscribers=2, **given))
+    return processes
+
+
+def shared(processes: dict[str, Process]) -> set[str]:
+    """Names of the files in /dev/shm that living processes have open or mapped."""
+    names: set[str] = set()
+    for process in processes.values():
+        folder = Path(f"/proc/{process.pid}")
+        names.update(re.findall(r"/dev/shm/(\S+)", (folder / "maps").read_text()))
+        for path in (folder / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                names.update(re.findall(r"^/dev/shm/(\S+)$", str(path.readlink())))
+    return names
+
+
+def left(names: set[str], seconds: float = 10.0) -> list[str]:
+    """Return which of them still exist after at most so long."""
+    end = time.monotonic() + seconds
+    while found := sorted(name for name in names if (shared_memory.FOLDER / name).exists()):
+        if time.monotonic() > end:
+            break
+        time.sleep(0.1)
+    return found
+
+
+def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:
+    """Run for so long; return a column for each process, and what is wrong."""
+    wrong = []
+    with ExitStack() as stack:
+        processes = start(stack, folder, seconds, control=True)
+        deadline = time.monotonic() + 120.0
+        while not len(list((folder / "bag").glob("*.mcap"))):
+            if time.monotonic() > deadline:
+                raise SystemExit("no recording within 120 s")
+            time.sleep(0.1)
+        memory: dict[str, list[float]] = {name: [] for name in processes}
+        began = time.monotonic()
+        used = {name: process.processor_s() for name, process in processes.items()}
+        names: set[str] = set()
+        while (passed := time.monotonic() - began) < seconds:
+            time.sleep(min(2.0, seconds / 20.0))
+            for name, process in processes.items():
+                memory[name].append(process.memory_kb() / 1024.0)
+        names = shared(processes)
+        columns = []
+        for name, process in processes.items():
+            later = memory[name][int(len(memory[name]) * min(60.0 / seconds, 1.0 / 3.0)) :]
+            growth = max(later) - later[0]
+            busy = 100.0 * (process.processor_s() - used[name]) / passed
+            columns.append({
+                "": name,
+                "processor [% of a core]": f"{busy:.1f}",
+                "memory at the end [MB]": f"{later[-1]:.1f}",
+                "growth after the first minute [MB]": f"{growth:.2f}",
+            })  # fmt: skip
+            if growth > FLAT_MB:
+                wrong.append(f"{name} grows by {growth:.2f} MB")
+    if remaining := left(names):
+        wrong.append(f"left in /dev/shm: {remaining}")
+    return columns, wrong
+
+
+def lost(bag: Path) -> tuple[int, int]:
+    """Samples recorded, and samples missing between the first and the last."""
+    stamps = recording.read(bag).time_ns
+    return len(stamps), int((stamps[-1] - stamps[0]) // 1_000_000) + 1 - len(stamps)
+
+
+def killed(folder: Path) -> tuple[int, list[str], list[str]]:
+    """Kill all by SIGKILL, start and end a simulator.
+
+    Returns:
+        How many files were left by the killed processes, which of them are left by the simulator
+        that was started after them, and those that have no lock file, which nothing proves unused.
+
+    """
+    with ExitStack() as stack:
+        processes = start(stack, folder, 0.0, control=False)
+        deadline = time.monotonic() + 60.0
+        while len(names := shared(processes)) < 3 * len(processes) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        for process in processes.values():
+            process.kill()
+    count = len(left(names, 0.0))
+    with ExitStack() as stack:
+        again = Process("simulator", scene=SCENE)
+        stack.callback(again.end)
+        while not shared({"simulator": again}):
+            time.sleep(0.1)
+        names |= shared({"simulator": again})
+    after = left(names, 2.0)
+    locked = {name for name in after if name.endswith("l") or f"{name}_el" in after}
+    return count, sorted(locked), sorted(set(after) - locked)
+
+
+def main() -> int:
+    """Soak, print the table and what is wrong."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=10.0)
+    options = parser.parse_args()
+    subprocess.run([sys.executable, "-m", "sst_ros", "compile", SCENE], check=True)
+    with domain(), tempfile.TemporaryDirectory() as folder:
+        del os.environ["SST_ROS_NUMBA"]
+        columns, wrong = soak(Path(folder), 60.0 * options.minutes)
+        samples, missing = lost(Path(folder) / "bag")
+        if missing:
+            wrong.append(f"{missing} samples are not in the recording")
+        count, dead, unproven = killed(Path(folder))
+        if dead:
+            wrong.append(f"left in /dev/shm after SIGKILL and a new start: {dead}")
+    print(table(columns))
+    print(
+        f"\nsamples recorded {samples}, missing {missing}; after SIGKILL {count} files in /dev/shm,"
+    )
+    print(f"after a new start {len(dead)}, and {len(unproven)} ports that have no lock file")
+    print(machine.line(machine.described("rclpy", "ros-rmw-fastrtps-cpp", "viser")))
+    for line in wrong:
+        print(f"WRONG: {line}")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    sys.exit(main())
