@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -86,31 +86,41 @@ def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> d
     return processes
 
 
-def shared(processes: dict[str, Process]) -> set[str]:
-    """Names of the files in /dev/shm that living processes have open or mapped."""
+def shared(pids: Iterable[int | str]) -> set[str]:
+    """Names of the files of Fast DDS in /dev/shm that these processes have open or mapped."""
     names: set[str] = set()
-    for process in processes.values():
-        folder = Path(f"/proc/{process.pid}")
-        names.update(re.findall(r"/dev/shm/(\S+)", (folder / "maps").read_text()))
-        for path in (folder / "fd").iterdir():
-            with contextlib.suppress(OSError):
-                names.update(re.findall(r"^/dev/shm/(\S+)$", str(path.readlink())))
+    for pid in pids:
+        folder = Path(f"/proc/{pid}")
+        with contextlib.suppress(OSError):  # it has ended, or belongs to another user
+            names.update(re.findall(r"/dev/shm/(fast\S+)", (folder / "maps").read_text()))
+            for path in (folder / "fd").iterdir():
+                with contextlib.suppress(OSError):
+                    names.update(re.findall(r"^/dev/shm/(fast\S+)$", str(path.readlink())))
     return names
 
 
+def existing() -> set[str]:
+    """Names of the files in /dev/shm."""
+    return {path.name for path in shared_memory.FOLDER.iterdir()}
+
+
 def left(names: set[str], seconds: float = 10.0) -> list[str]:
-    """Return which of them still exist after at most so long."""
+    """Return which of them still exist after at most so long, unless a living process uses them.
+
+    Other programs on this machine may use the same ports.
+    """
     end = time.monotonic() + seconds
-    while found := sorted(name for name in names if (shared_memory.FOLDER / name).exists()):
-        if time.monotonic() > end:
+    while found := names & existing():
+        found -= shared(path.name for path in Path("/proc").glob("[0-9]*"))
+        if not found or time.monotonic() > end:
             break
-        time.sleep(0.1)
-    return found
+        time.sleep(0.2)
+    return sorted(found)
 
 
 def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:
     """Run for so long; return a column for each process, and what is wrong."""
-    wrong = []
+    wrong, before = [], existing()
     with ExitStack() as stack:
         processes = start(stack, folder, seconds, control=True)
         deadline = time.monotonic() + 120.0
@@ -121,12 +131,11 @@ def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]
         memory: dict[str, list[float]] = {name: [] for name in processes}
         began = time.monotonic()
         used = {name: process.processor_s() for name, process in processes.items()}
-        names: set[str] = set()
         while (passed := time.monotonic() - began) < seconds:
             time.sleep(min(2.0, seconds / 20.0))
             for name, process in processes.items():
                 memory[name].append(process.memory_kb() / 1024.0)
-        names = shared(processes)
+        names = shared(process.pid for process in processes.values()) - before
         columns = []
         for name, process in processes.items():
             later = memory[name][int(len(memory[name]) * min(60.0 / seconds, 1.0 / 3.0)) :]
@@ -155,27 +164,31 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
     """Kill all by SIGKILL, start and end a simulator.
 
     Returns:
-        How many files were left by the killed processes, which of them are left by the simulator
-        that was started after them, and those that have no lock file, which nothing proves unused.
+        How many files the killed processes left; which of these are left after a simulator was
+        started and ended; and which of them are ports without a lock file, which nothing proves
+        unused.
 
     """
+    before = existing()
     with ExitStack() as stack:
         processes = start(stack, folder, 0.0, control=False)
-        deadline = time.monotonic() + 60.0
-        while len(names := shared(processes)) < 3 * len(processes) and time.monotonic() < deadline:
-            time.sleep(0.2)
+        for process in processes.values():
+            while len(names := shared([process.pid])) < 3:
+                time.sleep(0.2)
+        time.sleep(5.0)  # until they have found each other
+        names = shared(process.pid for process in processes.values()) - before
         for process in processes.values():
             process.kill()
     count = len(left(names, 0.0))
     with ExitStack() as stack:
         again = Process("simulator", scene=SCENE)
         stack.callback(again.end)
-        while not shared({"simulator": again}):
+        while not shared([again.pid]):
             time.sleep(0.1)
-        names |= shared({"simulator": again})
+        names |= shared([again.pid]) - before
     after = left(names, 2.0)
-    locked = {name for name in after if name.endswith("l") or f"{name}_el" in after}
-    return count, sorted(locked), sorted(set(after) - locked)
+    unproven = [name for name in after if "port" in name and f"{name}_el" not in after]
+    return count, after, [name for name in unproven if not name.endswith("_el")]
 
 
 def main() -> int:
@@ -193,7 +206,7 @@ def main() -> int:
         if missing:
             wrong.append(f"{missing} samples are not in the recording")
         count, dead, unproven = killed(Path(folder))
-        if dead:
+        if set(dead) - set(unproven):
             wrong.append(f"left in /dev/shm after SIGKILL and a new start: {dead}")
     print(table(columns))
     print(
