@@ -50,7 +50,7 @@ def _remove(lock: Path, name: str) -> bool:
         return False  # another process was faster
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        there, held = os.stat(lock), os.fstat(descriptor)
+        there, held = lock.stat(), os.fstat(descriptor)
         if there.st_ino != held.st_ino or held.st_uid != os.geteuid():
             return False
         for path in (lock.with_name(name), lock.with_name(f"sem.{name}_mutex"), lock):

@@ -23,7 +23,7 @@ def locks(pid):
     targets = set()
     for path in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):  # the listing itself had one
-            targets.add(os.readlink(path))
+            targets.add(str(path.readlink()))
     found = (re.fullmatch(r"/dev/shm/(fast\w+)_el", target) for target in targets)
     return {match[1] for match in found if match}
 
