@@ -3,6 +3,7 @@
 
 import os
 import tempfile
+import time
 import unittest
 from pathlib import Path
 
@@ -90,6 +91,11 @@ class Started(unittest.TestCase):
     def test_a_node_works(self, proc_output, name):
         _, text, stream = LAUNCHES[name]
         proc_output.assertWaitFor(text, timeout=60, stream=stream)
+        if name == "record.launch.py":  # the slowest topic has one message a second
+            end = time.monotonic() + 60.0
+            while sum(path.stat().st_size for path in Path("bag").glob("*.mcap")) < 1_000_000:
+                self.assertLess(time.monotonic(), end, "the recording does not grow")
+                time.sleep(0.1)
 
     def test_no_launch_file_is_left_out(self):
         self.assertEqual(set(LAUNCHES), {path.name for path in FOLDER.glob("*.launch.py")})
