@@ -26,7 +26,8 @@ from pathlib import Path
 
 from benchmark import machine
 from benchmark.campaign.processes import domain
-from benchmark.realtime import Process, table
+from benchmark.nodes import Process
+from benchmark.realtime import table
 from sst_ros.nodes import shared_memory
 from sst_ros.recording import recording
 
