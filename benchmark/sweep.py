@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
 import json
 import os
 import resource
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,9 @@ BODIES = (
 VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
 MUJOCO_STEPS = 2780
 """Steps, with the softness below, by which rollout reaches 1e-6 rad soonest (docs/peers.csv)."""
+
+HASHES = 8_000_000
+"""Repetitions of SHA-256, some seconds."""
 
 RUNS = 1e9
 
@@ -178,6 +183,7 @@ def _cluster(steps: int) -> dict[str, float]:
             both = list(client.scheduler_info(n_workers=-1)["workers"])
             for index, worker in enumerate(both):  # each prepares the study once
                 client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
+            bounds = [_bound()]
             for workers in (1, 2):
                 began = time.perf_counter()
                 if workers == 1:
@@ -191,6 +197,7 @@ def _cluster(steps: int) -> dict[str, float]:
                 found[f"seconds of {chunks} chunks, {workers} workers"] = (
                     time.perf_counter() - began
                 )
+            bounds.append(_bound())
             began = time.perf_counter()
             client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
             found["seconds of an empty task, scheduler and client"] = (
@@ -198,6 +205,7 @@ def _cluster(steps: int) -> dict[str, float]:
             ) / 1000
     one, two = (found[f"seconds of {chunks} chunks, {workers} workers"] for workers in (1, 2))
     found["two workers against one"] = one / two
+    found["two loops in C against one, before and after"] = float(np.mean(bounds))
     # The scheduler serves one task at a time: more threads than this wait for it.
     useful = found["seconds of a chunk"] / found["seconds of an empty task, scheduler and client"]
     found["largest useful number of threads"] = useful
@@ -205,6 +213,19 @@ def _cluster(steps: int) -> dict[str, float]:
         RUNS / CHUNK * found["seconds of an empty task, scheduler and client"] / 3600
     )
     return found
+
+
+def _bound() -> float:
+    """Throughput of two threads of bare C against one: what this machine gives to any program."""
+    times = []
+    for threads in (1, 2):
+        began = time.perf_counter()
+        with ThreadPoolExecutor(threads) as pool:
+            list(
+                pool.map(lambda _: hashlib.pbkdf2_hmac("sha256", b"", b"", HASHES), range(threads))
+            )
+        times.append(time.perf_counter() - began)
+    return 2.0 * times[0] / times[1]
 
 
 def _on_worker(task: ChunkTask, index: int) -> str:

@@ -19,14 +19,14 @@ from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration import codegen
-from sst_ros.integration.batch_result import BatchResult, BatchStates
+from sst_ros.integration.batch_result import BatchResult
+from sst_ros.integration.batch_run import integrated
 from sst_ros.integration.batch_source import SIMD_WIDTH, batch_source
 from sst_ros.integration.initial_states import initial_states
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.integration.parametric_model import ParametricModel
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
-from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 
 _UNUSED = {
@@ -130,27 +130,14 @@ class Batch:
         """
         _refuse_bad_steps(step, count, keep_every, threads)
         y, code = self.start(gamma, gamma_dot, progress=progress)
-        number = y.shape[1]
-        given = self.drives(torque, number)
-        time, error = np.full(number, np.nan), np.zeros(number)
-        kept, ends = [y.copy()], [0]
-        size = keep_every or (0 if progress else max(count, 1))  # few calls: each passes all rows
-        for part in slices(count, size, self.scene.name, progress):
-            span = part.stop - part.start
-            self.advance(part.start, span, step, y, given, code, time, error, threads=threads)
-            if keep_every and span == keep_every:
-                kept.append(y.copy())
-                ends.append(part.stop)
-        time[code < 0] = 0.0
-        # A step in which a limit was passed is left out: its beginning is the last valid state.
-        last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(time / step) - 1, count)) * step
-        torques = given[:3].T if self.model.ode.drive[:3] == TORQUE else np.zeros((number, 3))
-        common = self.model, self.columns, torques, code >= 0
-        samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
-        trajectories = BatchStates(*common, samples, np.stack(kept)) if keep_every else None
-        return BatchResult(
-            *common, last, y, code=code, fault_time=time, local_error=error, kept=trajectories
-        )
+
+        def advance(first: int, span: int, h: float, *arrays: Any, rows: Any) -> None:
+            self.advance(first, span, h, *arrays, threads=threads if rows is None else 1)
+
+        return integrated(
+            self.model, self.columns, (y, code), self.drives(torque, y.shape[1]), advance,
+            step=step, count=count, keep_every=keep_every, progress=progress,
+        )  # fmt: skip
 
     def start(
         self, gamma: ArrayLike, gamma_dot: ArrayLike, *, progress: bool = False
@@ -215,7 +202,7 @@ class Batch:
 
     @property
     def limit_distances(self) -> Program:
-        """Distances to the limits; inputs are quaternion, body rate and the numbers that differ."""
+        """Distances to the limits, and their rates; see `ParametricModel`."""
         return self.model.limit_distances
 
     @cached_property

@@ -163,7 +163,8 @@ class BatchResult(BatchStates):
         status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
             start or its numbers ceased to be finite, shape (N,).
         code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
-        fault_time: end of the step in which a scenario ended [s], nan where it reached its end,
+        fault_time: when a scenario passed a limit [s], the end of the step in which its numbers
+            ceased to be finite, 0 without a start, nan where it reached its end,
             shape (N,).
         local_error: largest local error estimate of a quaternion in a step, shape (N,).
         kept: states every `keep_every` steps from the start on, arrays (samples, N, ...); None

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration.codegen import combination
+from sst_ros.integration.limit_crossings import crossings
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
 
@@ -54,8 +55,8 @@ def batch_source(
 
     Args:
         program: derivative; inputs t, state, drive, of which the last may be parameters.
-        distances: numbers that are positive as long as the state is valid; inputs are the state's
-            first seven, and the parameters.
+        distances: numbers that are positive as long as the state is valid, then their rates; inputs
+            are the state's first seven, and the parameters.
         tableau: explicit method.
         size: numbers in the state.
         feedback: gives the first three numbers of the drive; none by default.
@@ -66,12 +67,14 @@ def batch_source(
     stages = len(tableau.b)
     at = Layout(
         SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
-        far=len(distances.outputs), code=1, when=1, error=1,
+        was=len(distances.outputs), far=len(distances.outputs), code=1, when=1, error=1,
+        hit=1, found=1, share=1,
         **_feedback_rows(feedback),
     )  # fmt: skip
     outside = at.rows("d", drive)
     given = ["time", *at.rows("s", size), *outside]
-    valid = [*at.rows("new", 7), *outside[drive - (len(distances.inputs) - 7) :]]
+    parameters = outside[drive - (len(distances.inputs) - 7) :]
+    limits, both = len(distances.outputs) // 2, len(distances.outputs) * SIMD_WIDTH
     lines = [
         f"def batch(h, first, count, begin, end, y, d, code, when, error{more}):",
         f"    block = vector({at.numbers})",
@@ -85,6 +88,7 @@ def batch_source(
         *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
         *(f"            {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")),
         *_loaded(feedback, at),
+        *indented(8, evaluated(distances, [*at.rows("y", 7), *parameters], at, "was")),
         "        for step in range(first, first + count):",
         *_sampled(feedback, size, drive, at),
         f"            for stage in range({stages}):",
@@ -93,8 +97,11 @@ def batch_source(
         *indented(16, evaluated(program, given, at, "f")),
         *indented(16, _kept(tableau, size, at)),
         *indented(12, _results(tableau, size, at)),
-        *indented(12, evaluated(distances, valid, at, "far")),
-        *indented(12, _accepted(size, len(distances.outputs), at)),
+        *indented(12, evaluated(distances, [*at.rows("new", 7), *parameters], at, "far")),
+        *indented(12, crossings(limits, at)),
+        *indented(12, _accepted(size, at)),
+        f"            for x in range({both}):",
+        f"                {at.lane('was', 0, 'x')} = {at.lane('far', 0, 'x')}",
         "        for i in range(last + 1):",
         *(f"            y[{j}, lo + i] = {at.lane('y', j)}" for j in range(size)),
         f"            code[lo + i] = int({at.lane('code')})",
@@ -223,18 +230,17 @@ def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
     return [*lines, *loop(at, [f"factor = 1.0 / sqrt({squares})", *scaled])]
 
 
-def _accepted(size: int, distances: int, at: Layout) -> list[str]:
+def _accepted(size: int, at: Layout) -> list[str]:
     """Accept the new state where it is valid; otherwise record why not, and when."""
-    inside = ["found = 0.0"]
-    for j in reversed(range(distances)):
-        inside += [f"far = {at.lane('far', j)}", f"found = {j + 1}.0 if far < 0.0 else found"]
-    inside += [
+    inside = [
+        f"found = {at.lane('found')}",
         f"total = {' + '.join(at.lane('new', j) for j in range(size))}",
         f"found = found if total - total == 0.0 else {NOT_FINITE}.0",
         f"before = {at.lane('code')}",
         f"since = {at.lane('when')}",
         "now = before if before != 0.0 else found",
         f"{at.lane('code')} = now",
+        f"ends = (step + {at.lane('share')}) * h",
         f"{at.lane('when')} = since if before == now else ends",
         f"least = {at.lane('error')}",
         "worst = least",
@@ -248,4 +254,4 @@ def _accepted(size: int, distances: int, at: Layout) -> list[str]:
             f"new = {at.lane('new', j)}",
             f"{at.lane('y', j)} = new if now == 0.0 else old",
         ]
-    return ["ends = (step + 1) * h", *loop(at, inside)]
+    return loop(at, inside)

@@ -242,7 +242,7 @@ def _collocation(
     if limits:
         ends = [(math.cos(limit.end), math.sin(limit.end)) for limit in limits]
         program = trace(
-            lambda *state: limit_distances(limits, ends, dynamics.model, state),
+            lambda *state: limit_distances(limits, ends, dynamics.model, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
     ode = ODE(dynamics, sine)

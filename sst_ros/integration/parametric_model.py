@@ -131,13 +131,13 @@ class ParametricModel:
 
     @cached_property
     def limit_distances(self) -> Program:
-        """Distances to the limits; inputs are quaternion, body rate and the varied numbers."""
+        """Distances to the limits, and their rates; inputs: state (7) and the varied numbers."""
 
-        def distances(*inputs: Expression) -> tuple[Any, ...]:
+        def values(*inputs: Expression) -> tuple[Any, ...]:
             at = self.constants(inputs[7:])
             return limit_distances(self._limits, at.ends, at.model, inputs[:7])
 
-        return trace(distances, (*QUATERNION, *RATE, *self.names))
+        return trace(values, (*QUATERNION, *RATE, *self.names))
 
     def output_function(self, names: tuple[str, ...]) -> Callable[..., tuple[Any, ...]]:
         """Return a function of arrays: quantities of OUTPUTS by name; inputs as `limit_distances`.

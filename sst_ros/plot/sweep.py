@@ -42,6 +42,7 @@ def early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> 
     names = list(correlations)[::-1]
     left.barh(names, [correlations[name] for name in names], color=VERMILION)
     left.set_xlim(-1.0, 1.0)
+    left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
     left.set_title("Rank correlation of inputs with an early end")
     reasons = list(counts)[::-1]
     right.barh(reasons, [counts[reason] for reason in reasons], color=GREY)

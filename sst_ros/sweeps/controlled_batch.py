@@ -16,7 +16,8 @@ from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import BatchResult, BatchStates
+from sst_ros.integration.batch_result import BatchResult
+from sst_ros.integration.batch_run import integrated
 from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Array
@@ -31,6 +32,8 @@ from sst_ros.sweeps.traced_controller import (
 )
 
 _NOISE = 6
+_NEVER = 2**62
+"""Steps from one sample to the next while torques are held."""
 
 
 class ControlledBatch:
@@ -114,31 +117,27 @@ class ControlledBatch:
         start = self._loop.motion.at(0.0)
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
-        y, code = batch.start(gamma, rate)
-        drive = batch.drives((0.0, 0.0, 0.0), count)
-        time, error = np.full(count, np.nan), np.zeros(count)
         step = self.samples * self._loop.channel.period / steps
         memory, gains = self._memory(gamma, rate, count), self._gains(batch, given, count)
-        more = hold, self._references, memory, gains, rows.astype(np.int64), self._seed
-        blocks = -(-count // SIMD_WIDTH)
-        states, ends, span = [y.copy()], [0], kept or steps
-        for first in range(0, steps, span):
-            size = min(span, steps - first)
-            self.module.batch(step, first, size, 0, blocks, y, drive, code, time, error, *more)
-            states.append(y.copy())
-            ends.append(first + size)
-        time[code < 0] = 0.0
-        last = np.where(code < 0, 0.0, np.where(code > 0, np.rint(time / step) - 1, steps)) * step
-        torque = np.ascontiguousarray(drive[:3].T)
-        common = batch.model, batch.columns, torque, code >= 0
-        trajectory = None
-        if kept:
-            t = np.minimum.outer(step * np.array(ends, dtype=float), last)
-            trajectory = BatchStates(*common, t, np.stack(states))
-        result = BatchResult(
-            *common, last, y, code=code, fault_time=time, local_error=error, kept=trajectory
-        )
-        return result, {}, self._tracking(result, memory, last)
+
+        def advance(first: int, span: int, h: float, *arrays: Any, rows: Any) -> None:
+            own, held, begin = (memory, gains, numbers), hold, first
+            if rows is not None:  # torques are held while a step is repeated, whenever it was
+                chosen = [np.ascontiguousarray(array[..., rows]) for array in own]
+                own, held, begin = (chosen[0], chosen[1], chosen[2]), _NEVER, 1
+            blocks = -(-arrays[0].shape[1] // SIMD_WIDTH)
+            more = held, self._references, *own, self._seed
+            self.module.batch(h, begin, span, 0, blocks, *arrays, *more)
+            if rows is not None:
+                arrays[3][:] += (first - begin) * h
+
+        numbers = rows.astype(np.int64)
+        result = integrated(
+            batch.model, batch.columns, batch.start(gamma, rate),
+            batch.drives((0.0, 0.0, 0.0), count), advance,
+            step=step, count=steps, keep_every=kept,
+        )  # fmt: skip
+        return result, {}, self._tracking(result, memory, result.t)
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""

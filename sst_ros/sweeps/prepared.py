@@ -14,15 +14,22 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import BatchResult, BatchStates
+from sst_ros.integration.batch_result import BatchResult
 from sst_ros.integration.parametric_model import OUTPUTS
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
-from sst_ros.state import DIMENSIONS, QUANTITIES
 from sst_ros.sweeps.controlled_batch import ControlledBatch
+from sst_ros.sweeps.range_ends import range_ends
 from sst_ros.sweeps.sampling import Sampler
+from sst_ros.sweeps.sweep_columns import (
+    Columns,
+    components,
+    extremes_of,
+    largest_angle,
+    units_of,
+    with_faults,
+)
 from sst_ros.sweeps.sweep_study import SweepStudy
-from sst_ros.sweeps.variations import Variation
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,10 +41,7 @@ MOST_STEPS = 1_000_000
 PARTS = 64
 """Extremes are those of the states at the ends of at most so many equal parts of a run."""
 
-_JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 _STATE_KEYS = ("initial.gamma", "initial.gamma_dot")
-
-Columns = dict[str, NDArray[Any]]
 
 
 class PreparedSweep:
@@ -56,7 +60,7 @@ class PreparedSweep:
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:
         self.study = study
         scene = study.model_scene
-        parameters = self._ends()
+        parameters = range_ends(self.study)
         numbers, _ = _split(parameters)
         ends = Scenarios(scene, numbers)
         faults = ends.faults(most=1)
@@ -115,24 +119,9 @@ class PreparedSweep:
             "steps": self.steps,
             "duration": self.study.length,
             "study": self.study.document(),
-            "units": self.units,
+            "units": units_of(self.study.variations),
             "inputs": [name for one in self.study.variations for name in one.columns],
         }
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Unit of each column that has one."""
-        found = {"t": "s", "fault_time": "s", "energy": "J", "local_error": "1"}
-        for name, (unit, dimension) in QUANTITIES.items():
-            for part in DIMENSIONS[dimension]:
-                for suffix in ("", "_min", "_max"):
-                    found[f"{name}{suffix}_{part}"] = unit
-        for part in DIMENSIONS["leg"]:
-            found |= {f"error_rms_{part}": "rad", f"error_max_{part}": "rad"}
-        for one in self.study.variations:
-            unit = "1" if one.factor else one.targets[0].spec.unit
-            found |= dict.fromkeys(one.columns, unit)
-        return found
 
     def _results(self, values: dict[str, Array], rows: NDArray[np.int64]) -> tuple[Columns, Any]:
         scenarios, starts, faults = self._scenarios(values)
@@ -148,11 +137,11 @@ class PreparedSweep:
             if name == "energy":
                 columns[name] = result.energy
             elif name != "extremes":
-                columns |= _parts(name, getattr(result, name))
+                columns |= components(name, getattr(result, name))
         columns |= extremes | more
         texts, reason = result.reasons
         if faults:
-            texts, reason = _with_faults(columns, texts, reason, faults)
+            texts, reason = with_faults(columns, texts, reason, faults)
         columns |= {"reason_texts": texts, "reason": reason}
         return columns, self._trajectory(values, rows)
 
@@ -168,7 +157,7 @@ class PreparedSweep:
         count = len(next(iter(values.values())))
         faults = scenarios.faults(most=count)
         if faults:
-            known = {key: array[:1] for key, array in self._ends().items()}
+            known = {key: array[:1] for key, array in range_ends(self.study).items()}
             numbers = {key: array.copy() for key, array in numbers.items()}
             for key, array in numbers.items():
                 array[list(faults)] = known[key]
@@ -197,7 +186,7 @@ class PreparedSweep:
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
         if kept or result.kept is None:
             return result, {}, {}
-        extremes = _extremes(result.kept)
+        extremes = extremes_of(result.kept)
         result.kept = None
         return result, extremes, {}
 
@@ -222,26 +211,7 @@ class PreparedSweep:
             if name == "energy" and array is not None:
                 found[name] = array.ravel()
             elif array is not None:
-                found |= _parts(name, array.reshape(samples * count, -1))
-        return found
-
-    def _ends(self) -> dict[str, Array]:
-        """Rows at the middle and at the ends of all ranges, by key of the scene."""
-        study, rows = self.study, []
-        tabulated = [one for one in study.variations if one.kind == "table"]
-        middle = {one.key: _middle(one) for one in study.variations if one.kind != "table"}
-        picks = {0}
-        for values in (study.table or {}).values():
-            picks |= {int(np.argmin(values)), int(np.argmax(values))}
-        for pick in sorted(picks) if tabulated else []:
-            row = study.sampler.rows(pick, 1)
-            rows.append(middle | {one.key: row[one.key][0] for one in tabulated})
-        rows = rows or [middle]
-        for one in study.variations:
-            rows += [rows[0] | {one.key: end} for end in _ends(one)]
-        found: dict[str, Array] = {}
-        for one in study.variations:
-            found |= one.parameters(np.stack([row[one.key] for row in rows]))
+                found |= components(name, array.reshape(samples * count, -1))
         return found
 
     def _chosen_steps(self) -> int:
@@ -265,7 +235,7 @@ class PreparedSweep:
                 self._run(scenarios, starts, rows, times * count)[0] for times in (1, 2)
             )
             both = (coarse.status == 0) & (fine.status == 0)
-            error = _largest_angle(coarse.quaternion[both], fine.quaternion[both])
+            error = largest_angle(coarse.quaternion[both], fine.quaternion[both])
             if not both.any():
                 return count  # no pilot row reaches the end
             if error <= tolerance:
@@ -301,57 +271,3 @@ def _split(parameters: dict[str, Array]) -> tuple[dict[str, Array], dict[str, Ar
         if key in _STATE_KEYS or key.startswith("control.")
     }
     return {key: parameters[key] for key in parameters.keys() - outside.keys()}, outside
-
-
-def _middle(one: Variation) -> Array:
-    return np.asarray(one.numbers.mean(axis=0) if one.kind == "uniform" else one.numbers[0])
-
-
-def _ends(one: Variation) -> list[Array]:
-    """Values that differ in every component that can differ."""
-    if one.kind == "normal":
-        return [one.values(np.full((1, len(one.columns)), q))[0] for q in (0.4, 0.6)]
-    return list(one.numbers)
-
-
-def _parts(name: str, array: Array) -> Columns:
-    _, dimension = QUANTITIES[name]
-    return {
-        f"{name}_{part}": np.ascontiguousarray(array[:, i])
-        for i, part in enumerate(DIMENSIONS[dimension])
-    }
-
-
-def _extremes(kept: BatchStates) -> Columns:
-    """Least and largest angles and rates of joints at the ends of steps."""
-    found: Columns = {}
-    with np.errstate(all="ignore"):
-        for name in _JOINTS:
-            array = getattr(kept, name)
-            for suffix, reduced in (("min", array.min(axis=0)), ("max", array.max(axis=0))):
-                for k in range(3):
-                    found[f"{name}_{suffix}_{k + 1}"] = reduced[:, k]
-    return found
-
-
-def _with_faults(
-    columns: Columns, texts: NDArray[Any], reason: NDArray[Any], faults: dict[int, InputError]
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Mark rows that make no scene: status -1, no numbers, and the first problem as the reason."""
-    rows, reason = list(faults), reason.copy()
-    for name, array in columns.items():
-        columns[name] = array.copy()
-        columns[name][rows] = -1 if name == "status" else np.nan
-    columns["fault_time"][rows] = 0.0
-    found = [f"no scene: {error.problems[0].key.partition(': ')[2]}" for error in faults.values()]
-    distinct = sorted(set(found))
-    reason[rows] = [len(texts) + distinct.index(text) for text in found]
-    return np.array([*texts, *distinct], dtype=object), reason
-
-
-def _largest_angle(one: Array, other: Array) -> float:
-    """Largest angle between orientations [rad]."""
-    if not len(one):
-        return 0.0
-    apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
-    return float(2.0 * apart.max())

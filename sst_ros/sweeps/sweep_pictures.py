@@ -53,7 +53,8 @@ def draw(table: pd.DataFrame, out: Path) -> list[Path]:
 def _badness(table: pd.DataFrame, outputs: list[str]) -> tuple[Array, str]:
     """How bad each run is, and what that means."""
     if (table["status"] != 0).any():
-        return -table["t"].to_numpy(), f"The {WORST} runs that ended first"
+        ends = table["fault_time"].fillna(table["t"]).to_numpy()
+        return -ends, f"The {WORST} runs that ended first"
     errors = [name for name in outputs if name.startswith("error_max")]
     if errors:
         return table[errors].max(axis=1).to_numpy(), f"The {WORST} largest tracking errors"

@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,22 +17,17 @@ import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.given import scene_of
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.scene.values import plain
 from sst_ros.scene.yaml_document import values_of
-from sst_ros.state import QUANTITIES
+from sst_ros.sweeps import study_checks
 from sst_ros.sweeps.controlled import ControlledRun, control_of
-from sst_ros.sweeps.sampling import LARGEST_HYPERCUBE, SAMPLINGS, Sampler
+from sst_ros.sweeps.sampling import LARGEST_HYPERCUBE, Sampler
+from sst_ros.sweeps.sweep_table import digest_of, keys_of, read_table, tabulated
 from sst_ros.sweeps.variations import Target, Variation, scales_tensor, targets_of, variation
 
-FINAL = (*QUANTITIES, "energy")
-"""Quantities of the final state that `outputs` may name."""
-
 DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
-OUTPUTS = (*FINAL, "extremes")
-MOST_ROWS = 2**53
 CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
@@ -85,9 +79,9 @@ class SweepStudy:
     chunk: int = CHUNK
 
     def __post_init__(self) -> None:
-        problems = list(self._problems())
-        if problems:
-            raise InputError("sweep", problems)
+        found = list(study_checks.problems(vars(self)))
+        if found:
+            raise InputError("sweep", found)
         object.__setattr__(self, "outputs", tuple(self.outputs))
         _ = self.variations, self.rows, self.length, self.controlled
 
@@ -122,7 +116,7 @@ class SweepStudy:
         if isinstance(scene, str) and (folder / scene).is_file():
             scene = folder / scene
         if isinstance(table, str):
-            table = _read_table(folder / table)
+            table = read_table(folder / table)
         return cls(scene_of(scene), table=table, **given)
 
     @cached_property
@@ -170,13 +164,13 @@ class SweepStudy:
             except (ValueError, TypeError, OverflowError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
         columns = [name for one in found for name in one.columns]
-        for key, names in _keys_of(self.table or {}).items():
+        for key, names in keys_of(self.table or {}).items():
             try:
                 targets = self._targets(key)
                 if key in self.vary or set(names) & set(columns):
                     raise ValueError("is given in vary, too")
                 factor = scales_tensor(self.scene, key)
-                found.append(_tabulated(key, names, targets, factor))
+                found.append(tabulated(key, names, targets, factor))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
         if not found:
@@ -227,7 +221,7 @@ class SweepStudy:
         if isinstance(self.torque, SineTorque):
             values["torque"] = values_of(self.torque)
         if self.table is not None:
-            values["table"] = {key: _digest(np.asarray(x)) for key, x in self.table.items()}
+            values["table"] = {key: digest_of(np.asarray(x)) for key, x in self.table.items()}
         document: dict[str, Any] = plain(values)
         return document
 
@@ -247,71 +241,3 @@ class SweepStudy:
         if key.partition(".")[0] == "torque" and self.control is not None:
             raise ValueError("has no effect: the controller gives the torques")
         return targets_of(self.model_scene, key)
-
-    def _problems(self) -> Any:
-        checks = {
-            "n": (self.n, 1, MOST_ROWS), "seed": (self.seed, 0, 2**64 - 1),
-            "steps": (self.steps, 1, 10_000_000), "chunk": (self.chunk, 1, 10_000_000),
-        }  # fmt: skip
-        for name, (value, least, most) in checks.items():
-            if value is None and name in ("n", "steps"):
-                continue
-            if type(value) is not int or not least <= value <= most:
-                yield Problem(name, value, f"must be a whole number from {least} to {most}")
-        for name, number in (("duration", self.duration), ("tolerance", self.tolerance)):
-            real = isinstance(number, (int, float)) and math.isfinite(number) and number > 0.0
-            if number is not None and not real:
-                yield Problem(name, number, "must be a finite number > 0")
-        if self.sampling not in SAMPLINGS:
-            yield Problem("sampling", self.sampling, f"must be one of {', '.join(SAMPLINGS)}")
-        for name in self.outputs:
-            if name not in OUTPUTS:
-                yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
-        if self.torque is not None and self.control is not None:
-            yield Problem("torque", "given", "has no effect: the controller gives the torques")
-        constant = not isinstance(self.torque, (Mapping, SineTorque, type(None)))
-        if constant and (np.shape(self.torque) != (3,) or not np.all(np.isfinite(self.torque))):
-            yield Problem("torque", self.torque, "must be three finite numbers [N m] or a mapping")
-        if self.trajectory is not None:
-            good = isinstance(self.trajectory, Mapping) and self.trajectory.keys() == {
-                "rows",
-                "samples",
-            }
-            if not good or not all(
-                type(x) is int and 1 <= x <= 100_000 for x in self.trajectory.values()
-            ):
-                allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
-                yield Problem("trajectory", self.trajectory, allowed)
-
-
-def _keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Columns of a table by key: a trailing index is that of a component."""
-    found: dict[str, list[str]] = {}
-    for name in table:
-        found.setdefault(re.sub(r"(\[\d+\])+$", "", name), []).append(name)
-    return found
-
-
-def _tabulated(key: str, names: list[str], targets: list[Target], factor: bool) -> Variation:
-    shape = () if factor else targets[0].nominal.shape
-    expected = [key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
-    if names != expected:
-        raise ValueError(f"needs the columns {', '.join(expected)}")
-    return Variation(key, "table", np.empty((0, 1)), tuple(names), tuple(targets), factor)
-
-
-def _read_table(path: Path) -> dict[str, Array]:
-    """Read the columns of a CSV or Parquet file."""
-    from sst_ros.extras import require
-
-    pandas = require("pandas")
-    try:
-        frame = pandas.read_parquet(path) if path.suffix == ".parquet" else pandas.read_csv(path)
-        return {str(name): frame[name].to_numpy(dtype=float) for name in frame}
-    except (OSError, ValueError) as error:
-        allowed = f"must be a readable .csv or .parquet file of numbers ({error})"
-        raise InputError("sweep", [Problem("table", str(path), allowed)]) from None
-
-
-def _digest(values: Array) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values, dtype=float).tobytes()).hexdigest()[:24]

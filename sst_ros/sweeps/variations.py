@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Section, Spec, specs
@@ -55,11 +54,6 @@ class Variation:
     columns: tuple[str, ...]
     targets: tuple[Target, ...]
     factor: bool
-
-    @property
-    def bounded(self) -> bool:
-        """Whether all values lie between known ends."""
-        return bool(np.all(np.isfinite(self.numbers)))
 
     def values(self, quantiles: Array) -> Array:
         """Values, shape (n, components), at quantiles in (0, 1) of the same shape."""
@@ -233,8 +227,3 @@ def _refuse_ends(kind: str, values: Array, targets: Sequence[Target], factor: bo
 
 def _indices(shape: tuple[int, ...]) -> list[str]:
     return ["".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
-
-
-def refused(origin: str, key: str, value: object, allowed: str) -> InputError:
-    """Return the error of one value of a study."""
-    return InputError(origin, [Problem(key, value, allowed)])

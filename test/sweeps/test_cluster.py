@@ -19,11 +19,12 @@ from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.local_engine import SweepFailed
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
+from test.sweeps.tables import same
 
 for module in ("numba", "distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]
 LIMIT_S = 60
 VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
 STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
@@ -121,13 +122,6 @@ def until(condition):
     while not condition():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.02)
-
-
-def same(one, other):
-    assert list(one.columns) == list(other.columns)
-    assert one["reason"].tolist() == other["reason"].tolist()
-    for name in set(one.columns) - {"reason"}:
-        assert one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes(), name
 
 
 def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
