@@ -42,7 +42,7 @@ VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
 MUJOCO_STEPS = 2780
 """Steps, with the softness below, by which rollout reaches 1e-6 rad soonest (docs/peers.csv)."""
 
-HASHES = 8_000_000
+HASHES = 4_000_000
 """Repetitions of SHA-256, some seconds."""
 
 RUNS = 1e9

@@ -23,13 +23,8 @@ from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Array
 from sst_ros.sweeps import counter_noise
 from sst_ros.sweeps.controlled import ControlledRun
-from sst_ros.sweeps.traced_controller import (
-    GAINS,
-    REFERENCES,
-    TracedController,
-    grouped,
-    reference_table,
-)
+from sst_ros.sweeps.reference_samples import REFERENCES, grouped, reference_table
+from sst_ros.sweeps.traced_controller import GAINS, TracedController
 
 _NOISE = 6
 _NEVER = 2**62

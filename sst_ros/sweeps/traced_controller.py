@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import REST
 from sst_ros.control.star_motions import product
 from sst_ros.dynamics import kernel
@@ -32,8 +31,9 @@ from sst_ros.mechanism.generic_math import (
     sin,
     sqrt,
 )
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.sweeps.controlled import ControlledRun
+from sst_ros.sweeps.reference_samples import Group
 
 NEWTON_STEPS = 5
 """Of the observer at a sample. They square the error; from one sample to the next it is small."""
@@ -41,16 +41,10 @@ NEWTON_STEPS = 5
 _ROUND = 1.5 * 2.0**52
 """Added and subtracted, it rounds to whole numbers, halves to even."""
 
-REFERENCES = (
-    ("first", 1), ("gamma", 3), ("gamma_dot", 3), ("gamma_ddot", 3), ("feedforward", 3),
-    ("held_feedforward", 3), ("quaternion", 4), ("body_rate", 3), ("body_acceleration", 3),
-)  # fmt: skip
 GAINS = (
     ("kp", 3), ("kd", 3), ("inertia", 3), ("integral_rate", 1), ("limit", 1), ("plant_limit", 1),
     ("angle_noise", 1), ("rate_noise", 1),
 )  # fmt: skip
-
-Group = dict[str, tuple[Any, ...]]
 
 
 class TracedController(NamedTuple):
@@ -230,36 +224,6 @@ class TracedController(NamedTuple):
         proportional = _three(k * e for k, e in zip(gains["kp"], leaning, strict=True))
         derivative = _three(k * e for k, e in zip(gains["kd"], rates, strict=True))
         return added(proportional, derivative), error
-
-
-def reference_table(loop: ControlledRun, samples: int) -> Array:
-    """Return the references of samples 0 to `samples`, shape (samples + 1, n)."""
-    inverse, period = InverseDynamics(loop.model), loop.channel.period
-    feeding = loop.settings.mode not in ("pd", "gravity_pd")
-    middle = loop.settings.feedforward_at == "middle"
-    rows = []
-    for k in range(samples + 1):
-        at = loop.motion.at(k * round(period * 1e9) / 1e9)
-        torque = inverse.reference_torque(at) if feeding else REST
-        held = torque
-        if feeding and middle:
-            held = inverse.reference_torque(
-                loop.motion.at(k * round(period * 1e9) / 1e9 + 0.5 * period)
-            )
-        rows.append(
-            (float(k == 0), *at.gamma, *at.gamma_dot, *at.gamma_ddot, *torque, *held,
-             *at.quaternion, *at.body_rate, *at.body_acceleration)
-        )  # fmt: skip
-    return np.array(rows)
-
-
-def grouped(names: Sequence[tuple[str, int]], numbers: Sequence[Any]) -> Group:
-    """Divide numbers into groups of the sizes given."""
-    found, at = {}, 0
-    for name, size in names:
-        found[name] = tuple(numbers[at : at + size])
-        at += size
-    return found
 
 
 def _rotation_vector(q: tuple[Any, ...]) -> Any:
