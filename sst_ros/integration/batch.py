@@ -131,8 +131,8 @@ class Batch:
         _refuse_bad_steps(step, count, keep_every, threads)
         y, code = self.start(gamma, gamma_dot, progress=progress)
 
-        def advance(first: int, span: int, h: float, *arrays: Any, rows: Any) -> None:
-            self.advance(first, span, h, *arrays, threads=threads if rows is None else 1)
+        def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
+            self.advance(first, count, step, *arrays, threads=threads if rows is None else 1)
 
         return integrated(
             self.model, self.columns, (y, code), self.drives(torque, y.shape[1]), advance,

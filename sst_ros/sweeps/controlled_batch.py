@@ -115,16 +115,17 @@ class ControlledBatch:
         step = self.samples * self._loop.channel.period / steps
         memory, gains = self._memory(gamma, rate, count), self._gains(batch, given, count)
 
-        def advance(first: int, span: int, h: float, *arrays: Any, rows: Any) -> None:
-            own, held, begin = (memory, gains, numbers), hold, first
+        def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
+            own: list[Any] = [memory, gains, numbers]
+            held, begin = hold, first
             if rows is not None:  # torques are held while a step is repeated, whenever it was
-                chosen = [np.ascontiguousarray(array[..., rows]) for array in own]
-                own, held, begin = (chosen[0], chosen[1], chosen[2]), _NEVER, 1
+                own = [np.ascontiguousarray(array[..., rows]) for array in own]
+                held, begin = _NEVER, 1
             blocks = -(-arrays[0].shape[1] // SIMD_WIDTH)
             more = held, self._references, *own, self._seed
-            self.module.batch(h, begin, span, 0, blocks, *arrays, *more)
+            self.module.batch(step, begin, count, 0, blocks, *arrays, *more)
             if rows is not None:
-                arrays[3][:] += (first - begin) * h
+                arrays[3][:] += (first - begin) * step
 
         numbers = rows.astype(np.int64)
         result = integrated(
