@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sst_ros import load_scene
+from sst_ros import load_scene, sweep
 from sst_ros.control.controller import MODES, Controller, Measurement
 from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
@@ -157,3 +157,16 @@ REFUSED = [
 def test_bad_loops_are_refused(control, message):
     with pytest.raises(InputError, match=message):
         PreparedSweep(SweepStudy(SCENE, VARY, n=2, control=control, duration=1.0))
+
+
+@pytest.mark.slow
+def test_the_time_at_which_a_controlled_run_leaves_does_not_depend_on_its_steps():
+    rates = [[rate, 0.0, 0.0] for rate in (0.0, 12.0, 20.0, -20.0)]
+    control = {"mode": "gravity_pd", "bandwidth": 5.0, "period": 0.01, "delay": 1}
+    coarse, fine = (
+        sweep("reach", {"initial.gamma_dot": rates}, duration=0.1, control=control, steps=steps)
+        for steps in (10, 80)
+    )
+    assert coarse["reason"].tolist() == fine["reason"].tolist()
+    assert coarse["status"].tolist() == [0, 1, 1, 1]
+    np.testing.assert_allclose(coarse["fault_time"], fine["fault_time"], rtol=0.0, atol=1e-7)
