@@ -16,7 +16,7 @@ from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO, axpy
-from sst_ros.nodes import middleware, parameters, topics
+from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.follow_joint_trajectory import FollowJointTrajectoryServer
 from sst_ros.nodes.messages import diagnostics
@@ -71,8 +71,6 @@ class InverseDynamicsController:
             self._commands.send(ZERO)
         self._report()
         self._print()
-        published = (self._commands.publisher, self._reference, self._error, self._diagnostics)
-        middleware.finish(published)
 
     def _hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does."""

@@ -26,7 +26,7 @@ from rclpy.publisher import Publisher
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
 """Of ROS 2 Kilted."""
 
-ACKNOWLEDGE_S = 1.5
+_ACKNOWLEDGE_S = 1.2
 """A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 
 
@@ -49,9 +49,9 @@ def _generation() -> int:
     return 3 if major >= _FIRST_RCLPY_ON_FAST_DDS_3 else 2
 
 
-def finish(publishers: Iterable[Publisher[Any]], timeout_s: float = ACKNOWLEDGE_S) -> None:
+def finish(publishers: Iterable[Publisher[Any]]) -> None:
     """Wait a while until the subscribers have received what was published."""
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + _ACKNOWLEDGE_S
     for publisher in publishers:
         left = max(0.0, deadline - time.monotonic())
         publisher.wait_for_all_acked(Duration(seconds=left))

@@ -30,7 +30,10 @@ class Worker(Protocol):
     done: threading.Event
 
     def close(self) -> None:
-        """Finish while still connected; raise an SstError where the work has failed."""
+        """Finish while still connected; raise an SstError where the work has failed.
+
+        What it publishes is received by its subscribers before the node leaves.
+        """
 
 
 def run(words: Sequence[str]) -> int:
@@ -83,5 +86,6 @@ def _spin(worker: Worker) -> None:
         try:
             worker.close()
         finally:
+            middleware.finish(worker.node.publishers)
             executor.shutdown()
             worker.node.destroy_node()

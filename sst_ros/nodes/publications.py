@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from sst_ros.description.headers import IDLE_FRAME_ID
 from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem
-from sst_ros.nodes import middleware, topics
+from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
 from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
 from sst_ros.runtime.run_types import HasState
@@ -148,10 +148,6 @@ class SimulatorTopics:
     def rivals(self) -> list[str]:
         """Names of other nodes that publish /clock while this one does."""
         return [] if self._clock is None else self._clock.rivals()
-
-    def finish(self, timeout_s: float = middleware.ACKNOWLEDGE_S) -> None:
-        """Wait until the subscribers have received all messages."""
-        middleware.finish(self._node.publishers, timeout_s)
 
     def _count_subscribers(self, age_ns: int) -> None:
         """Find the topics that are subscribed to, unless that was done so long ago [ns]."""

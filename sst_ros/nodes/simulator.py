@@ -32,7 +32,7 @@ from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 _WATCH_S = 0.1
 _END_S = 0.5
-"""Wait for the thread of the run, and then for subscribers, where a step does not end."""
+"""Wait for the thread of the run, where a step does not end."""
 
 
 class Simulator:
@@ -65,7 +65,7 @@ class Simulator:
         self._thread.start()
 
     def close(self) -> None:
-        """End the run, publish the last diagnostics, wait until subscribers have received all.
+        """End the run, publish the last diagnostics.
 
         Raises:
             SstError: the run has failed.
@@ -73,11 +73,9 @@ class Simulator:
         """
         self._loop.stop()
         self._thread.join(_END_S)
-        stuck = self._thread.is_alive()
-        if not stuck:
+        if not self._thread.is_alive():
             self._read_gauges()
         self._report()
-        self._topics.finish(*((_END_S,) if stuck else ()))
         if self._code is not None:
             self._code.start()
         print("\n".join(self._diagnostics.table()), flush=True)

@@ -30,6 +30,9 @@ from sst_ros.nodes import middleware  # noqa: E402
 
 DOMAINS = itertools.cycle(range(1, 101))
 
+# A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # The observer is in this process: it asks the same of the middleware as the nodes do.
 middleware.configure()
 
