@@ -73,6 +73,7 @@ def run(words: Sequence[str]) -> int:
         return 1
     finally:
         rclpy.try_shutdown()
+        signals.ignore()
     return 0
 
 

@@ -20,7 +20,14 @@ def test_two_simulators_do_not_hear_each_other(nodes, observer):
     places = ("/left", "/right")
     started = {
         place: nodes.start(
-            "simulator", "--ros-args", "-r", f"__ns:={place}", "-p", "wait_for_command:=true"
+            "simulator",
+            "--ros-args",
+            "-r",
+            f"__ns:={place}",
+            "-p",
+            "wait_for_command:=true",
+            "-p",
+            "duration:=0.0",
         )
         for place in places
     }

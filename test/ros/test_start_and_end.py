@@ -161,6 +161,22 @@ def test_ctrl_c_while_python_starts_a_node_of_ros2_run_ends_it(nodes, delay):
     assert status in (0, -signal.SIGINT) and err == ""
 
 
+def test_a_signal_while_python_exits_changes_nothing(domain):
+    code = (
+        "import atexit, os, signal, sys\n"
+        "from sst_ros.nodes.process import run\n"
+        "status = run(['simulator', '--ros-args', '-p', 'duration:=0.01'])\n"
+        "class Late:\n"
+        "    def __del__(self, kill=os.kill, own=os.getpid(), number=signal.SIGINT):\n"
+        "        kill(own, number)\n"
+        "sys.late = Late()\n"  # deleted after the handlers of Python have gone
+        "sys.exit(status)\n"
+    )
+    env = {**os.environ, "SST_ROS_NUMBA": "0"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+
+
 def test_signals_are_handled_before_what_takes_time_to_import():
     code = (
         "import sys; before = set(sys.modules); from sst_ros.nodes import signals; "
