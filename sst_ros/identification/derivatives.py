@@ -9,16 +9,12 @@ Torques that are held ask for the mean of the equation over each interval (weak 
 test function). Two Gauss points take it: there the second derivative of a cubic Hermite spline is
 of third order, and the errors of the pair cancel, so that the mean is of fourth order in the period
 although the acceleration jumps at each sample.
-
-Bias: noise of variance s^2 in the angles leaves the acceleration with s^2 (2 pi f)^4 (2 f / 5 f_s),
-f the cut-off and f_s the rate of samples. In the regressor it shrinks estimates by its share of the
-power of the acceleration (errors in variables). For 65,536 counts, 1 kHz, 20 Hz and 10 rad/s^2 RMS
-that is 2e-5, below the standard deviation from 1 % of noise of the torque, 2e-4 at 10 s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +22,7 @@ from numpy.typing import NDArray
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.errors import AssemblyError, InputError, Problem
 from sst_ros.identification.measured_motion import MeasuredMotion
+from sst_ros.identification.sine_components import BAND
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.direct_kinematics import cross, turned
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -33,6 +30,25 @@ from sst_ros.mechanism.geometry import Array, Geometry
 
 States = tuple[Array, Array, Array]
 """Quaternions (n, 4), W (n, 3) and W_dot (n, 3) in {E}."""
+
+
+class Equations(NamedTuple):
+    """Where the equation of motion is asked for.
+
+    Attributes:
+        states: g m of them; those of a row of torques follow each other, and its equation is their
+            mean.
+        rows: of the torques that they belong to, shape (m,).
+        group: g.
+        band: frequency up to which the equations are sound where angles were filtered [Hz].
+
+    """
+
+    states: States
+    rows: NDArray[np.intp]
+    group: int
+    band: float | None
+
 
 ORDER = 4
 MARGIN = 10.0
@@ -48,7 +64,7 @@ _EDGE = 8
 
 def equations(
     measured: MeasuredMotion, geometry: Geometry, cutoff: float | None = None
-) -> tuple[States, NDArray[np.intp], int]:
+) -> Equations:
     """States and the rows of torques that belong to them.
 
     Args:
@@ -56,10 +72,6 @@ def equations(
         geometry: base triangle and star.
         cutoff: of the filter [Hz]; by default none where rates were measured, else MARGIN times
             the bandwidth of the motion.
-
-    Returns:
-        States (g m of them), the rows of `measured.torque` that they belong to (m,), and g: the
-        states of a row follow each other, and its equation is their mean.
 
     Raises:
         InputError: no assembly of the manipulator has these angles, or samples are not evenly
@@ -78,7 +90,11 @@ def equations(
     quaternion = orientations(geometry, gamma, measured.quaternion, measured.gamma[0])
     found = ActuatorSpaceMap(geometry).star_rates(*quaternion.T, *rate.T, *acceleration.T)
     star = np.stack(found, axis=1)
-    return (quaternion, star[:, :3], star[:, 3:]), rows, int(times.shape[1])
+    band = None
+    if cutoff is not None or measured.gamma_dot is None:
+        band = min(BAND * bandwidth(float(np.median(np.diff(t))), measured.gamma), cutoff or np.inf)
+    states = quaternion, star[:, :3], star[:, 3:]
+    return Equations(states, rows, int(times.shape[1]), band)
 
 
 def orientations(geometry: Geometry, gamma: Array, quaternion: Array | None, first: Array) -> Array:

@@ -2,7 +2,8 @@
 """Weighted linear least squares: estimates, their covariance, the condition of the problem.
 
 The variance of the noise differs between actuators; it is estimated from the residuals of an
-unweighted fit, by which the equations are then divided (Gautier 1997; Swevers, Verdonck and
+unweighted fit, over the equations of the actuator less the unknowns that they determine (their
+leverage), and the equations are then divided by it (Gautier 1997; Swevers, Verdonck and
 De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71).
 """
 
@@ -19,6 +20,9 @@ EXACT = 1e-12
 """Noise over RMS torque that is assumed at least: data of a simulation have no other."""
 
 
+_WEIGHTINGS = 2
+
+
 @dataclass(frozen=True)
 class LinearFit:
     """Estimates of b numbers.
@@ -28,7 +32,7 @@ class LinearFit:
         covariance: shape (b, b).
         root: R of the weighted regressor, R^T R = covariance^-1, shape (b, b).
         noise: standard deviation of the residuals of each actuator [N m], shape (3,).
-        residual: measured less predicted torques [N m], shape (m, 3).
+        residual: measured less predicted torques [N m] of the m equations, shape (m, 3).
         condition: of the weighted regressor with columns of length one.
 
     """
@@ -57,24 +61,21 @@ def weighted_fit(columns: Array, torque: Array, noise: Array | None = None) -> L
     """
     floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
     if noise is None:
-        first, _, _ = _solved(columns, torque, np.ones(3))
-        weights = _noise(torque - columns @ first, len(first), floor)
-        second, _, _ = _solved(columns, torque, weights)
-        noise = _noise(torque - columns @ second, len(second), floor)
-    estimate, root, condition = _solved(columns, torque, noise)
+        noise = np.ones(3)
+        for _ in range(_WEIGHTINGS):
+            estimate, _, leverage = _solved(columns, torque, noise)
+            free = np.maximum(len(torque) - leverage, 1.0)
+            squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
+            noise = np.maximum(np.sqrt(squares / free), floor)
+    estimate, root, _ = _solved(columns, torque, noise)
+    condition = float(np.linalg.cond(root / np.linalg.norm(root, axis=0)))
     inverse = solve_triangular(root, np.eye(len(root)))
     residual = torque - columns @ estimate
     return LinearFit(estimate, inverse @ inverse.T, root, noise, residual, condition)
 
 
-def _noise(residual: Array, unknowns: int, floor: float) -> Array:
-    """Return the standard deviation of each actuator; the unknowns are shared out between them."""
-    free = max(len(residual) - unknowns / 3.0, 1.0)
-    return np.asarray(np.maximum(np.sqrt(np.sum(residual**2, axis=0) / free), floor))
-
-
-def _solved(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, float]:
-    """Estimate, R of the weighted regressor, and its condition with columns of length one."""
+def _solved(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """Estimate, R of the weighted regressor, and the unknowns that each actuator determines."""
     matrix = (columns / noise[:, None]).reshape(-1, columns.shape[-1])
     right = (torque / noise).ravel()
     lengths = np.linalg.norm(matrix, axis=0)
@@ -82,4 +83,5 @@ def _solved(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, 
     estimate = solve_triangular(r, q.T @ right)
     # One step of refinement: noise-free data are fitted to rounding.
     estimate = estimate + solve_triangular(r, q.T @ (right - matrix / lengths @ estimate))
-    return estimate / lengths, r * lengths, float(np.linalg.cond(r))
+    leverage = np.sum((q**2).reshape(-1, 3, len(r)), axis=(0, 2))
+    return estimate / lengths, r * lengths, leverage

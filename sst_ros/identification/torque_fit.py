@@ -17,6 +17,7 @@ from sst_ros.identification.identification import Identification
 from sst_ros.identification.least_squares import LinearFit, weighted_fit
 from sst_ros.identification.measured_motion import Measured, measured_motion
 from sst_ros.identification.regressor import Regressor
+from sst_ros.identification.sine_components import components
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 
@@ -36,6 +37,8 @@ class TorqueFit(Identification):
         fit: their estimates, without the constraint that bodies can exist.
         excess: chi^2 of `values` against these estimates.
         vague: combinations whose standard deviation exceeds their size.
+        samples: of the torques that were fitted.
+        band: frequency below which they were [Hz]; None where angles were not filtered.
         regressor: of the torques.
 
     """
@@ -44,6 +47,8 @@ class TorqueFit(Identification):
     fit: LinearFit
     excess: float
     vague: tuple[str, ...]
+    samples: int
+    band: float | None
     regressor: Regressor
 
     @property
@@ -83,14 +88,15 @@ class TorqueFit(Identification):
 
         """
         measured = measured_motion(data, self.given)
-        states, rows, group = equations(measured, Geometry.of(self.given), cutoff)
+        states, rows, group, _ = equations(measured, Geometry.of(self.given), cutoff)
         known, columns = self.regressor(*states)
         torque = known + self.base.of_columns(columns) @ self.estimate
         return torque.reshape(-1, group, 3).mean(axis=1), measured.torque[rows]
 
     def _notes(self) -> Iterator[str]:
         noise = ", ".join(f"{value:.3g}" for value in self.fit.noise)
-        yield f"{len(self.fit.residual)} samples; noise of the torques {noise} N m (std. dev.)"
+        band = "" if self.band is None else f", frequencies up to {self.band:.3g} Hz"
+        yield f"{self.samples} samples{band}; noise of the torques {noise} N m (std. dev.)"
         yield f"condition number {self.fit.condition:.3g} (columns of length one)"
         pairs = np.abs(np.triu(self.correlation, 1))
         if pairs.size > 1:
@@ -124,7 +130,7 @@ def fit_torques(
         allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
         raise InputError("identify", [Problem("gamma", moved, allowed)])
     regressor = Regressor(scene, names)
-    states, rows, group = equations(measured, Geometry.of(scene), cutoff)
+    states, rows, group, band = equations(measured, Geometry.of(scene), cutoff)
     known, columns = regressor(*states)
     known = known.reshape(-1, group, 3).mean(axis=1)
     columns = columns.reshape(-1, group, 3, len(names)).mean(axis=1)
@@ -139,6 +145,10 @@ def fit_torques(
     if len(torque) <= len(names):
         allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
         raise InputError("identify", [Problem("t", len(torque), allowed)])
+    samples = len(torque)
+    if band is not None:
+        period = float(np.median(np.diff(measured.t)))
+        torque, columns = (components(one, band, period, len(names)) for one in (torque, columns))
     base = independent(columns, names)
     if not base.chosen:
         allowed = "must determine something: no torque depends on these parameters here"
@@ -152,7 +162,7 @@ def fit_torques(
     all_of = structural(regressor)
     lost = [i not in base.chosen for i in all_of.chosen]
     vague = fit.deviation > scales(names, given)[list(base.chosen)]
-    note = f"identified from {len(torque)} samples"
+    note = f"identified from {samples} samples"
     return TorqueFit(
         scene=parameters.with_parameters(scene, names, values, note),
         given=scene,
@@ -164,6 +174,8 @@ def fit_torques(
         fit=fit,
         excess=excess,
         vague=_chosen(base.labels, vague.tolist()),
+        samples=samples,
+        band=band,
         regressor=regressor,
     )
 

@@ -19,13 +19,12 @@ NORMAL_95 = 1.96
 
 
 class Measured:
-    """Torques and angles of a motion of `reach`, exact, and as encoders and sensors give them."""
+    """Torques and angles of a motion, exact, and as encoders and sensors give them."""
 
-    def __init__(self, seconds, rate):
-        self.plant = manipulators.sweeping(load_scene("reach"), seconds, speed=1.0)
-        self.model = manipulators.wrong(self.plant)
-        motion, inverse = reference_motion(self.plant), InverseDynamics(self.plant)
-        self.t = np.arange(0.0, seconds, 1.0 / rate)
+    def __init__(self, plant, model, noise=NOISE):
+        self.plant, self.model, self.noise = plant, model, noise
+        motion, inverse = reference_motion(plant), InverseDynamics(plant)
+        self.t = np.arange(0.0, motion.duration, 1e-3)
         references = [motion.at(t) for t in self.t.tolist()]
         self.gamma = np.array([one.gamma for one in references])
         self.torque = np.array([inverse.reference_torque(one) for one in references])
@@ -35,13 +34,15 @@ class Measured:
         rng = np.random.default_rng(seed)
         zero = rng.uniform(0.0, COUNT, 3)
         gamma = COUNT * (np.floor((self.gamma + zero) / COUNT) + 0.5) - zero
-        noise = rng.normal(size=self.torque.shape) * NOISE * np.abs(self.torque).max(axis=0)
+        noise = rng.normal(size=self.torque.shape) * self.noise * np.abs(self.torque).max(axis=0)
         return {"t": self.t, "gamma": gamma, "torque": self.torque + noise}
 
 
 @cache
-def measured(seconds=6.0, rate=1000.0):
-    return Measured(seconds, rate)
+def measured():
+    """Six seconds of chirps of `reach`."""
+    plant = manipulators.sweeping(load_scene("reach"), 6.0, speed=1.0)
+    return Measured(plant, manipulators.wrong(plant))
 
 
 def errors(case, seeds):
@@ -83,6 +84,18 @@ def test_200_recordings_are_covered_by_their_95_percent_intervals():
     assert np.abs(z.mean(axis=0)).max() < 0.3
 
 
+def test_a_short_recording_is_biased_by_less_than_the_standard_deviation():
+    """In 1.2 s of `reach` the star hardly turns about its axis; torques have little noise."""
+    plant = load_scene("reach")
+    case = Measured(plant, manipulators.wrong(plant), noise=0.004)
+    z = errors(case, range(20))
+    assert z.shape[1] > 10
+    assert np.abs(z.mean(axis=0)).max() < 0.6
+    assert np.mean(np.abs(z) < NORMAL_95) > 0.9
+    assert np.abs(z).max() < 4.0
+    assert np.sqrt(np.mean(z**2)) > 0.5  # deviations are not bought by exaggeration
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_feedforward_errs_twenty_times_less_than_with_the_wrong_model(seed):
     assert improvement(measured(), seed) > 20.0
@@ -90,11 +103,14 @@ def test_feedforward_errs_twenty_times_less_than_with_the_wrong_model(seed):
 
 def test_noise_is_found_and_may_be_given():
     case = measured()
-    found = identify(case.recording(0), case.model)
+    several = [identify(case.recording(seed), case.model) for seed in range(6)]
+    found = several[0]
     true = NOISE * np.abs(case.torque).max(axis=0)
-    assert found.fit.noise == pytest.approx(true, rel=0.1)  # and some of the angles
-    given = identify(case.recording(0), case.model, noise=2.0 * true)
-    assert given.deviation == pytest.approx(2.0 * found.deviation, rel=0.05)
+    # One estimate, by some 40 equations of an actuator, errs by 11 %, the mean of six by 5 %.
+    assert np.mean([one.fit.noise for one in several], axis=0) == pytest.approx(true, rel=0.1)
+    given = identify(case.recording(0), case.model, noise=2.0 * found.fit.noise)
+    assert given.deviation == pytest.approx(2.0 * found.deviation, rel=1e-9)
+    assert given.estimate == pytest.approx(found.estimate, rel=1e-9, abs=1e-12)
     assert found.consistent
     assert np.all(np.abs(np.diag(found.correlation) - 1.0) < 1e-12)
 
