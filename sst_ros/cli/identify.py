@@ -11,6 +11,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.output_folder import require_free, writing
 
 DESIGN = "design"
+INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"
 
 
 def add(commands: Commands) -> None:
@@ -20,8 +21,9 @@ def add(commands: Commands) -> None:
         help="identify inertias, friction and more from a recorded run; design excitation motions",
         description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
         "what the motion determines, with standard deviations, and the nearest scene whose bodies "
-        "can exist. `identify design SCENE` makes a motion that determines the parameters well, "
-        "within stroke, workspace and the limits of the actuators.",
+        "can exist. With --method simulation the motion is integrated and fitted to the recorded "
+        "angles, by any numbers of the scene. `identify design SCENE` makes a motion that "
+        "determines the parameters well, within stroke, workspace and the limits of the actuators.",
     )
     identify.add_argument("bag", metavar="BAG", help="folder of the bag, or the word design")
     add_scene(
@@ -35,7 +37,12 @@ def add(commands: Commands) -> None:
     identify.add_argument(
         "--parameters", nargs="+", metavar="P",
         help="unknowns by the beginning of their names, as in: star friction.gamma offset; "
-        "default: bodies, friction, springs and rotors of the scene",
+        "default: bodies, friction, springs and rotors of the scene; by simulation full names, as "
+        "in: friction.gamma.smoothing stroke.restitution",
+    )  # fmt: skip
+    identify.add_argument(
+        "--method", choices=(INVERSE_DYNAMICS, SIMULATION),
+        help=f"default: {INVERSE_DYNAMICS}",
     )  # fmt: skip
     identify.add_argument(
         "--cutoff", type=float, metavar="HZ",
@@ -55,7 +62,7 @@ def add(commands: Commands) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     designing = options.bag == DESIGN
-    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene")
+    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
     wrong = [
         Problem(f"--{name}", getattr(options, name), f"is no option of identify {form}")
         for name in (others if designing else ours)
@@ -71,20 +78,17 @@ def _identify(options: argparse.Namespace) -> None:
     from sst_ros.scene.scene import load
     from sst_ros.scene.yaml_document import dump
 
+    names = ours if designing else others
+    chosen = {name: value for name in names if (value := getattr(options, name)) is not None}
     if designing:
         from sst_ros.identification.excitation import design
 
-        given = {name: getattr(options, name) for name in ours}
-        chosen = {name: value for name, value in given.items() if value is not None}
         motion = design(load(options.designed), options.parameters, **chosen)
         table, scene = motion.table(), motion.scene
     else:
         from sst_ros.identification.identify import identify
 
-        found = identify(
-            options.bag, options.scene, options.parameters,
-            cutoff=options.cutoff, delay=options.delay or 0.0,
-        )  # fmt: skip
+        found = identify(options.bag, parameters=options.parameters, **chosen)
         table, scene = found.table(), found.scene
     print(table, end="")
     if options.out is not None:

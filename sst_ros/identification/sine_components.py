@@ -17,8 +17,8 @@ no noise of the rates there, as cosines, or sums of samples, would.
 
 Below the frequency f, the noise of the acceleration has the variance s^2 (2 pi f)^4 (2 f / 5 f_s),
 with f_s the rate of samples: a band three times the bandwidth of the motion has 400 times less
-of it than the filter of the angles leaves at ten times. In 1.2 s of the scene `reach` with encoders of
-65,536 counts the bias is then 0.3 standard deviations at most, and without the projection 6.
+of it than the filter of the angles leaves at ten times. In 1.2 s of the scene `reach` with encoders
+of 65,536 counts the bias is then 0.3 standard deviations at most, and without the projection 6.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ from identification import manipulators
 
 from sst_ros import load_scene
 from sst_ros.cli.main import run
+from sst_ros.scene.yaml_document import dump
 
 
 def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
@@ -24,6 +25,22 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
+def test_a_recording_is_fitted_by_simulation(written, example2, tmp_path, capsys):
+    guess = tmp_path / "guess.yaml"
+    changed = load_scene("example2").with_values({"star.inertia.zz": 0.25})
+    guess.write_text(dump(changed), encoding="utf-8")
+    words = ["identify", str(written(example2)), "--scene", str(guess), "--method", "simulation"]
+    out = tmp_path / "identified.yaml"
+    assert run([*words, "--parameters", "star.inertia.zz", "--out", str(out)]) == 0
+    assert "known to" in capsys.readouterr().out
+    expected = load_scene("example2").star.inertia.zz
+    assert load_scene(out).star.inertia.zz == pytest.approx(expected, rel=1e-8)
+    assert run(words) == 1
+    assert "must be keys of numbers of the scene" in capsys.readouterr().err
+    assert run([*words, "--parameters", "star.inertia.zz", "--cutoff", "3"]) == 1
+    assert "takes no cutoff" in capsys.readouterr().err
+
+
 def test_a_scene_becomes_a_motion(tmp_path, capsys):
     out = tmp_path / "exciting.yaml"
     words = ["identify", "design", "example2", "--duration", "1", "--harmonics", "3"]
@@ -38,6 +55,7 @@ def test_a_scene_becomes_a_motion(tmp_path, capsys):
         (["design"], "must be given after design"),
         (["bag", "reach"], "only there"),
         (["design", "reach", "--cutoff", "3"], "is no option of identify design"),
+        (["design", "reach", "--method", "simulation"], "is no option of identify design"),
         (["bag", "--seed", "3"], "is no option of identify BAG"),
         (["nowhere"], "nowhere"),
     ],
@@ -48,8 +66,6 @@ def test_what_does_not_fit_is_refused(words, message, capsys):
 
 
 def test_a_recording_of_another_manipulator_is_refused(written, example2, tmp_path, capsys):
-    from sst_ros.scene.yaml_document import dump
-
     other = tmp_path / "other.yaml"
     other.write_text(dump(manipulators.general()), encoding="utf-8")
     assert run(["identify", str(written(example2)), "--scene", str(other)]) == 1
