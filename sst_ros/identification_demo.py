@@ -19,7 +19,8 @@ from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
-from sst_ros.identification.parameters import INERTIA, value_of, with_numbers
+from sst_ros.identification.parameters import INERTIA
+from sst_ros.identification.scene_numbers import value_of, with_numbers
 from sst_ros.plot.identification import draw_tracking_errors
 from sst_ros.plot.style import save_figure
 from sst_ros.recording.recording import read as read_bag

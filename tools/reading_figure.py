@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.identification.parameters import value_of
 from sst_ros.identification.readings import readings
+from sst_ros.identification.scene_numbers import value_of
 from sst_ros.identification.sensitivities import Sensitivities
 from sst_ros.identification.simulation_fit import combination
 from sst_ros.mechanism.geometry import Array

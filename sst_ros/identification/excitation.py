@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exciting motions: Fourier series of the actuators that make parameters well determined.
 
-gamma_k(t) = c_k + sum over n of a_nk sin(n w t) + b_nk cos(n w t), w = 2 pi / duration (Swevers,
-Ganseman, Tukel, De Schutter and Van Brussel, IEEE Trans. Robotics Autom. 13 (1997) 730-740). The
-coefficients are taken from the subspace in which the motion begins and ends at rest: gamma = c,
-gamma_dot = gamma_ddot = 0. They minimise
+The coefficients of `FourierSeries` minimise
 
     log condition number + mean log standard deviation
 
@@ -19,7 +16,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
@@ -29,6 +25,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, MotionRefused, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.base_parameters import BaseParameters, structural
+from sst_ros.identification.fourier_series import FourierSeries
 from sst_ros.identification.regressor import Regressor
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import cross, turned
@@ -39,9 +36,6 @@ from sst_ros.scene.scene import Scene
 
 SHARE = 0.9
 """Share of each range that the motion may use: the manipulator is not quite its model."""
-
-POINTS = 12
-"""Samples, and points of the scene, in a period of the highest harmonic."""
 
 LEAST_SINE = 0.15
 """Least sin(mu_k) and det J2 of a motion: torques and rates grow with their inverse."""
@@ -110,7 +104,7 @@ def design(
         problems.append(Problem("harmonics", harmonics, "must be from 3 to 30"))
     if problems:
         raise InputError("identify design", problems)
-    series = _Series(duration, harmonics, np.array(scene.initial.gamma))
+    series = FourierSeries(duration, harmonics, np.array(scene.initial.gamma))
     cost = _Cost(scene, parameters.selected(scene, wanted), series)
     free = np.random.default_rng(seed).normal(size=series.size)
     free *= _FIRST / np.abs(series.at(free, series.times)[0] - series.centre).max()
@@ -126,36 +120,10 @@ def design(
     ])  # fmt: skip
 
 
-class _Series:
-    """Fourier series that begin and end at rest, as functions of free numbers."""
-
-    def __init__(self, duration: float, harmonics: int, centre: Array) -> None:
-        self.duration, self.centre = duration, centre
-        n = np.arange(1, harmonics + 1)
-        self._frequency = 2.0 * np.pi * n / duration
-        rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
-        rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
-        self._basis = null_space(rest)
-        self.size = 3 * self._basis.shape[1]
-        count = POINTS * harmonics
-        self.times = np.arange(1, count + 1) * duration / count
-
-    def at(self, free: Array, t: Array) -> tuple[Array, Array, Array]:
-        """Angles [rad] and two derivatives at the times t [s], each shape (len(t), 3)."""
-        sine, cosine = np.split(self._basis @ free.reshape(-1, 3), 2)
-        w = self._frequency
-        s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
-        return (
-            self.centre + s @ sine + c @ cosine,
-            (c * w) @ sine - (s * w) @ cosine,
-            -(s * w * w) @ sine - (c * w * w) @ cosine,
-        )
-
-
 class _Cost:
     """What the optimisation minimises."""
 
-    def __init__(self, scene: Scene, names: tuple[str, ...], series: _Series) -> None:
+    def __init__(self, scene: Scene, names: tuple[str, ...], series: FourierSeries) -> None:
         self._scene, self._series = scene, series
         self._regressor = Regressor(scene, names)
         self._base = structural(self._regressor)
@@ -243,7 +211,7 @@ class _Cost:
         return np.asarray(rotation)
 
 
-def _scene(scene: Scene, series: _Series, free: Array) -> Scene:
+def _scene(scene: Scene, series: FourierSeries, free: Array) -> Scene:
     """Return the scene with the motion as waypoints, quintic between them."""
     rows = zip(series.times.tolist(), *(x.tolist() for x in series.at(free, series.times)),
                strict=True)  # fmt: skip

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.identification.scene_numbers import JOINT_KINDS, at, opened, set_number
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.bodies import Inertia, Link, Star
+from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section
 from sst_ros.scene.values import replaced
 from sst_ros.scene.yaml_document import from_values, values_of
 
@@ -29,7 +27,6 @@ STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" f
 """The ten inertial parameters of a body about O, in the order of a body's columns."""
 
 LINKS = ("actuated_links", "intermediate_links")
-JOINT_KINDS = ("gamma", "mu", "beta")
 NEGLIGIBLE = 1e-12
 """Friction coefficient [N m, N m s/rad] below which a scene has no such friction."""
 
@@ -91,17 +88,17 @@ def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = Fa
         moments: bodies have mass 1, so that "centre" is mass times centre.
 
     """
-    opened = _opened(scene)
+    result = opened(scene)
     if moments:
-        for body in (opened.star, *opened.actuated_links, *opened.intermediate_links):
+        for body in (result.star, *result.actuated_links, *result.intermediate_links):
             body.centre = [body.mass * part for part in body.centre]
             body.mass = 1.0
     for name, symbol in symbols.items():
         if moments and name.endswith(".mass"):
             continue  # torques depend on mass times centre alone
         name = re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
-        _set(opened, re.findall(r"\w+", name), symbol)
-    return opened
+        set_number(result, re.findall(r"\w+", name), symbol)
+    return result
 
 
 def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: str) -> Scene:
@@ -192,92 +189,12 @@ def _body(name: str, body: Star | Link, scene: Scene) -> Iterator[str]:
         yield from (f"{name}.{part}" for part in (STANDARD if weighty else STANDARD[4:]))
 
 
-def value_of(scene: Scene, name: str) -> float | None:
-    """Return a number of a scene by its key, the first of a list; None where there is none."""
-    try:
-        value = _at(scene, re.findall(r"\w+", name))
-    except (AttributeError, IndexError, TypeError):
-        return None
-    return float(value) if isinstance(value, (int, float)) else None
-
-
-def with_numbers(scene: Scene, names: Sequence[str], numbers: Array) -> Scene:
-    """Return the scene with other numbers by key; a list without index means all its entries.
-
-    Raises:
-        InputError: the numbers make no scene.
-
-    """
-    document = values_of(scene)
-    for name, number in zip(names, numbers.tolist(), strict=True):
-        _set(document, re.findall(r"\w+", name), number)
-    return from_values(Scene, document, scene.name)
-
-
 def _value(scene: Scene, name: str) -> float:
     words = re.findall(r"\w+", name)
     if words[0] == "offset":
         return 0.0
     if words[-2:-1] == ["moment"] and words[0] != "moment":
-        value = _at(scene, words[:-2])
+        value = at(scene, words[:-2])
         return float(value.mass * value.centre["xyz".index(words[-1])])
-    value = _at(scene, words)
+    value = at(scene, words)
     return 0.0 if value is None else float(value)
-
-
-def _at(value: Any, words: Sequence[str]) -> Any:
-    for word in words:
-        if value is None:
-            return None
-        if isinstance(value, (tuple, list)):
-            if not word.isdigit():
-                value = getattr(value[0], word)
-                continue
-            value = value[int(word)]
-        else:
-            value = getattr(value, word)
-    return value[0] if isinstance(value, (tuple, list)) else value
-
-
-def _opened(value: Any) -> Any:
-    if isinstance(value, Section):
-        return SimpleNamespace(**{f.name: _opened(getattr(value, f.name)) for f in fields(value)})
-    return [_opened(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def _set(value: Any, words: Sequence[str], symbol: Any) -> None:
-    """Set a number; a list without an index means all of its entries."""
-    first, *rest = words
-    if isinstance(value, list):
-        if not first.isdigit():
-            for entry in value:
-                _set(entry, words, symbol)
-        elif rest:
-            _set(value[int(first)], rest, symbol)
-        else:
-            value[int(first)] = symbol
-        return
-    known = value if isinstance(value, dict) else vars(value)
-    if rest:
-        if known.get(first) is None:
-            known[first] = _absent(first)
-        _set(known[first], rest, symbol)
-    elif isinstance(known.get(first), list):
-        known[first] = [symbol] * len(known[first])
-    else:
-        known[first] = symbol
-
-
-def _absent(name: str) -> SimpleNamespace:
-    """Return an empty section for a term that the scene does not have."""
-    from sst_ros.scene.loads import Actuators, Friction
-
-    if name == "friction":
-        return SimpleNamespace(gamma=None, mu=None, beta=None)
-    if name == "inertia":
-        return SimpleNamespace(**dict.fromkeys((f.name for f in fields(Inertia)), 0.0))
-    sections: dict[str, type[Section]] = {
-        "actuators": Actuators,
-        **dict.fromkeys(JOINT_KINDS, Friction),
-    }
-    return SimpleNamespace(**{f.name: f.default for f in fields(sections[name])})

@@ -13,8 +13,9 @@ from sst_ros.errors import InputError
 from sst_ros.identification.base_parameters import BaseParameters
 from sst_ros.identification.consistency import consistent_values, scales
 from sst_ros.identification.least_squares import LinearFit
-from sst_ros.identification.parameters import STANDARD, value_of, with_numbers
+from sst_ros.identification.parameters import STANDARD
 from sst_ros.identification.parameters import values as parameter_values
+from sst_ros.identification.scene_numbers import value_of, with_numbers
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 

@@ -16,11 +16,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.identification import parameters
 from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured
 from sst_ros.identification.possible_scene import possible_scene
 from sst_ros.identification.readings import Readings, readings
+from sst_ros.identification.scene_numbers import value_of
 from sst_ros.identification.sensitivities import Sensitivities
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
@@ -160,7 +160,7 @@ def _residual(motion: Sensitivities, read: Readings, values: Array) -> tuple[Arr
 
 
 def _given(scene: Scene, names: tuple[str, ...]) -> Array:
-    return np.array([parameters.value_of(scene, name) for name in names], dtype=float)
+    return np.array([value_of(scene, name) for name in names], dtype=float)
 
 
 def _positive(name: str) -> bool:
