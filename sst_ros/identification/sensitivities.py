@@ -8,6 +8,10 @@ With y' = f(y, t, p) the sensitivity S = dy/dp obeys the variational equation
 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
 derivatives are those of the traced equation of motion, exact to rounding, and are integrated with
 the motion, so that one error control holds for both.
+
+Where a compliant stop is met or left its torque is zero on both sides: f is continuous, and S as
+well. A jump (saltation) would follow from a jump of f alone (Leine and Nijmeijer, Dynamics and
+Bifurcations of Non-Smooth Mechanical Systems, Springer 2004, section 7.2).
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, comp
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.regressor import present
+from sst_ros.identification.scene_numbers import value_of, with_numbers
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueProfile
@@ -59,7 +64,7 @@ class Sensitivities:
         self._torque, self._geometry = torque, Geometry.of(scene)
         problems = []
         for name in self.names:
-            value = parameters.value_of(scene, name)
+            value = value_of(scene, name)
             if value is None:
                 allowed = "must be the key of a number that the scene has"
                 problems.append(Problem("parameters", name, allowed))
@@ -89,7 +94,7 @@ class Sensitivities:
         # Inertias between iterations of a fit need not be those of bodies that can exist.
         outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
         names = [self.names[i] for i in outer]
-        scene = parameters.with_numbers(self.scene, names, values[outer])
+        scene = with_numbers(self.scene, names, values[outer])
         inner = values[self._inner].copy()
         chain = np.ones(len(values))
         if RESTITUTION in self.names:
