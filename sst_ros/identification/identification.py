@@ -22,6 +22,10 @@ class Identification(ABC):
         given: the scene as it was.
         names: of the parameters, length p.
         values: their values in `scene`, shape (p,).
+        labels: quantities that are estimated: parameters or combinations of them, length b.
+        before: their values in the scene that was given, shape (b,).
+        estimate: their estimates, shape (b,).
+        covariance: of the estimates, shape (b, b).
         undetermined: combinations that this motion leaves open, as text.
         warnings: what else to know.
 
@@ -31,28 +35,12 @@ class Identification(ABC):
     given: Scene
     names: tuple[str, ...]
     values: Array
+    labels: tuple[str, ...]
+    before: Array
+    estimate: Array
+    covariance: Array
     undetermined: tuple[str, ...]
     warnings: tuple[str, ...]
-
-    @property
-    @abstractmethod
-    def labels(self) -> tuple[str, ...]:
-        """Quantities that are estimated, b of them: parameters or combinations of them."""
-
-    @property
-    @abstractmethod
-    def before(self) -> Array:
-        """Their values in the scene that was given, shape (b,)."""
-
-    @property
-    @abstractmethod
-    def estimate(self) -> Array:
-        """Their estimates, shape (b,)."""
-
-    @property
-    @abstractmethod
-    def covariance(self) -> Array:
-        """Covariance of the estimates, shape (b, b)."""
 
     @property
     def deviation(self) -> Array:

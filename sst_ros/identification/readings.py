@@ -91,7 +91,10 @@ def readings(data: Measured, scene: Scene) -> Readings:
     measured = measured_motion(data, scene)
     t = measured.t - measured.t[0]
     torque: TorqueProfile
-    if measured.held:
+    if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
+        begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
+        torque = TorqueTable(begins, data.ticks.torque)
+    elif measured.held:
         torque = TorqueTable(t[:-1], measured.torque)
     else:
         from scipy.interpolate import CubicSpline

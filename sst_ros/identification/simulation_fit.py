@@ -33,11 +33,9 @@ _SHOWN = 0.05
 
 @dataclass(frozen=True)
 class SimulationFit(Identification):
-    """Constants identified by simulation.
+    """Constants identified by simulation; `values` differ from estimates that no body has.
 
     Attributes:
-        fitted: values that fit best, shape (p,); `values` differ where no body has them.
-        spread: covariance of the parameters, shape (p, p), infinite where nothing is known.
         relative: relative standard deviations of the combinations `directions`, rising, (p,).
         directions: combinations as rows, relative changes of the parameters, shape (p, p).
         error: root of the mean square of the residuals in standard deviations, or in [rad], [m]
@@ -45,31 +43,9 @@ class SimulationFit(Identification):
 
     """
 
-    fitted: Array
-    spread: Array
     relative: Array
     directions: Array
     error: float
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.names
-
-    @property
-    def before(self) -> Array:
-        """Values of the scene that was given, shape (p,)."""
-        return _given(self.given, self.names)
-
-    @property
-    def estimate(self) -> Array:
-        """Values that fit best, shape (p,)."""
-        return self.fitted
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the estimates, shape (p, p)."""
-        return self.spread
 
     def _notes(self) -> Iterator[str]:
         yield f"root of the mean square of the residuals {self.error:.3g}"
@@ -89,7 +65,7 @@ def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -
         raise InputError("identify", [Problem("parameters", wanted, allowed)])
     read = readings(data, scene)
     motion = Sensitivities(scene, names, read.torque)
-    given = _given(scene, names)
+    given = np.array([value_of(scene, name) for name in names], dtype=float)
     size = np.abs(given) + (given == 0.0)
 
     known: dict[bytes, tuple[Array, Array]] = {}
@@ -127,10 +103,12 @@ def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -
         given=scene,
         names=names,
         values=values,
+        labels=names,
+        before=given,
+        estimate=fitted,
+        covariance=spread,
         undetermined=tuple(text),
         warnings=warnings,
-        fitted=fitted,
-        spread=spread,
         relative=relative,
         directions=rows,
         error=error,
@@ -157,10 +135,6 @@ def _residual(motion: Sensitivities, read: Readings, values: Array) -> tuple[Arr
     off, by_pose = read.residual(motion.scene, states[:count])
     poses = slopes[:count][read.times_of_residuals][:, :4]
     return off, np.einsum("ri,rip->rp", by_pose, poses)
-
-
-def _given(scene: Scene, names: tuple[str, ...]) -> Array:
-    return np.array([value_of(scene, name) for name in names], dtype=float)
 
 
 def _positive(name: str) -> bool:

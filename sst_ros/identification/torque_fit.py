@@ -52,26 +52,6 @@ class TorqueFit(Identification):
     regressor: Regressor
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        """Base parameters as text."""
-        return self.base.labels
-
-    @property
-    def before(self) -> Array:
-        """Base parameters of the scene that was given, shape (b,)."""
-        return np.asarray(self.base.transform @ parameters.values(self.given, self.names))
-
-    @property
-    def estimate(self) -> Array:
-        """Estimates of the base parameters, shape (b,)."""
-        return self.fit.estimate
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the estimates, shape (b, b)."""
-        return self.fit.covariance
-
-    @property
     def consistent(self) -> bool:
         """Whether bodies that can exist explain the estimates within their uncertainty."""
         return self.excess < SIGNIFICANT
@@ -168,6 +148,10 @@ def fit_torques(
         given=scene,
         names=names,
         values=values,
+        labels=base.labels,
+        before=np.asarray(base.transform @ given),
+        estimate=fit.estimate,
+        covariance=fit.covariance,
         undetermined=_chosen(all_of.labels, lost),
         warnings=tuple(warnings),
         base=base,

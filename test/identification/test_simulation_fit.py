@@ -264,9 +264,9 @@ def test_bodies_that_cannot_exist_give_way_to_the_nearest():
     read = {f"gamma_{k + 1}": motion.gamma[:, k] for k in range(3)} | {"t": motion.t}
     found = identify(read, plant, ("actuated_links.inertia.zz",), method="simulation")
     given = plant.actuated_links[0].inertia
-    assert found.fitted[0] < 0.95 * given.zz == 0.95 * (given.yy - given.xx)
+    assert found.estimate[0] < 0.95 * given.zz == 0.95 * (given.yy - given.xx)
     assert found.warnings[0].startswith("no bodies have the inertias that fit best")
-    assert found.scene.actuated_links[0].inertia.zz == pytest.approx(found.fitted[0], rel=1e-5)
+    assert found.scene.actuated_links[0].inertia.zz == pytest.approx(found.estimate[0], rel=1e-5)
 
 
 @pytest.mark.parametrize(
