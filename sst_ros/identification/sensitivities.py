@@ -41,6 +41,10 @@ from sst_ros.simulation.torque_profile import TorqueProfile
 TOLERANCE = 1e-12
 """Relative and absolute, of a step; the latter over the size of a parameter for its column."""
 
+AT_STOPS = 0.1
+"""Of the tolerance where stops are compliant: derivatives jump there, and a step across loses its
+order."""
+
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
 RESTITUTION = "stroke.restitution"
 
@@ -115,6 +119,7 @@ class Sensitivities:
             flow = derivative[1 : 1 + size].T @ y[size:].reshape(size, count)
             return np.concatenate([derivative[0], (flow + into * (chain * scale)).ravel()])
 
+        tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
         breaks = torque.breaks()
         inside = breaks[(breaks > 0.0) & (breaks < t[-1])]
         ends = np.unique(np.concatenate([inside, [t[-1]]]))
@@ -125,7 +130,7 @@ class Sensitivities:
             try:
                 run = solve_ivp(
                     rates, (begin, end), y, "DOP853", np.union1d(t[here], end),
-                    rtol=TOLERANCE, atol=TOLERANCE, args=(torque.between(begin, end),),
+                    rtol=tolerance, atol=tolerance, args=(torque.between(begin, end),),
                 )  # fmt: skip
             except (ArithmeticError, ValueError):
                 run = None
