@@ -17,9 +17,9 @@ from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
 from sst_ros.identification.scene_numbers import value_of, with_numbers
 from sst_ros.identification.sensitivities import Sensitivities, damping_slope
+from sst_ros.mechanism.generic_math import ZERO, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.symmetric_motion import drift_free_rate, inertia
-from sst_ros.mechanism.vec3 import ZERO, rotation_rows
 from sst_ros.simulation.torque import SineProfile
 
 END, STEPS, COLUMNS = 0.08, 2, 10
