@@ -56,6 +56,7 @@ EXTRAS |= {
     "test": [
         "argcomplete",
         "build",
+        "catkin_pkg",  # for rosidl_adapter
         "codespell",
         "colcon-common-extensions",
         "hypothesis",
