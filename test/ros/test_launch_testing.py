@@ -80,11 +80,15 @@ def generate_test_description(name):
     os.chdir(tempfile.mkdtemp())
     if name == "ros2_control.launch.py":
         stand_in_for_ros2_control(Path(tempfile.mkdtemp()))
-    included = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(FOLDER / name)),
-        launch_arguments=LAUNCHES[name][0].items(),
-    )
-    return LaunchDescription([included, launch_testing.actions.ReadyToTest()])
+    names = ["record.launch.py", "simulate.launch.py"] if name == "record.launch.py" else [name]
+    included = [
+        IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(str(FOLDER / one)),
+            launch_arguments=LAUNCHES[one][0].items(),
+        )
+        for one in names
+    ]
+    return LaunchDescription([*included, launch_testing.actions.ReadyToTest()])
 
 
 class Started(unittest.TestCase):
