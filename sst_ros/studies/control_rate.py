@@ -11,10 +11,12 @@ states are compared with the reference of the continuous motion.
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,6 +53,12 @@ HOLDS = (START, MIDDLE, EXACT)
 
 TOLERANCE = 1e-10
 """Local tolerance of a step, the default of the node."""
+
+OWN_ERROR = 0.1
+"""A method's own error below this part of that of the hold leaves the latter as it is."""
+
+SAME_ERROR = 1.05
+"""Methods whose errors differ by less than this ratio have the same error."""
 
 COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "estimate_rad",
            "tick_us", "core_share", "by")  # fmt: skip
@@ -197,15 +205,39 @@ class ControlStudy:
     reference: ReferenceSolution
     rows: DataFrame
 
+    def resolved_from(self, method: str) -> float:
+        """Least rate [Hz] from which on the error is that of the hold; infinite if there is none.
+
+        At this rate and at every higher one the method's own error, that with the exact profile, is
+        below a part OWN_ERROR of that with held torques. A lower rate at which it is so
+        does not count: errors of either sign may cancel there.
+        """
+        runs = self.rows[(self.rows.by == RUN_LOOP) & (self.rows.method == method)]
+        errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
+        held = errors.drop(columns=EXACT).min(axis=1)
+        unresolved = np.flatnonzero(~(errors[EXACT] <= OWN_ERROR * held).to_numpy())
+        resolved = errors.index[unresolved[-1] + 1 if len(unresolved) else 0 :]
+        return float(resolved[0]) if len(resolved) else math.inf
+
+    @cached_property
+    def least_rates(self) -> dict[str, float]:
+        """`resolved_from` of each method [Hz]."""
+        methods = self.rows[self.rows.by == RUN_LOOP].method.unique()
+        return {method: self.resolved_from(method) for method in methods}
+
+    def resolved(self, hold: str) -> DataFrame:
+        """Rows of the run loop whose error is that of the hold."""
+        rows = self.rows[(self.rows.hold == hold) & (self.rows.by == RUN_LOOP)]
+        return rows[rows.rate_Hz >= rows.method.map(self.least_rates)]
+
     def order(self, hold: str) -> float:
-        """Power of the period with which the largest error falls."""
-        rows = self.rows[self.rows.hold == hold]
+        """Power of the period with which the largest error of the hold falls."""
+        rows = self.resolved(hold)
         return slope((1.0 / rows.rate_Hz).tolist(), rows.largest_rad.tolist())
 
     def spread(self, hold: str) -> float:
-        """Largest ratio of the errors of two methods at the same rate."""
-        rows = self.rows[(self.rows.hold == hold) & (self.rows.by == RUN_LOOP)]
-        errors = rows.groupby("rate_Hz").largest_rad
+        """Largest ratio of the errors of two methods at the same rate, of those `resolved`."""
+        errors = self.resolved(hold).groupby("rate_Hz").largest_rad
         return float((errors.max() / errors.min()).max())
 
 
@@ -270,18 +302,25 @@ def row_of(
 
 def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
-    largest = max(study.spread(hold) for hold in (START, MIDDLE))
-    if largest > 1.05:
-        worst = max((START, MIDDLE), key=study.spread)
+    late = {name: rate for name, rate in study.least_rates.items() if rate > min(RATES)}
+    largest = max((study.spread(hold) for hold in (START, MIDDLE)), default=math.nan)
+    if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
         return (
-            f"the methods differ by up to {largest:.2g} times (hold: {worst}): choose a finer "
+            f"the methods differ by up to {largest:.2g} times at the same rate: choose a finer "
             "method or tolerance first"
         )
-    least = study.rows[study.rows.rate_Hz == study.rows.rate_Hz.min()]
-    start, middle = (least[least.hold == hold].largest_rad.max() for hold in (START, MIDDLE))
+    least = study.resolved(START).rate_Hz.min()
+    start, middle = (
+        rows[rows.rate_Hz == least].largest_rad.max()
+        for rows in map(study.resolved, (START, MIDDLE))
+    )
+    of_methods = "; ".join(
+        f"{name} has errors of its own beside that of the hold below {rate:g} Hz"
+        for name, rate in late.items()
+    )
     return (
         "raise the rate or command the torque of the middle of the hold; do not change the method: "
-        f"at the same rate all methods have the same error, to {100 * (largest - 1):.1g} %, "
-        f"and at {least.rate_Hz.max():g} Hz the middle gives {start / middle:.0f} times "
-        "less than the start"
+        f"at the same rate all {'other ' if late else ''}methods have the same error, to "
+        f"{100 * (largest - 1):.1g} %, and at {least:g} Hz the middle gives "
+        f"{start / middle:.0f} times less than the start" + (f" ({of_methods})" if late else "")
     )

@@ -67,6 +67,23 @@ def test_a_method_that_matters_is_advised_against(brief):
     assert "choose a finer method" in advice(dataclasses.replace(brief, rows=rows))
 
 
+def test_a_rate_counts_only_if_every_higher_one_does(brief):
+    """Of rk4 at 100 Hz the error of the method and that of the hold cancel; at 200 Hz not."""
+    rows = brief.rows.copy()
+    own = (rows.method == "rk4") & (rows.hold == EXACT)
+    held = (rows.method == "rk4") & (rows.hold == MIDDLE)
+    rows.loc[own & (rows.rate_Hz == 200), "largest_rad"] = 1.0
+    rows.loc[held & (rows.rate_Hz == 100), "largest_rad"] *= 1e-3
+    rows.loc[held & (rows.rate_Hz == 200), "largest_rad"] *= 1.4
+    lucky = dataclasses.replace(brief, rows=rows)
+    assert lucky.least_rates == {"rk4": 500, "dop853": 100}
+    assert max(lucky.spread(START), lucky.spread(MIDDLE)) < 1.001
+    assert lucky.order(MIDDLE) == pytest.approx(2.0, abs=0.02)
+    assert "rk4 has errors of its own beside that of the hold below 500 Hz" in advice(lucky)
+    rows.loc[rows.hold == EXACT, "largest_rad"] = 1.0
+    assert "choose a finer method" in advice(dataclasses.replace(brief, rows=rows))
+
+
 def test_the_page_shows_orders_advice_and_errors(brief, tmp_path):
     said = page([brief])
     assert "theory 2." in said and advice(brief) in said and "WARNING" not in said
