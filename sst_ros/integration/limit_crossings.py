@@ -7,6 +7,7 @@ most h^4 max|d^(4)| / 384. A step that ends outside is found, and one that leave
 
 from __future__ import annotations
 
+from sst_ros.integration.events import GRAZING
 from sst_ros.integration.simd_source import Layout, indented, loop
 
 EARLIEST = 1e-8
@@ -35,7 +36,7 @@ def crossings(count: int, at: Layout) -> list[str]:
             "tangents = tangents if falling < 0.0 else 1.0",
             "tangents = tangents if rising > 0.0 else 1.0",
             "hit = 1.0 if tangents < 0.0 else hit",
-            "hit = 1.0 if after < 0.0 else hit",
+            f"hit = 1.0 if after < {-GRAZING} else hit",
         ]
     code, lanes = at.lane("code"), at.lanes
     test += [
@@ -57,10 +58,10 @@ def crossings(count: int, at: Layout) -> list[str]:
         "    turns = 1.0 if falling < 0.0 else 0.0",
         "    turns = turns if rising > 0.0 else 0.0",
         "    high = -falling / (square + root) if turns > 0.0 else 1.0",
-        "    high = 1.0 if after < 0.0 else high",
+        f"    high = 1.0 if after < {-GRAZING} else high",
         "    least = before + high * (falling + high * (square + high * cube))",
         "    least = after if after < 0.0 else least",
-        "    if least < 0.0:",
+        f"    if least < {-GRAZING}:",
         "        low = 0.0",
         "        for trial in range(52):",
         "            middle = 0.5 * (low + high)",

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,14 +23,11 @@ from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.progress import slices
-from sst_ros.runtime.pacing import Pacer, SteadyTime
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import HasState, Phase
-from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.runtime.run_types import Phase
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State, Triple
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.studies.initial_value_problem import InitialValueProblem
+from sst_ros.studies.loop_runs import run_in_loop
 from sst_ros.studies.reference_solution import ReferenceSolution, solve_reference
 from sst_ros.studies.results import table
 from sst_ros.studies.sampled_data import slope
@@ -63,8 +58,6 @@ SAME_ERROR = 1.05
 COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "estimate_rad",
            "tick_us", "core_share", "by")  # fmt: skip
 
-_LONGEST_S = 120.0
-
 
 @dataclass(frozen=True)
 class ControlRun:
@@ -90,68 +83,6 @@ class ControlRun:
     tick_s: float
 
 
-class _NoMessages:
-    waiting = False
-
-    def take(self, until_ns: float) -> None:
-        return None
-
-
-class ProfileInput(TorqueInput):
-    """Torque input that reads a profile at the time of the simulation instead of messages."""
-
-    def __init__(self, owner: Any, scene: Scene, hold: str, period_ns: int) -> None:
-        super().__init__(owner, scene.actuators, _NoMessages(), _NoMessages())
-        assert scene.torque is not None
-        self._profile, self._sine = scene.torque.at, scene.torque
-        self._exact = hold == EXACT
-        self._shift_ns = period_ns // 2 if hold == MIDDLE else 0
-
-    def torque(self, simulation: HasState, now_ns: int) -> Any:
-        """Return the torques of the tick that begins now [N m], or the profile itself."""
-        if self._exact:
-            return self._sine
-        time_ns = simulation.state.time_ns + self._shift_ns
-        return self._profile(time_ns / NANOSECONDS)  # the simulation clamps it
-
-
-class _Output:
-    """Keeps the states of all samples, and the processor time of the thread at each."""
-
-    def __init__(self) -> None:
-        self.states: list[State] = []
-        self.times: list[float] = []
-
-    def now_ns(self) -> int:
-        return NANOSECONDS
-
-    unread = False
-
-    def missing_subscribers(self) -> list[str]:
-        return []
-
-    def start(self) -> None:
-        pass
-
-    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
-        pass
-
-    def sample(self, simulation: HasState, stamp_ns: int) -> None:
-        self.states.append(simulation.state)
-        self.times.append(time.thread_time())
-
-    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
-        pass
-
-    def phase_changed(self, phase: str) -> None:
-        pass
-
-
-class _Owner:
-    def __init__(self, parameters: SimulatorParameters) -> None:
-        self.parameters = parameters
-
-
 def run_controlled(
     scene: Scene, rate: int, method: str, hold: str, seconds: float, *, compiled: bool = True
 ) -> ControlRun:
@@ -169,24 +100,21 @@ def run_controlled(
         SstError: the run stopped early; says why.
 
     """
-    given = SimulatorParameters(
-        scene=scene.name, rate=rate, publish_rate=rate, duration=seconds, real_time_factor=0.0,
-        integrator=method, tolerance=TOLERANCE,
-    )  # fmt: skip
-    owner, output = _Owner(given), _Output()
-    torques = ProfileInput(owner, scene, hold, given.period_ns)
+    assert scene.torque is not None
+    profile, period_ns = scene.torque, NANOSECONDS // rate
+    shift_ns = period_ns // 2 if hold == MIDDLE else 0
     compiled = compiled and numba_version() is not None
 
     def build(built: Scene) -> Simulation:
         return Simulation(built, method, tolerance=TOLERANCE, compiled=compiled)
 
-    loop = RunLoop(
-        scene, build, owner, torques, Pacer(given.period_ns, 0.0, SteadyTime()), output
-    )  # fmt: skip
-    thread = threading.Thread(target=loop.run, daemon=True)
-    thread.start()
-    thread.join(_LONGEST_S)
-    loop.stop()
+    def torque(simulation: Simulation) -> Any:
+        if hold == EXACT:
+            return profile
+        return profile.at((simulation.time_ns + shift_ns) / NANOSECONDS)
+
+    ticks = math.ceil(seconds * rate - 1e-6)
+    loop, output = run_in_loop(scene, build, torque, period_ns, ticks)
     if loop.phase is not Phase.FINISHED:
         raise SstError(f"{scene.name} at {rate} Hz: {loop.fault or 'the run takes too long'}")
     rows = [(*state.quaternion, *state.body_rate) for state in output.states]

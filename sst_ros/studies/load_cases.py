@@ -73,9 +73,22 @@ def _friction() -> Iterator[Case]:
         )  # fmt: skip
 
 
+FINER = 1e-7
+"""Tolerance at which the error estimate is checked where LOOSE does not resolve the contacts."""
+
 SHORT_CONTACT = (
-    "a contact of 6e-5 s is a few steps at a tolerance of 1e-6: the coarse solution meets the stop "
-    "half a step apart, its distance is not yet proportional to the error"
+    "a contact of 6e-5 s is a few steps at a tolerance of 1e-6, at which the estimate is 0.06 of "
+    "the true error: the coarse solution meets the stop half a step apart"
+)
+
+SHARP_FRICTION = (
+    "three steps are the whole motion at a tolerance of 1e-6, at which the estimate is 17 times "
+    "the true error: friction brings neighbouring motions together, which so few steps do not see"
+)
+
+UNSTABLE = (
+    "three joints that bounce together are an unstable motion, in which 1e-14 rad at the start "
+    "become 5e-3 rad after forty contacts: the error is that of rounding at any tolerance"
 )
 
 
@@ -95,7 +108,7 @@ def _contacts() -> Iterator[Case]:
             partial(extremes.bouncing, Stroke(at_end="elastic", stiffness=stiffness)),
             REST, 30, 10_000_000, extremes.energy_drift, 1e-8,
             difficulty="the torque has a kink; contact takes pi sqrt(m / k)",
-            estimate=SHORT_CONTACT if stiffness > 1e8 else "",
+            **({"loose": FINER, "estimate": SHORT_CONTACT} if stiffness > 1e8 else {}),
         )  # fmt: skip
 
     def symmetric(simulation: Simulation) -> float:
@@ -111,7 +124,7 @@ def _contacts() -> Iterator[Case]:
     yield Case(
         "forty contacts in a second", "energy is constant",
         partial(bounce, 1e4, 20.0), REST, 10, 100_000_000, extremes.energy_drift, 1e-9,
-        difficulty="each contact is located; their errors add up",
+        difficulty="each contact is located; their errors add up", loose=None, estimate=UNSTABLE,
     )  # fmt: skip
 
     def rubbing() -> Scene:
@@ -125,7 +138,7 @@ def _contacts() -> Iterator[Case]:
         "sharp Coulomb friction and three contacts", "the motion at a tolerance of 1e-14",
         rubbing, REST, 30, 10_000_000, tight, 1e-8,
         difficulty="friction of 2 N m changes its sign within 0.01 rad/s, at each contact",
-        estimate="friction brings neighbouring motions together; of that the estimate sees less",
+        loose=FINER, estimate=SHARP_FRICTION,
     )  # fmt: skip
 
 
@@ -256,10 +269,10 @@ def _long() -> Iterator[Case]:
             f"1e5 s of swinging, {method}, steps of 10 ms", "energy is constant [J], of 1.14 J",
             swing, REST, 10_000_000, 10_000_000, residual, bound, integrator=method,
             difficulty="ten million steps: rounding adds up, truncation of RK4 drifts",
-            compiled_only=True,
+            compiled_only=True, loose=None, estimate="one run of ten million fixed steps",
         )  # fmt: skip
     yield Case(
         "a thousand contacts", "energy is constant", partial(bounce, 1e4, 20.0), REST, 250,
-        100_000_000, extremes.energy_drift, 1e-7, compiled_only=True,
+        100_000_000, extremes.energy_drift, 1e-7, compiled_only=True, loose=None, estimate=UNSTABLE,
         difficulty="each contact is located; their errors add up",
     )  # fmt: skip

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of the run loop of the simulator node, without ROS and as fast as possible.
+
+There is a sample at every tick. The torques come from a function instead of messages.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from sst_ros.runtime.pacing import Pacer, SteadyTime
+from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.run_types import HasState
+from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State, Triple
+
+TorqueOf = Callable[[Any], Any]
+"""Torques of the tick that begins now [N m], constant or a `SineTorque`, from the simulation."""
+
+_LONGEST_S = 120.0
+
+
+class _Parameters(SimulatorParameters):
+    """Parameters with a control period of any whole number of nanoseconds."""
+
+    period = 0
+
+    @property
+    def period_ns(self) -> int:
+        return self.period
+
+
+class _NoMessages:
+    waiting = False
+
+    def take(self, until_ns: float) -> None:
+        return None
+
+
+class FunctionInput(TorqueInput):
+    """Torque input that calls a function at every tick."""
+
+    def __init__(self, owner: Any, scene: Scene, torque: TorqueOf) -> None:
+        super().__init__(owner, scene.actuators, _NoMessages(), _NoMessages())
+        self._torque_of = torque
+
+    def torque(self, simulation: HasState, now_ns: int) -> Any:
+        """Return the torques of the tick that begins now."""
+        return self._torque_of(simulation)  # the simulation clamps them
+
+
+class LoopOutput:
+    """Keeps the states of all samples, and the processor time of the thread at each."""
+
+    unread = False
+
+    def __init__(self) -> None:
+        self.states: list[State] = []
+        self.times: list[float] = []
+
+    def now_ns(self) -> int:
+        """Return any time but zero, which means that there is none."""
+        return NANOSECONDS
+
+    def missing_subscribers(self) -> list[str]:
+        """Wait for nobody."""
+        return []
+
+    def start(self) -> None:
+        """Do nothing."""
+
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        """Do nothing."""
+
+    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+        """Keep the state."""
+        self.states.append(simulation.state)
+        self.times.append(time.thread_time())
+
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+        """Do nothing."""
+
+    def phase_changed(self, phase: str) -> None:
+        """Do nothing."""
+
+
+class _Owner:
+    def __init__(self, parameters: SimulatorParameters) -> None:
+        self.parameters = parameters
+
+
+def run_in_loop(
+    scene: Scene,
+    build: Callable[[Scene], Simulation],
+    torque: TorqueOf,
+    period_ns: int,
+    ticks: int,
+) -> tuple[RunLoop, LoopOutput]:
+    """Run the run loop for some ticks in a thread of its own.
+
+    Args:
+        scene: what is simulated.
+        build: makes the simulation of a scene.
+        torque: torques of a tick.
+        period_ns: length of a tick [ns].
+        ticks: how many.
+
+    Returns:
+        The loop, finished or with a fault, and what it has published.
+
+    """
+    # Only the number of ticks follows from rate and duration.
+    given = _Parameters(
+        scene=scene.name, rate=1, publish_rate=1, duration=float(ticks), real_time_factor=0.0
+    )
+    object.__setattr__(given, "period", period_ns)
+    owner, output = _Owner(given), LoopOutput()
+    pacer = Pacer(period_ns, 0.0, SteadyTime())
+    loop = RunLoop(scene, build, owner, FunctionInput(owner, scene, torque), pacer, output)
+    thread = threading.Thread(target=loop.run, daemon=True)
+    thread.start()
+    thread.join(_LONGEST_S)
+    loop.stop()
+    thread.join(1.0)
+    return loop, output
