@@ -42,8 +42,8 @@ class Overview(NamedTuple):
         latency_s, latency_us: times [s] and latencies of commands [us].
         late_ms: delay of each sample [ms], shape (n,).
         effort: difference of effort and applied torque [N m], shape (n,).
-        used_s: computing time of all steps [s] at each report of the simulator, shape (r,).
-        estimates: errors of the orientation [rad] by name, shape (r,) each.
+        estimates: computing time of all steps [s] and errors of the orientation [rad] by name: the
+            integration error at each sample, estimates at each report of the simulator.
         reported_s, step_us: times of the reports [s], mean time of a step since the start [us].
 
     """
@@ -60,8 +60,7 @@ class Overview(NamedTuple):
     latency_us: Array
     late_ms: Array
     effort: Array
-    used_s: Array
-    estimates: Mapping[str, Array]
+    estimates: Mapping[str, tuple[Array, Array]]
     reported_s: Array
     step_us: Array
 
@@ -104,8 +103,8 @@ def _panels(run: Overview) -> list[_Panel]:
     known = run.step_us > 0.0
     reported_s, step_us = run.reported_s[known], run.step_us[known]
     used = any(
-        (np.isfinite(positive(values)) & np.isfinite(run.used_s)).any()
-        for values in run.estimates.values()
+        (np.isfinite(positive(values)) & np.isfinite(used)).any()
+        for used, values in run.estimates.values()
     )
     return [
         _Panel(
@@ -138,7 +137,7 @@ def _panels(run: Overview) -> list[_Panel]:
             _missing(run.effort) or ("" if np.nanmax(run.effort) else "no difference"),
         ),
         _Panel(
-            "Error against computing time used, at the reports of the simulator",
+            "Error against computing time used, over the run",
             partial(_used, run=run), "" if used else NOT_RECORDED, over_time=False,
         ),
         _Panel(
@@ -163,8 +162,9 @@ def _curve(axes: Axes, seconds: Array, values: Array | None, label: str, marker:
 def _used(axes: Axes, run: Overview) -> None:
     axes.set_xlabel("computing time of all steps [ms]")
     axes.set_ylabel("error of the orientation [rad]")
-    for (name, values), style in zip(run.estimates.items(), LINES, strict=False):
-        axes.plot(1e3 * run.used_s, positive(values), label=name, marker="o", markersize=4, **style)
+    for (name, (used, values)), style in zip(run.estimates.items(), LINES, strict=False):
+        marker = "o" if len(used) == len(run.reported_s) else ""
+        axes.plot(1e3 * used, positive(values), label=name, marker=marker, markersize=4, **style)
     axes.set_yscale("log")
     axes.legend(fontsize=8, loc="best")
 

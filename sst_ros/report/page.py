@@ -54,16 +54,18 @@ def overview(
     known = np.isfinite(missed)
     losses["ticks missed"] = (at[known], missed[known]) if known.any() else None
     used = 1e-6 * ticks * step_us
-    largest = np.fmax.accumulate(integration.error.orientation)
-    found = np.interp(at, recording.seconds, largest) if len(at) else at
-    curves = dict(zip(ESTIMATES, [found, *estimates], strict=True))
     seconds, count = recording.seconds, len(recording.time_ns)
+    # Reports come once a second: between them, and from the start, the steps cost the same.
+    at_samples = np.interp(seconds, [0.0, *at], [0.0, *used]) if len(at) else np.full(count, np.nan)
+    found = np.fmax.accumulate(integration.error.orientation)
+    errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
+    curves = dict(zip(ESTIMATES, errors, strict=True))
     return draw_overview(
         Overview(
             seconds, error_curves(integration), timing.energy, timing.pace_s, timing.pace,
             timing.period_us, timing.nominal_us, losses,
             timing.latency.time_s, timing.latency.received_us, timing.late_us / 1e3,
-            recording.effort_difference, used, curves, at, step_us,
+            recording.effort_difference, curves, at, step_us,
         ),
         f"Run of {recording.scene.name}: {seconds[-1]:g} s, {count} samples",
         made_line(summary),

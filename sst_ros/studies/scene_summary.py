@@ -77,7 +77,7 @@ def _right_hand_side(scene: Scene, dynamics: Dynamics) -> list[str]:
         if cost.present:
             lines.append(f"  {cost.name:<21}{cost.adds:>19}{cost.without:>24}")
     absent = [cost for cost in found if not cost.present]
-    total = sum(cost.adds for cost in absent)
+    total = sum(cost.written + cost.adds for cost in absent)
     names = ", ".join(cost.name for cost in absent) or "none"
     lines += ["", f"terms absent, {total} operations", *_wrapped(names, "  ")]
     return lines

@@ -5,11 +5,16 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import Expression, Graph
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
@@ -122,6 +127,65 @@ def operations(scene: Scene) -> int:
     )
 
 
+class _AttributedGraph(Graph):
+    """A graph that keeps for each operation the term whose code has written it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.terms: list[str] = []
+
+    def node(self, op: str, *args: Any) -> Expression:
+        """Return the expression op(args)."""
+        found = super().node(op, *args)
+        if len(self.terms) < len(self.nodes):
+            self.terms.append(_term_of(sys._getframe(1)))
+        return found
+
+
+def _term_of(frame: FrameType | None) -> str:
+    """Return the term whose function in `loads` or `kernel` is being run; empty for none."""
+    called = ""
+    while frame is not None and frame.f_code is not kernel.derivative.__code__:
+        name, known = frame.f_code.co_name, frame.f_locals
+        if name == "<genexpr>" and {"kind", "friction"} <= known.keys():
+            return f"friction in {('gamma', 'mu', 'beta')[known['kind']]}"
+        if name == "<genexpr>" and {"kind", "spring"} <= known.keys():
+            return "springs"
+        if name == "<genexpr>" and {"asked", "has"} <= known.keys():
+            return "actuator lag"
+        if name in ("_weight", "field_of"):
+            return "gravity"
+        if name == "_on_star" and "total" in known:
+            return "external moment" if "external" in known else "gravity"
+        if name == "_push" or (name == "joint_torques" and called == "angle"):
+            return "elastic ends"
+        called, frame = name, frame.f_back
+    return ""
+
+
+def operations_by_term(scene: Scene) -> Counter[str]:
+    """Operations in the generated source by the term whose code has written them.
+
+    What a term has in common with the rest counts for who needs it first. The key "" has all that
+    is no load: geometry, the star, and links, payload and rotors, which are constants.
+    """
+    dynamics, graph = Dynamics.of(scene), _AttributedGraph()
+    size = len(dynamics.state)
+    state = [graph.node("input", name) for name in (*dynamics.state, *dynamics.drive)]
+    torque, moment = (state[size], state[size + 1], state[size + 2]), state[size + 3 :]
+    given = (moment[0], moment[1], moment[2]) if moment else None
+    waiting = list(kernel.derivative(dynamics.model, tuple(state[:size]), torque, given))
+    needed: set[int] = set()
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Expression) and value.index not in needed:
+            op, args = graph.nodes[value.index]
+            if op != "input":
+                needed.add(value.index)
+                waiting += args
+    return Counter(graph.terms[index] for index in needed)
+
+
 @dataclass(frozen=True)
 class Cost:
     """What a term costs.
@@ -130,7 +194,9 @@ class Cost:
         name: of the term.
         present: whether the scene has it.
         without: operations in the source that is generated for the scene without it.
-        adds: operations that it adds.
+        adds: operations that it adds to that.
+        written: operations in the scene's source that the term's code has written; links, payload,
+            rotors and the torque limit are constants or act outside, and have no code there.
 
     """
 
@@ -138,14 +204,16 @@ class Cost:
     present: bool
     without: int
     adds: int
+    written: int
 
 
 def costs(scene: Scene) -> list[Cost]:
-    """Count the operations and the time of every term: the source with it less that without it."""
-    total, found = operations(scene), []
+    """Count for every term what it costs in a scene, in the sources with it and without it."""
+    total, written, found = operations(scene), operations_by_term(scene), []
     for term in TERMS:
         without = operations(term.without(scene))
-        found.append(Cost(term.name, bool(term.value(scene)), without, total - without))
+        present, adds = bool(term.value(scene)), total - without
+        found.append(Cost(term.name, present, without, adds, written[term.name]))
     return found
 
 
@@ -174,7 +242,7 @@ def cost_table(scene: Scene, *, compiled: bool = True) -> list[dict[str, Any]]:
             bare = evaluation_ns(term.without(scene), compiled=compiled) if cost.adds else whole_ns
             rows.append({"scene": scene.name, "term": cost.name, "operations": cost.adds,
                          "ns": whole_ns - bare})  # fmt: skip
-    absent = [cost for cost in found if not cost.present]
+    absent = [cost.written + cost.adds for cost in found if not cost.present]
     rows.append({"scene": scene.name, "term": f"absent: {len(absent)} terms",
-                 "operations": sum(cost.adds for cost in absent), "ns": 0.0})  # fmt: skip
+                 "operations": sum(absent), "ns": 0.0})  # fmt: skip
     return rows

@@ -162,9 +162,12 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(tmp_path, bag
     found = evaluate(run)
     drawn = page.overview(run, found.integration, found.timing, found.summary)
     titles = {axes.get_title("left"): axes for axes in drawn.axes}
-    panel = titles["Error against computing time used, at the reports of the simulator"]
+    panel = titles["Error against computing time used, over the run"]
     curves = {line.get_label(): line.get_xydata() for line in panel.lines}
+    error = curves["integration error"]
     estimate = curves["its estimate by the simulator"]
+    assert len(error) > 100 and error[0, 0] == 0.0 and (np.diff(error[:, 0]) >= 0.0).all()
+    assert error[-1, 0] == pytest.approx(np.nanmax(estimate[:, 0]))
     assert estimate[:2, 0] == pytest.approx([5.0, 10.0])  # 100 and 200 steps of 50 us, in ms
     assert estimate[:2, 1] == pytest.approx([1e-11, 1e-10])
     assert curves["hold error if torques are those of the start"][1, 1] == pytest.approx(2e-3)

@@ -10,6 +10,7 @@ import pytest
 from mechanism.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
+from sst_ros.dynamics import loads
 from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
 from sst_ros.scene.loads import (
     Actuators,
@@ -22,7 +23,7 @@ from sst_ros.scene.loads import (
 from sst_ros.scene.scene import Scene, load, names
 from sst_ros.studies.scene_summary import WIDTH, summary
 from sst_ros.studies.step_advice import step_advice
-from sst_ros.studies.term_costs import TERMS, costs, operations
+from sst_ros.studies.term_costs import TERMS, costs, operations, operations_by_term
 
 EXAMPLE2 = load("example2_heavy")
 QUICK = ("example2", "elastic_stops", "friction", "general", "gravity_payload", "stiff", "swing")
@@ -71,6 +72,36 @@ def test_absent_terms_cost_nothing_and_present_ones_something(name):
 def test_operations_are_counted_in_the_generated_source(name):
     scene = load(name)
     assert operations(scene) == Dynamics.of(scene).program.operations.total()
+
+
+@every_scene
+def test_operations_are_attributed_to_the_terms_whose_code_writes_them(name):
+    scene = load(name)
+    written = operations_by_term(scene)
+    assert written.total() == operations(scene)
+    for cost in costs(scene):
+        assert cost.written == written[cost.name]
+        assert cost.present or cost.written == 0
+
+
+def test_each_term_with_code_of_its_own_has_operations_in_a_scene_with_everything():
+    written = operations_by_term(everything())
+    constant = {"actuated links", "intermediate links", "payload", "rotors", "torque limit"}
+    assert {term.name for term in TERMS} - constant == {name for name in written if name}
+    # Of what terms share, as the angles, the first one has all, the others add nothing more.
+    adds = {cost.name: cost.adds for cost in costs(everything())}
+    assert all(0.3 * adds[name] <= written[name] for name in written if name)
+
+
+def test_the_code_of_an_absent_term_is_seen_in_the_source(monkeypatch):
+    """A viscous friction that the scene does not ask for."""
+    resistance = loads.resistance
+    monkeypatch.setattr(loads, "joint_torques", lambda legs, leg, *given: tuple(
+        -resistance(friction, loads.rate(leg, kind))
+        for kind, friction in enumerate((Friction(viscous=2.0),) * 3)
+    ))  # fmt: skip
+    scene = load("swing")
+    assert scene.friction is None and operations_by_term(scene)["friction in gamma"] > 0
 
 
 def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
