@@ -230,7 +230,7 @@ def row_of(
 
 def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
-    late = {name: rate for name, rate in study.least_rates.items() if rate > min(RATES)}
+    own = {name: rate for name, rate in study.least_rates.items() if rate > min(RATES)}
     largest = max((study.spread(hold) for hold in (START, MIDDLE)), default=math.nan)
     if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
         return (
@@ -242,13 +242,11 @@ def advice(study: ControlStudy) -> str:
         rows[rows.rate_Hz == least].largest_rad.max()
         for rows in map(study.resolved, (START, MIDDLE))
     )
-    of_methods = "; ".join(
-        f"{name} has errors of its own beside that of the hold below {rate:g} Hz"
-        for name, rate in late.items()
-    )
+    late = "; ".join(f"{name}, below {rate:g} Hz," for name, rate in own.items())
+    other, own_errors = ("other ", f"; {late} has errors of its own") if late else ("", "")
     return (
         "raise the rate or command the torque of the middle of the hold; do not change the method: "
-        f"at the same rate all {'other ' if late else ''}methods have the same error, to "
-        f"{100 * (largest - 1):.1g} %, and at {least:g} Hz the middle gives "
-        f"{start / middle:.0f} times less than the start" + (f" ({of_methods})" if late else "")
+        f"at the same rate all {other}methods have the same error, to {100 * (largest - 1):.1g} %, "
+        f"and at {least:g} Hz the middle gives {start / middle:.0f} times less than the "
+        f"start{own_errors}"
     )

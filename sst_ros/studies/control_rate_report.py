@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -104,9 +105,9 @@ def recorded_run(bag: Path, rate: int, hold: str) -> ControlRun:
 
 
 def title(study: ControlStudy) -> str:
-    """Return scene, time span and advice in two lines."""
+    """Return scene, time span and advice in two or three lines."""
     found, _, why = advice(study).partition(": ")
-    return f"{study.scene} over {study.seconds:g} s: {found}\n{why}"
+    return f"{study.scene} over {study.seconds:g} s: {found}\n{textwrap.fill(why, 125)}"
 
 
 def grid(study: ControlStudy) -> DataFrame:

@@ -79,7 +79,7 @@ def test_a_rate_counts_only_if_every_higher_one_does(brief):
     assert lucky.least_rates == {"rk4": 500, "dop853": 100}
     assert max(lucky.spread(START), lucky.spread(MIDDLE)) < 1.001
     assert lucky.order(MIDDLE) == pytest.approx(2.0, abs=0.02)
-    assert "rk4 has errors of its own beside that of the hold below 500 Hz" in advice(lucky)
+    assert "; rk4, below 500 Hz, has errors of its own" in advice(lucky)
     rows.loc[rows.hold == EXACT, "largest_rad"] = 1.0
     assert "choose a finer method" in advice(dataclasses.replace(brief, rows=rows))
 
