@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 TARGET, TARGETS = 1e-9, (1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is marked in figures."""
 
+AT_REST = "It rests: it has no torques of its own, a controller drives it along its motion."
+
 INTRODUCTION = """\
 # Accuracy and computing time
 
@@ -71,7 +73,8 @@ def report(
         studies.append(work_precision(each, kind=kind, compiled=compiled, shown=True))
         terms += cost_table(each, compiled=compiled)
         print(text(studies[-1]), flush=True)
-        figures = {f"accuracy_{each.name}": figure(studies[-1])}
+        moves = not studies[-1].rests
+        figures = {f"accuracy_{each.name}": figure(studies[-1])} if moves else {}
         if len(studies) == len(names):
             figures["accuracy"] = draw_summary(summary(studies), provenance(compiled=compiled))
         write(
@@ -122,6 +125,8 @@ def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
 def fastest(study: WorkPrecision, target: float = TARGET) -> str:
     """Return the fastest setting for a target as a sentence."""
     best = study.best(target)
+    if study.rests:
+        return AT_REST
     if best is None:
         errors = study.rows[ERROR].astype(float).dropna()
         reached = (
@@ -219,7 +224,8 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
             f"{t:.0e} rad": f"{own.setting[t]}: {_time(own.wall_s[t])}" if t in own.index else None
             for t in TARGETS
         }
-        rows.append({"scene": each.scene, "run": f"{each.seconds:g} s", **cells})
+        run = "at rest" if each.rests else f"{each.seconds:g} s"
+        rows.append({"scene": each.scene, "run": run, **cells})
     lines = [INTRODUCTION, "## Which method and step", "",
              "![time of the fastest setting, by scene](accuracy.png)", "",
              markdown(table(rows))]  # fmt: skip
@@ -228,9 +234,10 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
         lines += ["", "## What the terms of a scene cost", "", TERMS_INTRODUCTION,
                   markdown(table(shown))]  # fmt: skip
     for each in studies:
-        lines += ["", f"## {each.scene}", "", f"**{fastest(each)}**", "",
-                  f"![error against wall time, {each.scene}](accuracy_{each.scene}.png)",
-                  ""]  # fmt: skip
+        lines += ["", f"## {each.scene}", "", f"**{fastest(each)}**", ""]
+        if not each.rests:
+            picture = f"accuracy_{each.scene}.png"
+            lines += [f"![error against wall time, {each.scene}]({picture})", ""]
         if each.ends:
             lines.append(f"- Compared over {each.seconds:g} s; the run ends there: {each.ends}.")
         lines += [f"- {fact}" for fact in facts(each)]

@@ -16,7 +16,7 @@ from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Str
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import Case
+from sst_ros.studies.extreme_cases import LOOSE, Case
 from sst_ros.studies.extreme_scenes import REST, Triple
 from sst_ros.studies.sampled_data import pole
 
@@ -108,7 +108,8 @@ def _contacts() -> Iterator[Case]:
             partial(extremes.bouncing, Stroke(at_end="elastic", stiffness=stiffness)),
             REST, 30, 10_000_000, extremes.energy_drift, 1e-8,
             difficulty="the torque has a kink; contact takes pi sqrt(m / k)",
-            **({"loose": FINER, "estimate": SHORT_CONTACT} if stiffness > 1e8 else {}),
+            loose=FINER if stiffness > 1e8 else LOOSE,
+            estimate=SHORT_CONTACT if stiffness > 1e8 else "",
         )  # fmt: skip
 
     def symmetric(simulation: Simulation) -> float:

@@ -99,13 +99,24 @@ class WorkPrecision:
         """Smallest orientation error that is reported [rad]."""
         return ABOVE_REFERENCE * self.reference.own.orientation
 
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves, so that every setting is right to rounding.
+
+        So it is with scenes that a controller drives along a reference motion.
+        """
+        errors = self.rows[ERROR].astype(float)
+        return bool((errors < ROUNDING).all())
+
     def best(self, target: float) -> Series[Any] | None:
         """Return the fastest setting with an orientation error of at most `target` [rad].
 
         A setting counts only if at least one finer setting of its method was tried and every one
         of them is as good: a coarse setting whose errors happen to cancel is no recommendation.
         """
-        good = []
+        good: list[Any] = []
+        if self.rests:
+            return None
         for _, group in self.rows.groupby(["method", "kind"], sort=False):
             bad = np.flatnonzero(~(group[ERROR].astype(float).to_numpy() <= target))
             good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()

@@ -127,6 +127,14 @@ def brief():
     return work_precision(BRIEF, compiled=False, longest_s=0.0)
 
 
+def test_a_scene_that_rests_has_no_fastest_setting():
+    """A controller drives it; without torques every setting is right to rounding."""
+    spiral = work_precision(dataclasses.replace(scene.load("spiral"), duration=0.2), compiled=False)
+    assert spiral.rests and spiral.best(1e-6) is None and "rests" in fastest(spiral)
+    shown = page([spiral])
+    assert "| spiral | at rest |" in shown and "accuracy_spiral.png" not in shown
+
+
 def graded(*errors):
     """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
     rows = [
