@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.ode import ODE
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.schema import Section, specs
 from sst_ros.simulation.simulation import NANOSECONDS

@@ -96,7 +96,9 @@ def test_rest_at_an_end_of_the_stroke_is_no_fault():
     """Rounding puts gamma_3 below 0 by 5e-16 rad; `Simulation` stays at rest there."""
     found = Batch(EXAMPLE2).run([(0.0,) * 3, (0.7, 0.7, 0.0)], (0.0,) * 3, step=1e-3, count=10)
     assert found.success.all(), found.message
-    pushed = Batch(EXAMPLE2).run([(0.0, 0.5, 0.5)], (0.0,) * 3, (-1.0, 0.0, 0.0), step=1e-3, count=1)
+    pushed = Batch(EXAMPLE2).run(
+        [(0.0, 0.5, 0.5)], (0.0,) * 3, (-1.0, 0.0, 0.0), step=1e-3, count=1
+    )
     assert pushed.message == ("gamma_1 < 0",)
 
 
