@@ -68,7 +68,7 @@ class LoopOutput:
         return NANOSECONDS
 
     def missing_subscribers(self) -> list[str]:
-        """Wait for nobody."""
+        """Return no topic: there are no subscribers to wait for."""
         return []
 
     def start(self) -> None:
