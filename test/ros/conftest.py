@@ -83,13 +83,15 @@ class Nodes:
 
     def start(self, command, *words, executable=None, env=None):
         argv = executable or [sys.executable, "-m", "sst_ros", command]
+        # Ends with this process, also where that is killed: the next run has the same domains.
+        ends_with = {} if executable else {child_process.PARENT: str(os.getpid())}
         process = subprocess.Popen(
             [*argv, *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             # To make machine code for every scene of a test would take longer than all tests.
-            env={**os.environ, "SST_ROS_NUMBA": "0", **(env or {})},
+            env={**os.environ, "SST_ROS_NUMBA": "0", **ends_with, **(env or {})},
         )
         self.running.append(process)
         return process
