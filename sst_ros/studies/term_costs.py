@@ -149,7 +149,7 @@ def _term_of(frame: FrameType | None) -> str:
     called = ""
     while frame is not None and frame.f_code is not kernel.derivative.__code__:
         name, known = frame.f_code.co_name, frame.f_locals
-        if name == "<genexpr>" and {"kind", "friction"} <= known.keys():
+        if name == "<genexpr>" and {"kind", "one"} <= known.keys():
             return f"friction in {('gamma', 'mu', 'beta')[known['kind']]}"
         if name == "<genexpr>" and {"kind", "spring"} <= known.keys():
             return "springs"
@@ -159,7 +159,7 @@ def _term_of(frame: FrameType | None) -> str:
             return "gravity"
         if name == "_on_star" and "total" in known:
             return "external moment" if "external" in known else "gravity"
-        if name == "_push" or (name == "joint_torques" and called == "angle"):
+        if name == "stop_torque" or (name == "joint_torques" and called == "angle"):
             return "elastic ends"
         called, frame = name, frame.f_back
     return ""

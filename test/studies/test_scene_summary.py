@@ -95,10 +95,10 @@ def test_each_term_with_code_of_its_own_has_operations_in_a_scene_with_everythin
 
 def test_the_code_of_an_absent_term_is_seen_in_the_source(monkeypatch):
     """A viscous friction that the scene does not ask for."""
-    resistance = loads.resistance
+    resistance = loads.friction_torque
     monkeypatch.setattr(loads, "joint_torques", lambda legs, leg, *given: tuple(
-        -resistance(friction, loads.rate(leg, kind))
-        for kind, friction in enumerate((Friction(viscous=2.0),) * 3)
+        -resistance(one, loads.rate(leg, kind))
+        for kind, one in enumerate((Friction(viscous=2.0),) * 3)
     ))  # fmt: skip
     scene = load("swing")
     assert scene.friction is None and operations_by_term(scene)["friction in gamma"] > 0
