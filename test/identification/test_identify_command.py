@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `identify`: a recording to a scene, a scene to a motion, and refusals."""
 
+from dataclasses import replace
+
 import pytest
+from bags import simulated
 from identification import manipulators
 
 from sst_ros import load_scene
 from sst_ros.cli.main import run
+from sst_ros.scene.loads import Actuators
 from sst_ros.scene.yaml_document import dump
 
 
@@ -25,15 +29,18 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_recording_is_fitted_by_simulation(written, example2, tmp_path, capsys):
+@pytest.mark.parametrize("actuators", [None, Actuators(time_constant=0.02)])
+def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuators):
+    recorded = replace(load_scene("example2"), actuators=actuators)
     guess = tmp_path / "guess.yaml"
-    changed = load_scene("example2").with_values({"star.inertia.zz": 0.25})
+    changed = recorded.with_values({"star.inertia.zz": 0.25})
     guess.write_text(dump(changed), encoding="utf-8")
-    words = ["identify", str(written(example2)), "--scene", str(guess), "--method", "simulation"]
+    bag = written(simulated(recorded, 0.3))
+    words = ["identify", str(bag), "--scene", str(guess), "--method", "simulation"]
     out = tmp_path / "identified.yaml"
     assert run([*words, "--parameters", "star.inertia.zz", "--out", str(out)]) == 0
     assert "known to" in capsys.readouterr().out
-    expected = load_scene("example2").star.inertia.zz
+    expected = recorded.star.inertia.zz
     assert load_scene(out).star.inertia.zz == pytest.approx(expected, rel=1e-8)
     assert run(words) == 1
     assert "must be keys of numbers of the scene" in capsys.readouterr().err
