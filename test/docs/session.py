@@ -18,7 +18,7 @@ from sst_ros.cli.main import NODES
 
 PYTHONS = (".venv/bin/python", "python", "python3")
 COMMAND = "sst-ros"
-LIMIT_S = 60.0
+LIMIT_S = 200.0
 RECORDED_BYTES = 20_000
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
