@@ -119,16 +119,21 @@ def left(names: set[str], seconds: float = 10.0) -> list[str]:
     return sorted(found)
 
 
+def until(condition: Callable[[], object], what: str, timeout: float = 120.0) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            raise SystemExit(f"no {what} within {timeout:g} s")
+        time.sleep(0.1)
+
+
 def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:
     """Run for so long; return a column for each process, and what is wrong."""
     wrong, before = [], existing()
     with ExitStack() as stack:
         processes = start(stack, folder, seconds, control=True)
-        deadline = time.monotonic() + 120.0
-        while not len(list((folder / "bag").glob("*.mcap"))):
-            if time.monotonic() > deadline:
-                raise SystemExit("no recording within 120 s")
-            time.sleep(0.1)
+        until(lambda: any((folder / "bag").glob("*.mcap")), "recording")
         memory: dict[str, list[float]] = {name: [] for name in processes}
         began = time.monotonic()
         used = {name: process.processor_s() for name, process in processes.items()}
@@ -174,8 +179,7 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
     with ExitStack() as stack:
         processes = start(stack, folder, 0.0, control=False)
         for process in processes.values():
-            while len(names := shared([process.pid])) < 3:
-                time.sleep(0.2)
+            until(lambda pid=process.pid: len(shared([pid])) >= 3, "shared memory")
         time.sleep(5.0)  # until they have found each other
         names = shared(process.pid for process in processes.values()) - before
         for process in processes.values():
@@ -184,8 +188,7 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
     with ExitStack() as stack:
         again = Process("simulator", scene=SCENE)
         stack.callback(again.end)
-        while not shared([again.pid]):
-            time.sleep(0.1)
+        until(lambda: shared([again.pid]), "shared memory")
         names |= shared([again.pid]) - before
     after = left(names, 2.0)
     unproven = [name for name in after if "port" in name and f"{name}_el" not in after]

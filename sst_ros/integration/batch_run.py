@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.integration.batch_result import BatchResult, BatchStates
 from sst_ros.integration.batch_source import NOT_FINITE
-from sst_ros.integration.limit_crossings import EARLIEST
+from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
@@ -73,7 +73,7 @@ def integrated(
     # A step in which a limit was passed is left out: its beginning is the last valid state.
     steps = np.full(number, count)
     ended = code > 0
-    steps[ended] = np.ceil(time[ended] / step - 0.1 * EARLIEST) - 1.0
+    steps[ended] = whole_steps(time[ended], step)
     steps[code < 0] = 0
     _locate(advance, step, steps, y, given, code, time)
     last = steps * step

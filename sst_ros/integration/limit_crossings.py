@@ -7,11 +7,19 @@ most h^4 max|d^(4)| / 384. A step that ends outside is found, and one that leave
 
 from __future__ import annotations
 
+import numpy as np
+
 from sst_ros.integration.events import GRAZING
 from sst_ros.integration.simd_source import Layout, indented, loop
+from sst_ros.mechanism.geometry import Array
 
 EARLIEST = 1e-8
 """Least share of a step at which a crossing is reported, so that its time lies in this step."""
+
+
+def whole_steps(time: Array, step: float) -> Array:
+    """Return how many steps ended before a time at which a limit was passed [s]."""
+    return np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
 
 
 def crossings(count: int, at: Layout) -> list[str]:

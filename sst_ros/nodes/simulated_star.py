@@ -23,6 +23,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.run_loop import RunLoop
+from sst_ros.runtime.run_types import Reply
 
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
@@ -97,8 +98,7 @@ class SimulatedStar:
             gamma, gamma_dot = self._actuators(quaternion, rate)
         except (AssemblyError, ArithmeticError) as error:
             return answer(response, INVALID_POSE, str(error) or "the manipulator is singular there")
-        reply = self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot))
-        return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
+        return replied(response, self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot)))
 
     def _actuators(self, quaternion: Quadruple, rate: Triple) -> tuple[Triple, Triple]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
@@ -129,6 +129,11 @@ def answer(response: Any, code: int, text: str = "") -> Any:
     """Fill the result of a response, and return the response."""
     response.result.result, response.result.error_message = code, text
     return response
+
+
+def replied(response: Any, reply: Reply) -> Any:
+    """Fill the result of a response from a reply of the run, and return the response."""
+    return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
 
 
 def _unknown(request: Any, response: Any) -> Any:

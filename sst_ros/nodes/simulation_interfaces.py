@@ -17,13 +17,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from sst_ros.nodes import topics
-from sst_ros.nodes.simulated_star import (
-    FAILED,
-    OK,
-    UNSUPPORTED,
-    SimulatedStar,
-    answer,
-)
+from sst_ros.nodes.simulated_star import OK, UNSUPPORTED, SimulatedStar, answer, replied
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 
@@ -93,9 +87,9 @@ class SimulationInterfaces:
             done = self._loop.ask(self._loop.reset)
             if not paused.success:  # out of a fault a reset comes first
                 self._loop.ask(partial(self._loop.pause, True))
-            return _replied(response, done)
+            return replied(response, done)
         if wanted in (PLAYING, PAUSED):
-            return _replied(response, self._loop.ask(partial(self._loop.pause, wanted == PAUSED)))
+            return replied(response, self._loop.ask(partial(self._loop.pause, wanted == PAUSED)))
         if wanted == QUITTING:
             self._leave()
             return answer(response, OK)
@@ -108,12 +102,12 @@ class SimulationInterfaces:
             text = "ROS time continues; reset the state"
             return answer(response, UNSUPPORTED, text)
         if scope & SCOPE_STATE:
-            return _replied(response, self._loop.ask(self._loop.reset))
+            return replied(response, self._loop.ask(self._loop.reset))
         return answer(response, OK)
 
     def step_simulation(self, request: Any, response: Any) -> Any:
         """Step a paused run by some samples."""
-        return _replied(response, self._loop.ask(partial(self._loop.step, int(request.steps))))
+        return replied(response, self._loop.ask(partial(self._loop.step, int(request.steps))))
 
     def spawn_entity(self, request: Any, response: Any) -> Any:
         """Refuse, by the name of what was to be spawned."""
@@ -169,13 +163,7 @@ class StepsAction:
             handle.succeed()
         else:
             handle.abort()
-        result.set_result(_replied(action.SimulateSteps.Result(), reply))
-
-
-def _replied(response: Any, reply: Reply) -> Any:
-    if reply.success:
-        return answer(response, OK)
-    return answer(response, FAILED, reply.message)
+        result.set_result(replied(action.SimulateSteps.Result(), reply))
 
 
 def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:

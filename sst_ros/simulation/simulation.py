@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import warnings
-from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -125,7 +124,6 @@ class Simulation:
             derivative=derivative,
         )
         self._warned = not self.compiled
-        self._checked: tuple[Any, ...] = (None, None, None)
         self._start = self._initial()
         self._now = self._before = _Instant(0, self._start)
         self.reset()
@@ -162,11 +160,7 @@ class Simulation:
             as `step`: the state is then that after the last step before, at `time_ns`.
 
         """
-        arguments = torque, dt_ns, moment
-        if not all(map(is_, arguments, self._checked)):
-            refuse_bad_step(*arguments)
-            if type(torque) is tuple and type(moment) is tuple:
-                self._checked = arguments  # tuples do not change
+        refuse_bad_step(torque, dt_ns, moment)
         torque = self._propagator.acting(torque)
         if callable(torque) and not self._warned:
             self._warned = True

@@ -8,7 +8,6 @@ same limit within a step of the same time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from sst_ros.errors import RunStopped, SstError
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.limit_crossings import EARLIEST
+from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.schema import Section, specs
@@ -80,7 +79,7 @@ def compared(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bool]
         batch.advance(first, steps, h, y, given, code, when, error, threads=1)
     done = case.steps
     if code[0]:  # the step in which it ends is left out
-        done = math.ceil(float(when[0]) / h - 0.1 * EARLIEST) - 1
+        done = int(whole_steps(when, h)[0])
     own = CompiledMethod(ODE(Dynamics.of(scene)), DOP853, compiled=False)
     with np.errstate(all="ignore"):
         for first, steps, torque in _spans(case):

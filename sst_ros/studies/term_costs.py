@@ -210,7 +210,7 @@ class Cost:
 
 
 def costs(scene: Scene) -> list[Cost]:
-    """Count for every term what it costs in a scene, in the sources with it and without it."""
+    """Count the operations of every term of a scene, in the sources with it and without it."""
     total, written, found = operations(scene), operations_by_term(scene), []
     for term in TERMS:
         without = operations(term.without(scene))

@@ -27,13 +27,12 @@ def reference_table(loop: ControlledRun, samples: int) -> Array:
     middle = loop.settings.feedforward_at == "middle"
     rows = []
     for k in range(samples + 1):
-        at = loop.motion.at(k * round(period * 1e9) / 1e9)
+        time = k * round(period * 1e9) / 1e9
+        at = loop.motion.at(time)
         torque = inverse.reference_torque(at) if feeding else REST
         held = torque
         if feeding and middle:
-            held = inverse.reference_torque(
-                loop.motion.at(k * round(period * 1e9) / 1e9 + 0.5 * period)
-            )
+            held = inverse.reference_torque(loop.motion.at(time + 0.5 * period))
         rows.append(
             (float(k == 0), *at.gamma, *at.gamma_dot, *at.gamma_ddot, *torque, *held,
              *at.quaternion, *at.body_rate, *at.body_acceleration)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
 from sst_ros.description.headers import BASE_FRAME
@@ -121,27 +122,18 @@ def transforms(document, angles):
         found = pose(joint.find("parent").get("link"))
         if joint.find("origin") is not None:
             local = np.eye(4)
-            roll, pitch, yaw = numbers(joint, "origin", "rpy")
-            local[:3, :3] = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+            rpy = numbers(joint, "origin", "rpy")
+            local[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
             local[:3, 3] = numbers(joint, "origin", "xyz")
             found = found @ local
         if joint.get("type") != "fixed":
-            x, y, z = numbers(joint, "axis", "xyz")
-            across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            axis = np.array(numbers(joint, "axis", "xyz"))
             angle, about = angles[joint.get("name")], np.eye(4)
-            about[:3, :3] += np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
+            about[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             found = found @ about
         return found
 
     return base, {link: pose(link) for link in parents}
-
-
-def turn(axis, angle):
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(angle)
-    matrix[j, i], matrix[i, j] = np.sin(angle), -np.sin(angle)
-    return matrix
 
 
 @pytest.mark.parametrize("name", names())

@@ -22,7 +22,7 @@ print("listening", flush=True)
 rclpy.spin(node)
 """
 
-SPEAK = """
+SPEAKER = """
 import time
 import rclpy
 from rclpy.duration import Duration
@@ -35,6 +35,9 @@ publisher = node.create_publisher(String, "said", 1000)
 end = time.monotonic() + 30.0
 while publisher.get_subscription_count() == 0 and time.monotonic() < end:
     time.sleep(0.01)
+"""
+
+SPEAK = """
 for _ in range(4):
     publisher.publish(String(data="a word"))
     print(publisher.wait_for_all_acked(Duration(seconds=1.0)), flush=True)
@@ -58,19 +61,7 @@ simulator.close()
 """
 
 BURST = """
-import time
-import rclpy
 from pathlib import Path
-from rclpy.duration import Duration
-from std_msgs.msg import String
-from sst_ros.nodes import middleware
-middleware.configure()
-rclpy.init()
-node = rclpy.create_node("speaker")
-publisher = node.create_publisher(String, "said", 1000)
-end = time.monotonic() + 30.0
-while publisher.get_subscription_count() == 0 and time.monotonic() < end:
-    time.sleep(0.01)
 tasks = [task for task in Path("/proc/self/task").iterdir()
          if (task / "comm").read_text().startswith("dds.ev")]
 def wakes():
@@ -91,17 +82,22 @@ def no_profile(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
-    """By default they are asked every 3 s: the second of waiting would pass in vain."""
+def heard(words):
+    """Run a speaker beside a listener, each in a process of its own."""
     command = [sys.executable, "-c"]
     with subprocess.Popen([*command, LISTEN], stdout=subprocess.PIPE, text=True) as listener:
         try:
             assert listener.stdout.readline() == "listening\n"
-            spoken = subprocess.run(
-                [*command, SPEAK], capture_output=True, text=True, timeout=60, check=True
+            return subprocess.run(
+                [*command, SPEAKER + words], capture_output=True, text=True, timeout=60, check=True
             )
         finally:
             listener.kill()
+
+
+def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
+    """By default they are asked every 3 s: the second of waiting would pass in vain."""
+    spoken = heard(SPEAK)
     assert spoken.stdout.split() == ["True"] * 4
     assert spoken.stderr == ""
 
@@ -125,15 +121,7 @@ def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch
 
 def test_a_publication_does_not_wake_the_thread_for_events(domain, no_profile):
     """By default each of them does: more than 500 times here."""
-    command = [sys.executable, "-c"]
-    with subprocess.Popen([*command, LISTEN], stdout=subprocess.PIPE, text=True) as listener:
-        try:
-            assert listener.stdout.readline() == "listening\n"
-            spoken = subprocess.run(
-                [*command, BURST], capture_output=True, text=True, timeout=60, check=True
-            )
-        finally:
-            listener.kill()
+    spoken = heard(BURST)
     assert int(spoken.stdout) < 250
 
 
