@@ -6,31 +6,31 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_ros.cli.parsing import Commands, add_scene
+from sst_ros.cli.parsing import Commands, add_scene_name, command, free_out
 from sst_ros.errors import InputError, Problem
-from sst_ros.output_folder import require_free, writing
+from sst_ros.output_folder import writing
 
 DESIGN = "design"
 INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"
 
 
-def add(commands: Commands) -> None:
-    """Add the command to the command line."""
-    identify = commands.add_parser(
-        "identify",
-        help="identify inertias, friction and more from a recorded run; design excitation motions",
+def add_identify(commands: Commands) -> None:
+    """Add `identify` to the command line."""
+    identify = command(
+        commands, "identify", _identify,
+        "identify inertias, friction and more from a recorded run; design excitation motions",
         description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
         "what the motion determines, with standard deviations, and the nearest scene whose bodies "
         "can exist. With --method simulation the motion is integrated and fitted to the recorded "
         "angles, by any numbers of the scene. `identify design SCENE` makes a motion that "
         "determines the parameters well, within stroke, workspace and the limits of the actuators.",
-    )
+    )  # fmt: skip
     identify.add_argument("bag", metavar="BAG", help="folder of the bag, or the word design")
-    add_scene(
+    add_scene_name(
         identify, "designed", nargs="?", metavar="SCENE",
         help="after design: the scene to make a motion for, about its initial pose",
     )  # fmt: skip
-    add_scene(
+    add_scene_name(
         identify, "--scene", metavar="S",
         help="what is known, and the values to start from; default: the recorded scene",
     )  # fmt: skip
@@ -57,7 +57,6 @@ def add(commands: Commands) -> None:
     identify.add_argument("--seed", type=int, help="of a designed motion; default: 0")
     identify.add_argument("--out", type=Path, metavar="SCENE.yaml", help="write the scene")
     identify.add_argument("--force", action="store_true", help="overwrite the file of --out")
-    identify.set_defaults(run=_identify)
 
 
 def _identify(options: argparse.Namespace) -> None:
@@ -74,7 +73,7 @@ def _identify(options: argparse.Namespace) -> None:
     if wrong:
         raise InputError("identify", wrong)
     if options.out is not None:
-        require_free(options.out, "identify", force=options.force)
+        free_out(options, options.out)
     from sst_ros.scene.scene import load
     from sst_ros.scene.yaml_document import dump
 

@@ -13,24 +13,26 @@ from sst_ros.cli.parsing import Parser
 from sst_ros.errors import printable
 
 PROGRAM = "sst-ros"
-COMMANDS = (
-    "simulate",
-    "workspace",
-    "scene",
-    "plan",
-    "describe",
-    "compile",
-    "demo",
-    "paper",
-    "view",
-    "report",
-    "plot",
-    "export",
-    "recover",
-    "study",
-    "sweep",
-    "identify",
-)
+COMMANDS = {
+    "simulate": "motion",
+    "workspace": "scene",
+    "scene": "scene",
+    "plan": "motion",
+    "describe": "scene",
+    "compile": "scene",
+    "demo": "demo",
+    "paper": "demo",
+    "view": "view",
+    "report": "recording",
+    "plot": "recording",
+    "export": "recording",
+    "recover": "recording",
+    "study": "study",
+    "sweep": "study",
+    "identify": "identify",
+}
+"""Module that adds each command, by a function `add_COMMAND`."""
+
 NODES = {
     "simulator": "node: integrate the equation of motion in real time",
     "torque_player": "node: play the torques of a scene",
@@ -70,9 +72,9 @@ def parser(only: str | None = None) -> Parser:
     result.add_argument("--version", action="version", version=_version())
     result.add_argument("--debug", action="store_true", help="print the traceback of an error")
     commands = result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
-    for name in COMMANDS:
+    for name, module in COMMANDS.items():
         if only in (None, name):
-            importlib.import_module(f"sst_ros.cli.{name}").add(commands)
+            getattr(importlib.import_module(f"sst_ros.cli.{module}"), f"add_{name}")(commands)
     for name, what in NODES.items() if only is None else ():
         commands.add_parser(name, help=what, add_help=False)
     return result

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`scene`: look at scenes."""
+"""`scene`, `describe`, `compile`, `workspace`: what a scene is, without a run of it."""
 
 from __future__ import annotations
 
@@ -7,21 +7,49 @@ import argparse
 import json
 from pathlib import Path
 
-from sst_ros.cli.parsing import Commands, add_scene, group
-from sst_ros.errors import SstError
+from sst_ros.cli.parsing import Commands, add_out, add_scene_name, command, free_out, group, refuse
+from sst_ros.errors import SstError, suggestion
+from sst_ros.extras import require
+
+FORMATS = (".png", ".pdf", ".svg")
 
 
-def add(commands: Commands) -> None:
-    """Add the command to the command line."""
-    kinds = group(commands.add_parser("scene", help="list, show and check scenes"))
-    kinds.add_parser("list", help="list the shipped scenes").set_defaults(run=_list)
-    show = kinds.add_parser("show", help="show contents, cost of a step and advice on the method")
-    add_scene(show, "scene", metavar="SCENE")
-    show.set_defaults(run=_show)
-    check = kinds.add_parser("check", help="check scene files and report all faults")
+def add_scene(commands: Commands) -> None:
+    """Add `scene` to the command line."""
+    kinds = group(commands, "scene", "list, show and check scenes")
+    command(kinds, "list", _list, "list the shipped scenes")
+    show = command(kinds, "show", _show, "show contents, cost of a step and advice on the method")
+    add_scene_name(show, "scene", metavar="SCENE")
+    check = command(kinds, "check", _check, "check scene files and report all faults")
     check.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    check.set_defaults(run=_check)
-    kinds.add_parser("schema", help="print the JSON schema, for editors").set_defaults(run=_schema)
+    command(kinds, "schema", _schema, "print the JSON schema, for editors")
+
+
+def add_describe(commands: Commands) -> None:
+    """Add `describe` to the command line."""
+    describe = command(commands, "describe", _describe, "write a scene as URDF")
+    add_scene_name(describe, "--scene", default="example2", metavar="S")
+    describe.add_argument(
+        "--ros2-control", action="store_true",
+        help="with the tag by which ros2_control drives the actuators of a running simulator",
+    )  # fmt: skip
+
+
+def add_compile(commands: Commands) -> None:
+    """Add `compile` to the command line."""
+    compile_ = command(commands, "compile", _compile, "compile a scene before its first fast run")
+    add_scene_name(compile_, "scene", nargs="?", default="example2", metavar="SCENE")
+    compile_.add_argument(
+        "--integrator", default="auto", help="auto, or the name of an integrator; default: auto"
+    )
+
+
+def add_workspace(commands: Commands) -> None:
+    """Add `workspace` to the command line."""
+    what = "map the workspace of a scene: reach, condition, singular poses"
+    workspace = command(commands, "workspace", _workspace, what)
+    add_scene_name(workspace, "scene", metavar="SCENE")
+    add_out(workspace, "picture, .png, .pdf or .svg", "SCENE_workspace.png")
 
 
 def _list(_: argparse.Namespace) -> None:
@@ -59,3 +87,56 @@ def _schema(_: argparse.Namespace) -> None:
     from sst_ros.scene.scene import Scene
 
     print(json.dumps(json_schema(Scene, "sst_ros scene"), indent=2))
+
+
+def _describe(options: argparse.Namespace) -> None:
+    from sst_ros.description.ros2_control import urdf_with_ros2_control
+    from sst_ros.description.urdf import urdf
+    from sst_ros.scene.scene import load
+
+    write = urdf_with_ros2_control if options.ros2_control else urdf
+    print(write(load(options.scene)), end="")
+
+
+def _compile(options: argparse.Namespace) -> None:
+    from sst_ros.integration import code_cache, codegen
+    from sst_ros.integration.cache_folder import cache_folder, configured_folder
+    from sst_ros.scene.scene import load
+    from sst_ros.simulation.simulation import INTEGRATORS
+
+    if options.integrator not in INTEGRATORS:
+        allowed = f"must be one of {', '.join(INTEGRATORS)}"
+        allowed += suggestion(options.integrator, INTEGRATORS)
+        refuse(options, "--integrator", options.integrator, allowed)
+    if codegen.numba_version() is None:
+        require("numba")
+        raise SstError("numba is switched off by SST_ROS_NUMBA=0")
+    if (folder := cache_folder()) != configured_folder():
+        raise SstError("compiled code would not be kept; see the warning above")
+    simulated = load(options.scene)
+    for method in code_cache.make(simulated, options.integrator):
+        print(f"{method}: compiled, in {folder}", flush=True)
+    if not code_cache.is_there(simulated, options.integrator):
+        raise SstError("another process is compiling: try again when it has ended")
+
+
+def _workspace(options: argparse.Namespace) -> None:
+    from sst_ros.mechanism import singularities, workspace
+    from sst_ros.mechanism.geometry import Geometry
+    from sst_ros.scene.scene import load
+
+    scene = load(options.scene)
+    out = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
+    if out.suffix not in FORMATS:
+        refuse(options, "--out", str(out), f"must end in {' or '.join(FORMATS)}")
+    free_out(options, out)
+    require("matplotlib")
+    from sst_ros.plot.style import save_figure
+    from sst_ros.plot.workspace import draw
+
+    geometry = Geometry.of(scene)
+    directions, faces = workspace.triangle_directions(geometry, divisions=60)
+    chart = workspace.over_orientations(geometry, directions, turns=180, progress=True)
+    print(singularities.report(geometry, chart))
+    save_figure(draw([chart], [faces], [scene.name]), out)
+    print(out)

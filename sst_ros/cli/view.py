@@ -9,39 +9,33 @@ import threading
 from pathlib import Path
 
 from sst_ros import child_process
-from sst_ros.cli.parsing import Commands, add_scene, integer_from
-from sst_ros.errors import InputError, Problem
+from sst_ros.cli.parsing import Commands, add_scene_name, command, integer_from, refuse
 from sst_ros.extras import require
 
 
-def add(commands: Commands) -> None:
-    """Add the command to the command line."""
-    view = commands.add_parser(
-        "view",
-        help="show the manipulator in a browser, live or from a bag",
+def add_view(commands: Commands) -> None:
+    """Add `view` to the command line."""
+    view = command(
+        commands, "view", _view, "show the manipulator in a browser, live or from a bag",
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
-    )
+    )  # fmt: skip
     view.add_argument("bag", nargs="?", type=Path, help="folder of a bag to play")
-    add_scene(view, "--scene", metavar="S", help="start a simulator of this scene to look at")
+    add_scene_name(view, "--scene", metavar="S", help="start a simulator of this scene to look at")
     view.add_argument(
         "--simulator", default="sst_simulator", metavar="NAME", help="node of the simulator"
     )
     view.add_argument("--namespace", default="/", metavar="NS", help="namespace of its nodes")
     view.add_argument("--host", default="127.0.0.1", help="address to serve at (this machine only)")
     view.add_argument(
-        "--port",
-        type=integer_from(1024, 65535),
-        default=8080,
+        "--port", type=integer_from(1024, 65535), default=8080,
         help="port; the next free one is taken",
-    )
+    )  # fmt: skip
     view.add_argument("--open", action="store_true", help="open it, where there is a desktop")
-    view.set_defaults(run=_view)
 
 
 def _view(options: argparse.Namespace) -> int:
     if options.bag is not None and options.scene is not None:
-        allowed = "give a bag or a scene, not both"
-        raise InputError("view", [Problem("--scene", options.scene, allowed)])
+        refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
     require("viser")
     if options.bag is not None:
         return _replay(options)

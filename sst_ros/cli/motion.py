@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`simulate`: a whole motion of a scene, without nodes."""
+"""`simulate`, `plan`: a whole motion of a scene without nodes, and a check of one before it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from sst_ros.cli.parsing import Commands, add_scene
+from sst_ros.cli.parsing import Commands, add_scene_name, command, free_out, group, refuse
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.output_folder import require_free
 
 FORMATS = (".parquet", ".csv")
 MOST_SAMPLES = 10_000_000
 
 
-def add(commands: Commands) -> None:
-    """Add the command to the command line."""
-    simulate = commands.add_parser(
-        "simulate",
-        help="simulate a scene under its own torques",
+def add_simulate(commands: Commands) -> None:
+    """Add `simulate` to the command line."""
+    simulate = command(
+        commands, "simulate", _simulate, "simulate a scene under its own torques",
         description="Simulate a scene under its own torques. Exit status 1 if the motion ended "
         "before the duration, at a limit of the scene for example.",
-    )
-    add_scene(simulate, "scene", metavar="SCENE")
+    )  # fmt: skip
+    add_scene_name(simulate, "scene", metavar="SCENE")
     simulate.add_argument("--duration", type=float, help="length [s]; default: that of the scene")
     simulate.add_argument("--method", default="auto", help="integrator; default: auto")
     simulate.add_argument(
@@ -36,25 +36,36 @@ def add(commands: Commands) -> None:
         "--plot", action="store_true", help="draw it; beside FILE, or as SCENE.png"
     )
     simulate.add_argument("--force", action="store_true", help="overwrite earlier results")
-    simulate.set_defaults(run=_simulate)
+
+
+def add_plan(commands: Commands) -> None:
+    """Add `plan` to the command line."""
+    kinds = group(commands, "plan", "check a reference motion: torques, limits, shortest duration")
+    what = "check feasibility and the shortest duration; exit status 0 if feasible"
+    check = command(kinds, "check", _check, what)
+    add_scene_name(check, "scene", metavar="SCENE", help="scene with a motion: name, or .yaml file")
+    check.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    check.add_argument("--csv", type=Path, metavar="OUT", help="write the torques to play")
+    check.add_argument("--force", action="store_true", help="overwrite the file of --csv")
+    check.add_argument(
+        "--period", type=float, default=1e-3, help="length of a row of --csv [s]; default 0.001"
+    )
 
 
 def _simulate(options: argparse.Namespace) -> int:
     import numpy as np
 
-    from sst_ros.extras import require
     from sst_ros.simulation.simulate import simulate
 
     out, picture = options.out, None
     if out is not None:
         if out.suffix not in FORMATS:
-            allowed = f"must end in {' or '.join(FORMATS)}"
-            raise InputError("simulate", [Problem("--out", str(out), allowed)])
-        require_free(out, "simulate", force=options.force)
+            refuse(options, "--out", str(out), f"must end in {' or '.join(FORMATS)}")
+        free_out(options, out)
         require("pyarrow" if out.suffix == ".parquet" else "pandas")
     if options.samples is not None and not 1 <= options.samples <= MOST_SAMPLES:
         allowed = f"must be a whole number from 1 to {MOST_SAMPLES}"
-        raise InputError("simulate", [Problem("--samples", options.samples, allowed)])
+        refuse(options, "--samples", options.samples, allowed)
     if options.plot:
         picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
         require_free(picture, "simulate", force=options.force)
@@ -89,3 +100,25 @@ def _simulate(options: argparse.Namespace) -> int:
         save_figure(trajectory.plot(), picture)
         print(picture)
     return 0 if trajectory.success else 1
+
+
+def _check(options: argparse.Namespace) -> int:
+    from sst_ros.control.plan import examine
+    from sst_ros.control.plan_table import as_json, table, write_torques
+    from sst_ros.control.reference_motions import reference_motion
+    from sst_ros.control.time_scaling import time_scaling
+    from sst_ros.recording.recorded_motion import samples
+    from sst_ros.scene.scene import load
+
+    if not 1e-9 <= options.period < float("inf"):
+        problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
+        raise InputError("plan check", [problem])
+    if options.csv is not None:
+        require_free(options.csv, "plan check", force=options.force, option="--csv")
+    held = load(options.scene)
+    plan = examine(reference_motion(held, samples), held)
+    write = as_json if options.json else table
+    print(write(plan, time_scaling(plan)).rstrip())
+    if options.csv is not None:
+        write_torques(plan, options.csv, options.period)
+    return 1 if plan.problems else 0
