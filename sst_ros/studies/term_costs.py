@@ -9,7 +9,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
@@ -31,92 +31,51 @@ TIMED_STEPS, ROUNDS = 2000, 200
 each term take turns, and each has the time of its fastest turn, which no other process has met."""
 
 
-@dataclass(frozen=True)
-class Term:
-    """Something that a scene may have.
+TERMS: dict[str, tuple[str, ...]] = {
+    "actuated links": ("actuated_links",),
+    "intermediate links": ("intermediate_links",),
+    "payload": ("payload",),
+    "gravity": ("gravity",),
+    "external moment": ("moment",),
+    "friction in gamma": ("friction", "gamma"),
+    "friction in mu": ("friction", "mu"),
+    "friction in beta": ("friction", "beta"),
+    "springs": ("springs",),
+    "rotors": ("actuators", "rotor_inertia", "gear_ratio"),
+    "torque limit": ("actuators", "torque_limit"),
+    "actuator lag": ("actuators", "time_constant"),
+    "elastic ends": ("stroke", "stiffness"),
+}
+"""Section of a scene that has each term, and the fields of that section where not all are its."""
 
-    Attributes:
-        name: its name in the summary.
-        value: what the scene has of it, falsy for nothing.
-        without: the scene without it.
 
-    """
-
-    name: str
-    value: Callable[[Scene], Any]
-    without: Callable[[Scene], Scene]
+def has(scene: Scene, term: str) -> bool:
+    """Return whether a scene has one of TERMS."""
+    section, *fields = TERMS[term]
+    value: Any = getattr(scene, section)
+    if section in ("actuated_links", "intermediate_links"):
+        return any(link.inertia for link in value)
+    return bool(value and getattr(value, fields[0]) if fields else value)
 
 
-def _drop(key: str, *parts: str) -> Callable[[Scene], Scene]:
-    """Leave out a section, or some fields of it."""
-
-    def without(scene: Scene) -> Scene:
-        held: Any = getattr(scene, key)
-        if held is None:
-            return scene
-        change: Any = () if isinstance(held, tuple) else None
-        if parts:
-            blank = {field.name: field.default for field in dataclasses.fields(held)}
-            if any(getattr(held, name) != blank[name] for name in blank if name not in parts):
-                change = dataclasses.replace(held, **{part: blank[part] for part in parts})
-        changes: dict[str, Any] = {key: change}
+def without(scene: Scene, term: str) -> Scene:
+    """Return a scene without one of TERMS; gravity goes with the last links that it acts on."""
+    section, *fields = TERMS[term]
+    value: Any = getattr(scene, section)
+    change: Any = () if section == "springs" else None
+    if section in ("actuated_links", "intermediate_links"):
+        change = (Link(),) * 3
+    elif section == "stroke":
+        change = Stroke(at_end="ignore") if value.stiffness else value
+    elif value is not None and fields:
+        blank = {field.name: field.default for field in dataclasses.fields(value)}
+        if any(getattr(value, name) != blank[name] for name in blank if name not in fields):
+            change = dataclasses.replace(value, **{name: blank[name] for name in fields})
+    changes: dict[str, Any] = {section: change}
+    try:
         return dataclasses.replace(scene, **changes)
-
-    return without
-
-
-def _without_links(key: str) -> Callable[[Scene], Scene]:
-    """Leave out links, and gravity if nothing is left for it to act on."""
-
-    def without(scene: Scene) -> Scene:
-        changes: dict[str, Any] = {key: (Link(),) * 3}
-        try:
-            return dataclasses.replace(scene, **changes)
-        except InputError:
-            return dataclasses.replace(scene, **changes, gravity=None)
-
-    return without
-
-
-def _part(key: str, part: str) -> Callable[[Scene], Any]:
-    return lambda scene: getattr(scene, key) and getattr(getattr(scene, key), part)
-
-
-TERMS = (
-    Term(
-        "actuated links",
-        lambda scene: any(link.inertia for link in scene.actuated_links),
-        _without_links("actuated_links"),
-    ),
-    Term(
-        "intermediate links",
-        lambda scene: any(link.inertia for link in scene.intermediate_links),
-        _without_links("intermediate_links"),
-    ),
-    Term("payload", lambda scene: scene.payload, _drop("payload")),
-    Term("gravity", lambda scene: scene.gravity, _drop("gravity")),
-    Term("external moment", lambda scene: scene.moment, _drop("moment")),
-    Term("friction in gamma", _part("friction", "gamma"), _drop("friction", "gamma")),
-    Term("friction in mu", _part("friction", "mu"), _drop("friction", "mu")),
-    Term("friction in beta", _part("friction", "beta"), _drop("friction", "beta")),
-    Term("springs", lambda scene: scene.springs, _drop("springs")),
-    Term(
-        "rotors",
-        _part("actuators", "rotor_inertia"),
-        _drop("actuators", "rotor_inertia", "gear_ratio"),
-    ),
-    Term("torque limit", _part("actuators", "torque_limit"), _drop("actuators", "torque_limit")),
-    Term("actuator lag", _part("actuators", "time_constant"), _drop("actuators", "time_constant")),
-    Term(
-        "elastic ends",
-        lambda scene: scene.stroke.stiffness,
-        lambda scene: (
-            dataclasses.replace(scene, stroke=Stroke(at_end="ignore"))
-            if scene.stroke.stiffness
-            else scene
-        ),
-    ),
-)
+    except InputError:
+        return dataclasses.replace(scene, **changes, gravity=None)
 
 
 def operations(scene: Scene) -> int:
@@ -213,9 +172,8 @@ def costs(scene: Scene) -> list[Cost]:
     """Count the operations of every term of a scene, in the sources with it and without it."""
     total, written, found = operations(scene), operations_by_term(scene), []
     for term in TERMS:
-        without = operations(term.without(scene))
-        present, adds = bool(term.value(scene)), total - without
-        found.append(Cost(term.name, present, without, adds, written[term.name]))
+        bare = operations(without(scene, term))
+        found.append(Cost(term, has(scene, term), bare, total - bare, written[term]))
     return found
 
 
@@ -241,15 +199,14 @@ def evaluation_ns(scenes: Sequence[Scene], *, compiled: bool = True) -> list[flo
 def cost_table(scene: Scene, *, compiled: bool = True) -> list[dict[str, Any]]:
     """Return operations and times [ns] of an evaluation: the whole, then each term present."""
     found = costs(scene)
-    present = [(term, cost) for term, cost in zip(TERMS, found, strict=True) if cost.present]
-    bare = [term.without(scene) for term, _ in present]
-    whole_ns, *bare_ns = evaluation_ns([scene, *bare], compiled=compiled)
-    rows = [{"scene": scene.name, "term": "all", "operations": operations(scene), "ns": whole_ns}]
-    for (_, cost), ns in zip(present, bare_ns, strict=True):
+    present = [cost for cost in found if cost.present]
+    scenes = [scene, *(without(scene, cost.name) for cost in present)]
+    whole_ns, *bare_ns = evaluation_ns(scenes, compiled=compiled)
+    rows = [("all", operations(scene), whole_ns)]
+    for cost, ns in zip(present, bare_ns, strict=True):
         # A term that folds into constants leaves the same number of operations, and its time.
-        rows.append({"scene": scene.name, "term": cost.name, "operations": cost.adds,
-                     "ns": whole_ns - ns if cost.adds else 0.0})  # fmt: skip
+        rows.append((cost.name, cost.adds, whole_ns - ns if cost.adds else 0.0))
     absent = [cost.written + cost.adds for cost in found if not cost.present]
-    rows.append({"scene": scene.name, "term": f"absent: {len(absent)} terms",
-                 "operations": sum(absent), "ns": 0.0})  # fmt: skip
-    return rows
+    rows.append((f"absent: {len(absent)} terms", sum(absent), 0.0))
+    names = ("term", "operations", "ns")
+    return [{"scene": scene.name, **dict(zip(names, row, strict=True))} for row in rows]
