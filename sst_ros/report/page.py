@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.run_figures import ErrorCurves
-from sst_ros.plot.run_overview import Overview, draw_overview
+from sst_ros.plot.run_figures import ErrorCurves, draw_error_panel
+from sst_ros.plot.run_overview import (
+    NOT_RECORDED,
+    Panel,
+    curve_panel,
+    draw_latency,
+    draw_losses,
+    draw_overview,
+    draw_pace,
+    draw_periods,
+    draw_used,
+    missing,
+)
+from sst_ros.plot.style import positive
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.table import made_line, table
@@ -45,28 +58,66 @@ def overview(
     recording: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
 ) -> Figure:
     """Draw a run on one page."""
+    seconds, count = recording.seconds, len(recording.time_ns)
     losses: dict[str, tuple[Array, Array] | None] = {
         name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
         for name, times in (("samples lost", timing.lost_s),
                             ("gaps between applied torques", timing.gaps_s))
     }  # fmt: skip
     at, missed, ticks, step_us, *estimates = timing.reported.T
-    known = np.isfinite(missed)
+    known, timed = np.isfinite(missed), step_us > 0.0
     losses["ticks missed"] = (at[known], missed[known]) if known.any() else None
     used = 1e-6 * ticks * step_us
-    seconds, count = recording.seconds, len(recording.time_ns)
     # Reports come once a second: between them, and from the start, the steps cost the same.
     at_samples = np.interp(seconds, [0.0, *at], [0.0, *used]) if len(at) else np.full(count, np.nan)
     found = np.fmax.accumulate(integration.error.orientation)
     errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
-    curves = dict(zip(ESTIMATES, errors, strict=True))
+    drawn = any((np.isfinite(positive(y)) & np.isfinite(x)).any() for x, y in errors)
+    error, latency, effort = error_curves(integration), timing.latency, recording.effort_difference
     return draw_overview(
-        Overview(
-            seconds, error_curves(integration), timing.energy, timing.pace_s, timing.pace,
-            timing.period_us, timing.nominal_us, losses,
-            timing.latency.time_s, timing.latency.received_us, timing.late_us / 1e3,
-            recording.effort_difference, curves, at, step_us,
-        ),
+        [
+            Panel(
+                "Integration error, against the same torques",
+                partial(draw_error_panel, seconds=seconds, error=error, legend=True),
+                "" if np.isfinite(error.gamma).any() else "nothing could be compared",
+            ),
+            curve_panel("Energy residual", "energy residual [J]", seconds, timing.energy),
+            Panel(
+                "Real-time factor (recorder clock)",
+                partial(draw_pace, seconds=timing.pace_s, pace=timing.pace), missing(timing.pace),
+            ),
+            Panel(
+                "Period between received samples",
+                partial(draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us),
+                missing(timing.period_us), over_time=False,
+            ),
+            Panel("Cumulative losses", partial(draw_losses, losses=losses, end=seconds[-1])),
+            Panel(
+                "Latency: reception of a command to the step that applies it",
+                partial(draw_latency, seconds=latency.time_s, latency_us=latency.received_us),
+                missing(latency.received_us),
+            ),
+            curve_panel(
+                "Delay of samples", "delay, less the shortest [ms]", seconds, timing.late_us / 1e3
+            ),
+            curve_panel(
+                "Effort of joint_states against applied torque", "largest difference [N m]",
+                seconds, effort,
+                reason=missing(effort) or ("" if np.nanmax(effort) else "no difference"),
+            ),
+            Panel(
+                "Error against computing time used, over the run",
+                partial(
+                    draw_used, estimates=dict(zip(ESTIMATES, errors, strict=True)), reports=len(at)
+                ),
+                "" if drawn else NOT_RECORDED, over_time=False,
+            ),
+            curve_panel(
+                "Computing time of a step, mean since the start", "time [µs]",
+                at[timed], step_us[timed], marker="o",
+            ),
+        ],
+        seconds[-1],
         f"Run of {recording.scene.name}: {seconds[-1]:g} s, {count} samples",
         made_line(summary),
     )  # fmt: skip
