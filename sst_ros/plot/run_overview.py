@@ -21,7 +21,7 @@ Estimates: TypeAlias = "Mapping[str, tuple[Array, Array]]"
 Losses: TypeAlias = "Mapping[str, tuple[Array, Array] | None]"
 
 
-class Panel(NamedTuple):
+class OverviewPanel(NamedTuple):
     """A panel of the overview; `missing` is the reason why it is left out, or empty."""
 
     title: str
@@ -31,7 +31,7 @@ class Panel(NamedTuple):
 
 
 @styled
-def draw_overview(panels: Sequence[Panel], end: float, title: str, footnote: str) -> Figure:
+def draw_overview(panels: Sequence[OverviewPanel], end: float, title: str, footnote: str) -> Figure:
     """Draw a run of `end` seconds on one page; the footnote names what has no data."""
     shown = [panel for panel in panels if not panel.missing]
     rows = -(-len(shown) // 2)
@@ -54,18 +54,18 @@ def draw_overview(panels: Sequence[Panel], end: float, title: str, footnote: str
 def curve_panel(
     title: str, label: str, seconds: Array, values: Array | None, *, reason: str = "",
     marker: str = "",
-) -> Panel:  # fmt: skip
+) -> OverviewPanel:  # fmt: skip
     """Return a panel of one curve, small values in a power of ten; left out for a `reason`."""
     absent = reason or missing(values)
     if values is None or absent:
-        return Panel(title, Axes.set_axis_off, absent)
+        return OverviewPanel(title, Axes.set_axis_off, absent)
     shown, unit = scaled(values)
 
     def draw(axes: Axes) -> None:
         axes.set_ylabel(label.replace("[", f"[{unit}"))
         axes.plot(*few(seconds, shown), color=BLUE, linewidth=1.4, marker=marker, markersize=4)
 
-    return Panel(title, draw, absent)
+    return OverviewPanel(title, draw, absent)
 
 
 def missing(values: Array | None) -> str:

@@ -17,7 +17,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.run_figures import ErrorCurves, draw_error_panel
 from sst_ros.plot.run_overview import (
     NOT_RECORDED,
-    Panel,
+    OverviewPanel,
     curve_panel,
     draw_latency,
     draw_losses,
@@ -76,23 +76,23 @@ def overview(
     error, latency, effort = error_curves(integration), timing.latency, recording.effort_difference
     return draw_overview(
         [
-            Panel(
+            OverviewPanel(
                 "Integration error, against the same torques",
                 partial(draw_error_panel, seconds=seconds, error=error, legend=True),
                 "" if np.isfinite(error.gamma).any() else "nothing could be compared",
             ),
             curve_panel("Energy residual", "energy residual [J]", seconds, timing.energy),
-            Panel(
+            OverviewPanel(
                 "Real-time factor (recorder clock)",
                 partial(draw_pace, seconds=timing.pace_s, pace=timing.pace), missing(timing.pace),
             ),
-            Panel(
+            OverviewPanel(
                 "Period between received samples",
                 partial(draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us),
                 missing(timing.period_us), over_time=False,
             ),
-            Panel("Cumulative losses", partial(draw_losses, losses=losses, end=seconds[-1])),
-            Panel(
+            OverviewPanel("Cumulative losses", partial(draw_losses, losses=losses, end=seconds[-1])),
+            OverviewPanel(
                 "Latency: reception of a command to the step that applies it",
                 partial(draw_latency, seconds=latency.time_s, latency_us=latency.received_us),
                 missing(latency.received_us),
@@ -105,7 +105,7 @@ def overview(
                 seconds, effort,
                 reason=missing(effort) or ("" if np.nanmax(effort) else "no difference"),
             ),
-            Panel(
+            OverviewPanel(
                 "Error against computing time used, over the run",
                 partial(
                     draw_used, estimates=dict(zip(ESTIMATES, errors, strict=True)), reports=len(at)

@@ -12,10 +12,10 @@ import numpy as np
 
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.studies.model_errors import heavier, scaled
 
 Triple = tuple[float, float, float]
 
@@ -105,35 +105,11 @@ def mass_matrix(scene: Scene) -> Array:
     return np.asarray(np.linalg.inv(np.stack(columns, axis=1)))
 
 
-def times(inertia: Inertia, scale: float) -> Inertia:
-    """Scale an inertia."""
-    names = ("xx", "yy", "zz", "xy", "xz", "yz")
-    return Inertia(**{name: scale * getattr(inertia, name) for name in names})
-
-
-def heavier(scale: float) -> Scene:
-    """Scale all inertias."""
-    scene = spun(2.0)
-
-    def links(old: tuple[Link, Link, Link]) -> tuple[Link, Link, Link]:
-        first, second, third = (
-            Link(inertia=times(link.inertia or Inertia(xx=0.0, yy=0.0, zz=0.0), scale))
-            for link in old
-        )
-        return (first, second, third)
-
-    return replace(
-        scene,
-        star=replace(scene.star, inertia=times(scene.star.inertia, scale)),
-        actuated_links=links(scene.actuated_links),
-        intermediate_links=links(scene.intermediate_links),
-    )
-
-
-def odd_star(scale: float) -> Scene:
-    """Scale the star's inertia beside that of the links."""
-    scene = spun(2.0)
-    return replace(scene, star=replace(scene.star, inertia=times(scene.star.inertia, scale)))
+def with_inertias(star: float, links: float) -> Scene:
+    """Scale the inertia of the star, and those of the links."""
+    scene = heavier(spun(2.0), links)
+    inertia = scaled(base().star.inertia, star)
+    return replace(scene, star=replace(scene.star, inertia=inertia))
 
 
 def free() -> Scene:

@@ -30,17 +30,6 @@ REST = extremes.REST
 POSE = (0.7, 0.8, 0.75)
 
 
-def geometry_cases() -> Iterator[Case]:
-    """Yield the cases."""
-    for group, found in (
-        ("Parallel singularities", _parallel()),
-        ("Edges of the workspace", _edges()),
-        ("Poles and unusual shapes", _shapes()),
-    ):
-        for case in found:
-            yield replace(case, group=group)
-
-
 def singular_scene() -> Scene:
     """Return a scene with parallel singularities inside its workspace, limits ignored."""
     scene = extremes.free()
@@ -69,7 +58,9 @@ def near_singularity(angle: float, spin: float) -> Scene:
     return replace(scene, initial=initial)
 
 
-def _parallel() -> Iterator[Case]:
+def parallel_singularities() -> Iterator[Case]:
+    """Yield passages of a parallel singularity, and rest beside one."""
+
     def crossed(simulation: Simulation) -> float:
         start = Simulation(simulation.scene).conditioning["det_j2"]
         if start * simulation.conditioning["det_j2"] >= 0.0:
@@ -118,7 +109,8 @@ def _edge_pose(beta: float) -> Scene:
     return replace(extremes.base(), initial=Initial(gamma=(a, b, c)))
 
 
-def _edges() -> Iterator[Case]:
+def edges() -> Iterator[Case]:
+    """Yield starts at edges of the workspace."""
     for beta in (1e-3, 1e-6, 1e-9):
         yield Case(
             f"start at beta_1 = {beta:g} rad, inside",
@@ -193,7 +185,8 @@ def _with_star(inertia: Inertia) -> Scene:
     return replace(scene, star=replace(scene.star, inertia=inertia))
 
 
-def _shapes() -> Iterator[Case]:
+def shapes() -> Iterator[Case]:
+    """Yield poles and unusual shapes."""
     for rate in ((1.0, 1.0, 1.0), (1.0, -0.5, 0.25)):
 
         def unturned(simulation: Simulation, rate: tuple[float, float, float] = rate) -> float:

@@ -18,25 +18,14 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import LOOSE, Case
 from sst_ros.studies.extreme_scenes import REST, Triple
+from sst_ros.studies.model_errors import scaled
 from sst_ros.studies.sampled_data import pole
 
 QUARTER = math.pi / 4
 
 
-def load_cases() -> Iterator[Case]:
-    """Yield the cases."""
-    for group, found in (
-        ("Friction and actuators", _friction()),
-        ("Compliant stops", _contacts()),
-        ("Torques that jump", _jumps()),
-        ("Extreme ratios of inertia", _ratios()),
-        ("Long runs", _long()),
-    ):
-        for case in found:
-            yield replace(case, group=group)
-
-
-def _friction() -> Iterator[Case]:
+def friction() -> Iterator[Case]:
+    """Yield sharp friction, and actuators that lag."""
     push, breakaway = (0.3, 0.4, 0.2), 2.0
 
     def stuck(smoothing: float) -> Scene:
@@ -100,7 +89,8 @@ def bounce(stiffness: float, rate: float) -> Scene:
                    workspace=Workspace(at_edge="ignore"))  # fmt: skip
 
 
-def _contacts() -> Iterator[Case]:
+def contacts() -> Iterator[Case]:
+    """Yield compliant stops."""
     for stiffness in (1e3, 1e5, 1e9):
         yield Case(
             f"stops of {stiffness:g} N m/rad",
@@ -203,7 +193,9 @@ def noise(k: int) -> Triple:
     return (generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0))
 
 
-def _jumps() -> Iterator[Case]:
+def jumps() -> Iterator[Case]:
+    """Yield torques that jump."""
+
     def square(k: int) -> Triple:
         sign = 1.0 if k % 4 < 2 else -1.0
         return (2.0 * sign, -1.5 * sign, 1.0 * sign)
@@ -225,17 +217,13 @@ def _jumps() -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _ratios() -> Iterator[Case]:
-    def far(star: float, links: float) -> Scene:
-        scene = extremes.heavier(links)
-        inertia = extremes.times(extremes.base().star.inertia, star)
-        return replace(scene, star=replace(scene.star, inertia=inertia))
-
+def ratios() -> Iterator[Case]:
+    """Yield extreme ratios of inertias."""
     for star, links in ((1e9, 1e-9), (1e-9, 1e9)):
         yield Case(
             f"star x {star:g} with links x {links:g}",
             "energy is constant",
-            partial(far, star, links),
+            partial(extremes.with_inertias, star, links),
             REST, 10, 10_000_000, extremes.energy_drift, 1e-8,
             difficulty="inertias 1e18 apart in one mass matrix",
         )  # fmt: skip
@@ -243,7 +231,7 @@ def _ratios() -> Iterator[Case]:
 
         def bare(a: float = scale) -> Scene:
             scene, links = extremes.spun(2.0), (Link(), Link(), Link())
-            inertia = extremes.times(Inertia(xx=0.39, yy=0.39, zz=0.26), a)
+            inertia = scaled(Inertia(xx=0.39, yy=0.39, zz=0.26), a)
             return replace(scene, star=replace(scene.star, inertia=inertia),
                            actuated_links=links, intermediate_links=links)  # fmt: skip
 
@@ -255,7 +243,9 @@ def _ratios() -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _long() -> Iterator[Case]:
+def long_runs() -> Iterator[Case]:
+    """Yield long runs."""
+
     def residual(simulation: Simulation) -> float:
         return max(abs(simulation.energy_residual), simulation.closure_residual)
 

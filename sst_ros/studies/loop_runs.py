@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 from sst_ros.runtime.pacing import Pacer, SteadyTime
@@ -17,7 +18,7 @@ from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State, Triple
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
 
 TorqueOf = Callable[[Any], Any]
 """Torques of the tick that begins now [N m], constant or a `SineTorque`, from the simulation."""
@@ -71,27 +72,15 @@ class LoopOutput:
         """Return no topic: there are no subscribers to wait for."""
         return []
 
-    def start(self) -> None:
-        """Do nothing."""
-
-    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
-        """Do nothing."""
-
     def sample(self, simulation: HasState, stamp_ns: int) -> None:
         """Keep the state."""
         self.states.append(simulation.state)
         self.times.append(time.thread_time())
 
-    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
-        """Do nothing."""
+    def _nothing(self, *_: Any, **__: Any) -> None:
+        """Do nothing: there is nobody to publish to."""
 
-    def phase_changed(self, phase: str) -> None:
-        """Do nothing."""
-
-
-class _Owner:
-    def __init__(self, parameters: SimulatorParameters) -> None:
-        self.parameters = parameters
+    start = ticks = idle = phase_changed = _nothing
 
 
 def run_in_loop(
@@ -119,7 +108,8 @@ def run_in_loop(
         scene=scene.name, rate=1, publish_rate=1, duration=float(ticks), real_time_factor=0.0
     )
     object.__setattr__(given, "period", period_ns)
-    owner, output = _Owner(given), LoopOutput()
+    owner: Any = SimpleNamespace(parameters=given)
+    output = LoopOutput()
     pacer = Pacer(period_ns, 0.0, SteadyTime())
     loop = RunLoop(scene, build, owner, FunctionInput(owner, scene, torque), pacer, output)
     thread = threading.Thread(target=loop.run, daemon=True)

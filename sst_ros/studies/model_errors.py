@@ -60,12 +60,10 @@ def heavier(scene: Scene, factor: float) -> Scene:
         rotor = factor * actuators.rotor_inertia
         actuators = dataclasses.replace(actuators, rotor_inertia=rotor)
     if payload is not None:
-        inertia = payload.inertia and _inertia(payload.inertia, factor)
+        inertia = payload.inertia and scaled(payload.inertia, factor)
         payload = dataclasses.replace(payload, mass=factor * payload.mass, inertia=inertia)
     star = scene.star
-    star = dataclasses.replace(
-        star, mass=factor * star.mass, inertia=_inertia(star.inertia, factor)
-    )
+    star = dataclasses.replace(star, mass=factor * star.mass, inertia=scaled(star.inertia, factor))
     actuated, intermediate = (
         (_link(first, factor), _link(second, factor), _link(third, factor))
         for first, second, third in (scene.actuated_links, scene.intermediate_links)
@@ -101,9 +99,10 @@ def model_errors() -> Iterator[ModelError]:
 
 
 def _link(link: Link, factor: float) -> Link:
-    inertia = link.inertia and _inertia(link.inertia, factor)
+    inertia = link.inertia and scaled(link.inertia, factor)
     return dataclasses.replace(link, mass=factor * link.mass, inertia=inertia)
 
 
-def _inertia(inertia: Inertia, factor: float) -> Inertia:
+def scaled(inertia: Inertia, factor: float) -> Inertia:
+    """Return `factor` times an inertia."""
     return Inertia(**{key: factor * value for key, value in dataclasses.asdict(inertia).items()})

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.output_folder import writing
 from sst_ros.plot.style import save_figure
 from sst_ros.report.summary import made_on
@@ -22,16 +22,12 @@ def table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = Non
     """Return a DataFrame of rows; what is unknown stays None.
 
     Raises:
-        InputError: pandas is not installed.
+        MissingDependency: pandas is not installed.
 
     """
-    try:
-        import pandas
-    except ImportError:
-        allowed = "needs pandas: pip install 'sst_ros[report]'"
-        raise InputError("study", [Problem("pandas", None, allowed)]) from None
     listed = list(rows)
-    frame = pandas.DataFrame(listed, columns=None if columns is None else list(columns))
+    names = None if columns is None else list(columns)
+    frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
         values = [row.get(name) for row in listed]
         if None in values and all(type(value) is int for value in values if value is not None):

@@ -23,19 +23,6 @@ RIGHT = math.pi / 2
 MS = 1_000_000
 
 
-def scaling_cases() -> Iterator[Case]:
-    """Yield the cases by group."""
-    for group, difficulty, found in (
-        ("Time scales", "rates over twelve decades", _scaled_times()),
-        ("Inertia scales", "numbers far from 1, or far from each other", _scaled_inertias()),
-        ("Violent motion", "accelerations of 1e8 rad/s^2, rates of 1e6 rad/s", _violent()),
-        ("Starts at limits", "a joint at its limit, where a sign decides", _starts()),
-        ("Stiff loads", "decay rates far above those of the motion", _stiff()),
-    ):
-        for case in found:
-            yield replace(case, group=group, difficulty=case.difficulty or difficulty)
-
-
 def pushed(scale: float) -> Triple:
     """Return the torques of the reference motion times `scale` [N m]."""
     a, b, c = extremes.PUSH
@@ -47,7 +34,8 @@ def from_reference(simulation: Simulation) -> float:
     return extremes.apart(simulation, extremes.reference())
 
 
-def _scaled_times() -> Iterator[Case]:
+def scaled_times() -> Iterator[Case]:
+    """Yield motions at another speed."""
     for scale in (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4):
         yield Case(
             f"time x {scale:g}",
@@ -57,20 +45,24 @@ def _scaled_times() -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _scaled_inertias() -> Iterator[Case]:
+def scaled_inertias() -> Iterator[Case]:
+    """Yield motions with other inertias."""
     for scale in (1e-12, 1e-6, 1e6, 1e9):
         yield Case(
             f"inertia x {scale:g}", "the same motion, under torques scaled alike",
-            partial(extremes.heavier, scale), pushed(scale), 20, 10 * MS, from_reference, 1e-12,
+            partial(extremes.with_inertias, scale, scale), pushed(scale), 20, 10 * MS,
+            from_reference, 1e-12,
         )  # fmt: skip
     for scale in (1e-9, 1e9):
         yield Case(
             f"star's inertia x {scale:g} beside the same links", "energy is kept",
-            partial(extremes.odd_star, scale), REST, 10, 10 * MS, extremes.energy_drift, 1e-9,
+            partial(extremes.with_inertias, scale, 1.0), REST, 10, 10 * MS,
+            extremes.energy_drift, 1e-9,
         )  # fmt: skip
 
 
-def _violent() -> Iterator[Case]:
+def violent() -> Iterator[Case]:
+    """Yield torques and spins beyond all measure."""
     for name, scene, refusal in (
         ("against an end of the stroke", extremes.base, "StrokeExceeded"),
         ("into a serial singularity", extremes.free, "SingularityReached"),
@@ -88,7 +80,9 @@ def _violent() -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _starts() -> Iterator[Case]:
+def starts() -> Iterator[Case]:
+    """Yield starts at limits of the joints."""
+
     def at(gamma: Triple) -> Scene:
         return replace(extremes.base(), initial=Initial(gamma=gamma))
 
@@ -110,7 +104,8 @@ def _starts() -> Iterator[Case]:
     )  # fmt: skip
 
 
-def _stiff() -> Iterator[Case]:
+def stiff() -> Iterator[Case]:
+    """Yield stiff loads."""
     rests = (0.9, 0.7, 0.8)
     start = math.pi / 4
 

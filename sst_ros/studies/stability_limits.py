@@ -27,6 +27,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
+from sst_ros.studies.sampled_data import largest_stable
 from sst_ros.studies.step_advice import step_advice
 from sst_ros.sweeps.job_list import run_jobs
 
@@ -189,15 +190,7 @@ def largest_step(family: str, method: Method, coefficient: float) -> LargestStep
 
 def bisect_step(stable: Callable[[float], bool]) -> float:
     """Return the largest h for which `stable` holds, to one per cent; nan where there is none."""
-    if stable(LONGEST_S):
-        return LONGEST_S
-    low, high = math.log(_SHORTEST_S), math.log(LONGEST_S)
-    if not stable(_SHORTEST_S):
-        return math.nan
-    while high - low > 0.01:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(math.exp(middle)) else (low, middle)
-    return math.exp(low)
+    return LONGEST_S if stable(LONGEST_S) else largest_stable(stable, _SHORTEST_S, 1e3, 0.01)
 
 
 def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:

@@ -10,13 +10,11 @@ from pathlib import Path
 
 from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
+from sst_ros.studies import geometry_cases, load_cases, scaling_cases
 from sst_ros.studies.extreme_batches import batch_groups, run_batch
 from sst_ros.studies.extreme_cases import Case
 from sst_ros.studies.extreme_results import CaseResult, evaluate_case
-from sst_ros.studies.geometry_cases import geometry_cases
-from sst_ros.studies.load_cases import load_cases
 from sst_ros.studies.results import provenance, records, table, write
-from sst_ros.studies.scaling_cases import scaling_cases
 from sst_ros.studies.stability_limits import LONGEST_S, largest_steps, regions, scene_points
 from sst_ros.studies.stability_page import case_table, faults, lines, page
 from sst_ros.sweeps.job_list import run_jobs
@@ -60,10 +58,31 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     return all(case.passed for case in cases) and not list(faults())
 
 
+GROUPS = (
+    ("Time scales", scaling_cases.scaled_times, "rates over twelve decades"),
+    ("Inertia scales", scaling_cases.scaled_inertias, "numbers far from 1, or from each other"),
+    ("Violent motion", scaling_cases.violent, "accelerations of 1e8 rad/s^2, rates of 1e6 rad/s"),
+    ("Starts at limits", scaling_cases.starts, "a joint at its limit, where a sign decides"),
+    ("Stiff loads", scaling_cases.stiff, "decay rates far above those of the motion"),
+    ("Parallel singularities", geometry_cases.parallel_singularities, ""),
+    ("Edges of the workspace", geometry_cases.edges, ""),
+    ("Poles and unusual shapes", geometry_cases.shapes, ""),
+    ("Friction and actuators", load_cases.friction, ""),
+    ("Compliant stops", load_cases.contacts, ""),
+    ("Torques that jump", load_cases.jumps, ""),
+    ("Extreme ratios of inertia", load_cases.ratios, ""),
+    ("Long runs", load_cases.long_runs, ""),
+)
+"""Headings of the page, the cases below each, and why they are hard where a case names nothing."""
+
+
 @lru_cache(maxsize=1)
 def catalogue() -> tuple[Case, ...]:
     """Return all cases."""
-    return (*scaling_cases(), *geometry_cases(), *load_cases())
+    return tuple(
+        replace(case, group=group, difficulty=case.difficulty or difficulty)
+        for group, cases, difficulty in GROUPS for case in cases()
+    )  # fmt: skip
 
 
 def _evaluated(number: int) -> CaseResult:
