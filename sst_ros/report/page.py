@@ -91,7 +91,9 @@ def overview(
                 partial(draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us),
                 missing(timing.period_us), over_time=False,
             ),
-            OverviewPanel("Cumulative losses", partial(draw_losses, losses=losses, end=seconds[-1])),
+            OverviewPanel(
+                "Cumulative losses", partial(draw_losses, losses=losses, end=seconds[-1])
+            ),
             OverviewPanel(
                 "Latency: reception of a command to the step that applies it",
                 partial(draw_latency, seconds=latency.time_s, latency_us=latency.received_us),
