@@ -8,8 +8,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "sst_ros"
-INIT = Path(__file__).parent / NAME / "__init__.py"
-(VERSION,) = re.findall(r'^__version__ = "(.+)"$', INIT.read_text(encoding="utf-8"), re.M)
+VERSION_FILE = Path(__file__).parent / NAME / "version.py"
+(VERSION,) = re.findall(r'^VERSION = "(.+)"$', VERSION_FILE.read_text(encoding="utf-8"), re.M)
 ROS_MESSAGES = (
     "std",
     "sensor",

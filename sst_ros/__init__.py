@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import importlib
 
+from sst_ros.version import VERSION
+
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
     from sst_ros.control.controller import Controller as Controller
@@ -46,7 +48,7 @@ if TYPE_CHECKING:
     direct_kinematics, inverse_kinematics = _kinematics.direct, _kinematics.inverse
     load_scene, read_bag = _scene.load, _recording.read
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 # Module of each name, and its name there where that is another one.
 _MODULES = {

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory: derived quantities against the states of Simulation, files to the bit, at(t)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sst_ros.errors import InputError
+from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
@@ -95,6 +98,16 @@ def test_between_samples_it_is_as_accurate_as_at_them(torque):
     np.testing.assert_allclose(found.torque, direct.torque, rtol=0, atol=1e-12)
     with pytest.raises(InputError, match=r"must be times from 0 to 0.2"):
         coarse.at(0.3)
+
+
+def test_between_samples_the_actuators_clamp_as_at_them():
+    scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=0.5))
+    table = TorqueTable([0.0, 0.03], [[2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]])
+    coarse, fine = (
+        simulate(scene, table, 0.05, t_eval=np.linspace(0.0, 0.05, samples), tolerance=1e-12)
+        for samples in (3, 11)
+    )
+    np.testing.assert_allclose(coarse.at(fine.t).quaternion, fine.quaternion, rtol=0, atol=1e-11)
 
 
 def test_samples_under_held_torques_need_nothing_else():

@@ -11,6 +11,7 @@ import traceback
 from sst_ros.cli.failures import failure
 from sst_ros.cli.parsing import Parser
 from sst_ros.errors import printable
+from sst_ros.version import VERSION
 
 PROGRAM = "sst-ros"
 COMMANDS = {
@@ -106,9 +107,7 @@ def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
 
 
 def _version() -> str:
-    import sst_ros
-
-    return f"{PROGRAM} {sst_ros.__version__}"
+    return f"{PROGRAM} {VERSION}"
 
 
 def _abandon_stdout() -> None:

@@ -55,20 +55,19 @@ class AppliedTorque:
         self._start = 0.0
 
     def begin(self, torque: Torque, start: float) -> Vector3:
-        """Take the torques of a period that begins at `start` [s].
+        """Take the sine or function of a period that begins at `start` [s].
 
         Returns:
-            Three numbers of the drive: torques [N m], phases of a sine [rad], zero for a function.
+            Three numbers of the drive: phases of the sine [rad], zero for a function.
 
         """
         if isinstance(torque, SineTorque):
             rows = zip(torque.frequency, torque.phase, strict=True)
             first, second, third = (math.fmod(f * start + p, math.tau) for f, p in rows)
             return first, second, third
-        if callable(torque):
-            self._torque, self._start = torque, start
-            return (0.0, 0.0, 0.0)
-        return clamped(torque, self._limit)
+        assert callable(torque)
+        self._torque, self._start = torque, start
+        return (0.0, 0.0, 0.0)
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""

@@ -36,24 +36,22 @@ class ErrorGrowth(NamedTuple):
     Attributes:
         coulomb: joints with Coulomb friction (0 to 8, by kind and leg), and its smoothing [rad/s],
             where fixed steps may step over its sign change.
-        steps: accepted steps since the start.
         lost, total: growth of the distance of the body rates in steps of order 1, and in all.
 
     """
 
     coulomb: tuple[tuple[int, float], ...] = ()
-    steps: int = 0
     lost: float = 0.0
     total: float = 0.0
 
-    def after(self, at: Point, end: Point, steps: int = 1) -> ErrorGrowth:
-        """Add steps, of which the last led from `at` to `end`."""
+    def after(self, at: Point, end: Point) -> ErrorGrowth:
+        """Add a step from `at` to `end`."""
         if not self.coulomb:
-            return ErrorGrowth((), self.steps + steps)
+            return self
         old, new = ([a - b for a, b in zip(x.y[4:7], x.z[4:7], strict=True)] for x in (at, end))
         grown = math.dist(old, new)
         lost = grown if self._steps_over_sign_change(at, end) else 0.0
-        return ErrorGrowth(self.coulomb, self.steps + steps, self.lost + lost, self.total + grown)
+        return ErrorGrowth(self.coulomb, self.lost + lost, self.total + grown)
 
     def _steps_over_sign_change(self, at: Point, end: Point) -> bool:
         for joint, smoothing in self.coulomb:
@@ -63,8 +61,8 @@ class ErrorGrowth(NamedTuple):
                 return True
         return False
 
-    def errors(self, at: Point) -> tuple[float, float]:
-        """Estimated global errors of orientation [rad] and body rate [rad/s] of a point.
+    def errors(self, at: Point, steps: int) -> tuple[float, float]:
+        """Estimated global errors of orientation [rad] and body rate [rad/s] after some steps.
 
         Twice the asymptotic value: at loose tolerances the terms of higher order hide a part of it.
         """
@@ -72,7 +70,7 @@ class ErrorGrowth(NamedTuple):
         same = math.dist(y[:4], z[:4])
         opposite = math.dist(y[:4], [-x for x in z[:4]])  # q and -q are the same rotation
         apart = (2.0 * min(same, opposite), math.dist(y[4:7], z[4:7]))
-        rounding = _ROUNDING * math.sqrt(self.steps + 1.0)
+        rounding = _ROUNDING * math.sqrt(steps + 1.0)
         share = max(2.0 / (2.0**at.order - 1.0), self.lost / self.total if self.lost else 0.0)
         scale = (1.0, max(1.0, math.hypot(*y[4:7])))
         first, second = (

@@ -45,6 +45,7 @@ class LimitReached(Exception):
 class Checkpoint(NamedTuple):
     """All that a period changes beside the point, and the stepper in use before it."""
 
+    steps: int
     growth: ErrorGrowth
     in_use: AdaptiveStepper
     stepper: AdaptiveStepper
@@ -63,6 +64,11 @@ class Propagator:
         derivative: derivative of the state in plain Python, in place of the traced one and with
             its inputs; for explicit methods, and for torques that are numbers or functions.
         limits: whether the limits of the scene end the motion.
+
+    Attributes:
+        dynamics, ode: of the scene.
+        budget: as given; `budget.spent` counts evaluations.
+        accepted_steps: number of accepted steps since the start.
 
     """
 
@@ -106,6 +112,7 @@ class Propagator:
             derivative=self._torque.derivative,
             budget=budget,
         )
+        self.accepted_steps = 0
         self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
         self._first = self._growth, self._constant.checkpoint(), self._function.checkpoint()
         self._before = self._checkpoint(self._constant)
@@ -119,11 +126,6 @@ class Propagator:
     def changes(self) -> list[MethodChange]:
         """Changes of method."""
         return self._stepper.history
-
-    @property
-    def accepted_steps(self) -> int:
-        """Number of accepted steps since the start."""
-        return self._growth.steps
 
     def begin(self, y: list[float]) -> Point:
         """Complete quaternion, body rate and lagged torques, zero by default, to a state."""
@@ -166,10 +168,12 @@ class Propagator:
                 and nothing has changed.
 
         """
-        stepper = self._stepper_for(torque)
+        if type(torque) is tuple:
+            stepper, numbers = self._constant, torque
+        else:
+            stepper, numbers = self._stepper_for(torque), self._torque.begin(torque, start)
         before = self._checkpoint(stepper)
         self._stepper = stepper
-        numbers = torque if type(torque) is tuple else self._torque.begin(torque, start)
         drive = (*numbers, *moment)
         try:
             done = 0
@@ -199,6 +203,7 @@ class Propagator:
 
     def reset(self) -> None:
         """Forget what has happened."""
+        self.accepted_steps = 0
         self._growth, constant, function = self._first
         self._stepper = self._constant
         self._constant.restore(constant)
@@ -217,14 +222,15 @@ class Propagator:
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
-        return self._growth.errors(at)
+        return self._growth.errors(at, self.accepted_steps)
 
     def _checkpoint(self, stepper: AdaptiveStepper) -> Checkpoint:
         """Return what to go back to after a period by this stepper."""
-        return Checkpoint(self._growth, self._stepper, stepper, stepper.checkpoint())
+        kept = stepper.checkpoint()
+        return Checkpoint(self.accepted_steps, self._growth, self._stepper, stepper, kept)
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        self._growth, self._stepper, stepper, kept = checkpoint
+        self.accepted_steps, self._growth, self._stepper, stepper, kept = checkpoint
         stepper.restore(kept)
 
     def _stepper_for(self, torque: Torque) -> AdaptiveStepper:
@@ -247,14 +253,14 @@ class Propagator:
         self, at: Point, h: float, count: int, drive: tuple[float, ...]
     ) -> tuple[Point, int]:
         """Advance by up to `count` periods of h [s] that take one pair of steps each."""
-        if self._growth.coulomb:  # the joints are looked at after each period
+        stepper, coulomb = self._stepper, self._growth.coulomb
+        if coulomb:  # the joints are looked at after each period
             count = 1
-        done, (y, z, joints) = self._stepper.step_many(
-            h, count, (at.y, at.z, at.joints), drive, at.order
-        )
-        end = Point(y, z, joints, self._stepper.method.order)
-        if done:
-            self._growth = self._growth.after(at, end, done)
+        done, (y, z, joints) = stepper.step_many(h, count, at[:3], drive, at.order)
+        end = Point(y, z, joints, stepper.method.order)
+        self.accepted_steps += done
+        if coulomb and done:
+            self._growth = self._growth.after(at, end)
         return end, done
 
     def _adaptive(self, at: Point, start: float, h: float, drive: tuple[float, ...]) -> Point:
@@ -275,6 +281,7 @@ class Propagator:
         """Go on from x to h, or to the first limit or contact event before."""
         for step in self._stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
             end = self._point(step.y, step.z, step.order)
+            self.accepted_steps += 1
             self._growth = self._growth.after(at, end)
             if step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
                 at = end

@@ -19,7 +19,7 @@ _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
-"""Bounds of one call of `Simulation.steps`, after which requests are served."""
+"""Bounds of one call of `Simulation.advance`, after which requests are served."""
 _LONGEST_SLEEP_NS = 2_000_000
 """Bounds the ticks that one sleep ends in: the queue of commands keeps ten messages."""
 _LONGEST_WAIT_S = 0.1
@@ -258,7 +258,7 @@ class TickLoop:
         before = simulation.time_ns
         self.step_since = began = time.perf_counter()
         try:
-            simulation.steps(torque, self._period_ns, ticks, moment)
+            simulation.advance(torque, self._period_ns, ticks, moment)
         finally:
             took = time.perf_counter() - began
             self.step_since = 0.0

@@ -52,7 +52,8 @@ class _Gap:
         moment = (0.0,) * (len(dynamics.drive) - 3)
         at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
         found = []
-        for end, torque in self._pieces(k, t, float(times[-1])):
+        for end, asked in self._pieces(k, t, float(times[-1])):
+            torque = propagator.acting(asked)
             for time in (*times[(times > t) & (times < end)].tolist(), end):
                 if time > t:
                     at, _ = propagator.advance(at, t, time - t, 1, torque, moment)

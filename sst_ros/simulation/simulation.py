@@ -161,32 +161,47 @@ class Simulation:
 
         """
         refuse_bad_step(torque, dt_ns, moment)
-        torque = self._propagator.acting(torque)
+        torque = self.acting(torque)
         if callable(torque) and not self._warned:
             self._warned = True
             text = "a torque function runs in plain Python, slower than compiled=True; same digits"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
-        acting = torque, (*moment,) if self.dynamics.moved else ()
-        while count > 0:
-            point, done = self._advanced(dt_ns / NANOSECONDS, count, *acting)
-            time_ns = self._now.time_ns + done * dt_ns
-            self._before, self._now = self._now, _Instant(time_ns, point, *acting)
-            count -= done
+        self.advance(torque, dt_ns, count, moment)
 
-    def _advanced(
-        self, h: float, count: int, torque: Torque, moment: tuple[float, ...]
-    ) -> tuple[Point, int]:
-        """Return where one to `count` steps of h [s] lead, and how many were done."""
-        start = self._now.time_ns / NANOSECONDS
-        try:
-            return self._propagator.advance(self._now.point, start, h, count, torque, moment)
-        except LimitReached as reached:
-            assert reached.limit.error is not None
-            raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
-        except (CannotStep, ArithmeticError, ValueError) as error:
-            numbers = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
-            kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
-            raise kind(f"{error or 'not finite'} ({numbers})", start, self.state) from None
+    def acting(self, torque: Torque) -> Torque:
+        """Return what acts: finite torques [N m] within the limit of the actuators."""
+        return self._propagator.acting(torque)
+
+    def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
+        """Do what `steps` does, for arguments that have been checked.
+
+        Args:
+            torque: one of `acting`.
+            dt_ns: length of a step [ns], > 0.
+            count: number of steps.
+            moment: three finite numbers.
+
+        Raises:
+            as `steps`, without InputError.
+
+        """
+        propagator, h = self._propagator, dt_ns / NANOSECONDS
+        held = tuple(moment) if self.dynamics.moved else ()
+        while count > 0:
+            at = self._now
+            start = at.time_ns / NANOSECONDS
+            try:
+                point, done = propagator.advance(at.point, start, h, count, torque, held)
+            except LimitReached as reached:
+                assert reached.limit.error is not None
+                raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
+            except (CannotStep, ArithmeticError, ValueError) as error:
+                numbers = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
+                kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
+                raise kind(f"{error or 'not finite'} ({numbers})", start, self.state) from None
+            self._before = at
+            self._now = _Instant(at.time_ns + done * dt_ns, point, torque, held)
+            count -= done
 
     def within(self, time_ns: int) -> State:
         """State at a time inside the last step, to the full accuracy of the run.

@@ -50,9 +50,9 @@ class FunctionInput(TorqueInput):
         super().__init__(owner, scene.actuators, _NoMessages(), _NoMessages())
         self._torque_of = torque
 
-    def torque(self, simulation: HasState, now_ns: int) -> Any:
+    def torque(self, simulation: Any, now_ns: int) -> Any:
         """Return the torques of the tick that begins now."""
-        return self._torque_of(simulation)  # the simulation clamps them
+        return simulation.acting(self._torque_of(simulation))
 
 
 class LoopOutput:

@@ -14,6 +14,7 @@ import numpy as np
 from sst_ros.sweeps import parts
 from sst_ros.sweeps.prepared import prepared
 from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -70,10 +71,8 @@ def versions() -> tuple[tuple[str, str], ...]:
     import numba
     import scipy
 
-    import sst_ros
-
     return (
-        ("sst_ros", sst_ros.__version__),
+        ("sst_ros", VERSION),
         ("python", ".".join(platform.python_version_tuple()[:2])),
         ("numpy", np.__version__),
         ("scipy", scipy.__version__),

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,9 +78,7 @@ def complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
         InputError: a file is that of another study or version.
 
     """
-    import sst_ros
-
-    expected = {"digest": study.digest, "steps": steps, "version": sst_ros.__version__}
+    expected = {"digest": study.digest, "steps": steps, "version": VERSION}
     found = set()
     for path in sorted(folder.glob("part-*.parquet")):
         about = about_of(path)

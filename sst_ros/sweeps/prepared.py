@@ -30,6 +30,7 @@ from sst_ros.sweeps.sweep_columns import (
     with_faults,
 )
 from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -111,10 +112,8 @@ class PreparedSweep:
     @cached_property
     def about(self) -> dict[str, Any]:
         """Metadata of the files: study, its digest, version, units."""
-        import sst_ros
-
         return {
-            "version": sst_ros.__version__,
+            "version": VERSION,
             "digest": self.study.digest,
             "steps": self.steps,
             "duration": self.study.length,

@@ -311,10 +311,10 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
     class Broken(Simulation):
         broken = False
 
-        def steps(self, *args):
+        def advance(self, *args):
             if self.broken:
                 raise error
-            super().steps(*args)
+            super().advance(*args)
 
     bench = Bench(build=Broken)
     with bench.running() as loop:
@@ -392,10 +392,10 @@ def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
         stuck = threading.Event()
         released = threading.Event()
 
-        def steps(self, *args):
+        def advance(self, *args):
             while self.stuck.is_set() and not self.released.is_set():
                 pass
-            super().steps(*args)
+            super().advance(*args)
 
     bench = Bench(build=Stuck)
     with bench.running() as loop:

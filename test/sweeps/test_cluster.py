@@ -29,7 +29,7 @@ LIMIT_S = 60
 VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
 STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
 WORKER = "from distributed.cli.dask_worker import main; main()"
-OLD = "import sst_ros; sst_ros.__version__ = '0.0.9'"
+OLD = "from sst_ros import version; version.VERSION = '0.0.9'"
 FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))"
 POISONED = """
 import os, signal
