@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from symmetric_motion import inertia, inertia_slope
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.symmetric_motion import inertia, inertia_slope
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
-from sst_ros.integration import coarse_solution
+from sst_ros.integration.coarse_solution import Point, rescaled
 from sst_ros.integration.compiled_method import (
+    JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
     Method,
@@ -19,9 +20,6 @@ from sst_ros.integration.compiled_method import (
 from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
 from sst_ros.integration.step_control import GROW, better_method, step_factor
-
-JACOBIAN_COST = 30
-"""Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
 _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
@@ -98,12 +96,6 @@ class AdaptiveStepper:
         """The method in use."""
         return self._current.method
 
-    @property
-    def pair_cost(self) -> int:
-        """Evaluations of `step_pair`, which takes three steps."""
-        method = self._current.method
-        return 3 * (len(method.a) + (JACOBIAN_COST if isinstance(method, Rosenbrock) else 0))
-
     def load(self, h: float, at: StepPoint, d: Vector) -> None:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
         if self._derivative is not None:
@@ -142,9 +134,9 @@ class AdaptiveStepper:
             h = min(self._h, left)
             if left - h < 1e-3 * h:
                 h = left
-            z = coarse_solution.rescaled(y, z, order, self.method.order)
+            z = rescaled(y, z, order, self.method.order)
             order = self.method.order
-            self.budget.charge(self.pair_cost)
+            self.budget.charge(self._current.pair_cost)
             new_y, new_z, size = self._current.step_pair(t, h, y, z, d)
             factor = self._factor(size)
             if size > self.tolerance:
@@ -164,9 +156,7 @@ class AdaptiveStepper:
                 return
             t, y, z = t + h, new_y, new_z
 
-    def step_many(
-        self, h: float, count: int, at: StepPoint, d: Vector, order: int
-    ) -> tuple[int, StepPoint]:
+    def step_many(self, h: float, count: int, at: Point, d: Vector) -> tuple[int, Point]:
         """Do what `accepted_steps` does for up to `count` periods of h, one step a period.
 
         Returns how many were done, and where the last one ended: the next may need several steps or
@@ -175,22 +165,24 @@ class AdaptiveStepper:
         """
         if self._h < h or self._derivative is not None:
             return 0, at
-        method, cost = self._current.method, self.pair_cost
+        machine = self._current
+        method, cost = machine.method, machine.pair_cost
         if self.budget.per_period is not None:
             count = min(count, max(self.budget.per_period // cost, 1))
         implicit = isinstance(method, Rosenbrock)
         if implicit and self._auto:
             count = min(count, _CHOOSE_EVERY - 1 - self._since_choice)
+        y, z, joints, order = at
         if order != method.order:
-            at = (at[0], coarse_solution.rescaled(at[0], at[1], order, method.order), at[2])
-        done, end = self._current.step_many(h, count, self.tolerance, at, d)
+            z = rescaled(y, z, order, method.order)
+        done, end = machine.step_many(h, count, self.tolerance, (y, z, joints), d)
         self.budget.spent += done * cost
         if self._h < GROW * h:
-            for size in self._current.sizes[:done]:
+            for size in machine.sizes[:done]:
                 self._h = max(self._h, h * self._factor(float(size)))
         if implicit:
             self._since_choice += done
-        return done, end
+        return done, Point(*end, method.order)
 
     def step_sequence(
         self, first: int, periods: tuple[Any, Any, Any], at: StepPoint, reached: Any
@@ -200,17 +192,17 @@ class AdaptiveStepper:
         Arguments and results are those of `CompiledMethod.step_sequence`.
         """
         done, end = self._current.step_sequence(first, periods, self.tolerance, at, reached)
-        self.budget.spent += (done - first) * self.pair_cost
+        self.budget.spent += (done - first) * self._current.pair_cost
         return done, end
 
     def repeat(
         self, start: float, x: float, y: Vector, z: Vector, d: Vector, order: int
     ) -> tuple[list[float], list[float], int]:
         """Repeat an accepted step with the shorter length x: solution, coarse solution, order."""
-        z = coarse_solution.rescaled(y, z, order, self.method.order)
+        z = rescaled(y, z, order, self.method.order)
         if not x:
             return list(y), list(z), self.method.order
-        self.budget.charge(self.pair_cost)
+        self.budget.charge(self._current.pair_cost)
         new_y, new_z, _ = self._current.step_pair(start, x, y, z, d)
         return new_y, new_z, self.method.order
 

@@ -47,12 +47,34 @@ class AppliedTorque:
         limit: largest torque of an actuator [N m], or None.
         rhs: derivative of the state in place of that of `ode`, with its inputs.
 
+    Attributes:
+        limit: as given.
+
     """
 
     def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
-        self._ode, self._limit, self._rhs = ode, limit, rhs
+        self._ode, self.limit, self._rhs = ode, limit, rhs
+        self._traced = rhs is None
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
+
+    def acting(self, torque: Torque) -> Torque:
+        """Return what acts: numbers within the limit of the actuators; functions as they are.
+
+        A sine becomes a function where it is no part of the program: the actuators clamp it, or
+        the derivative was given.
+        """
+        if isinstance(torque, SineTorque):
+            return torque if self._traced and self.limit_of(torque) is None else torque.at
+        if callable(torque):
+            return torque
+        first, second, third = torque
+        return clamped((first, second, third), self.limit)
+
+    def limit_of(self, torque: SineTorque) -> float | None:
+        """Return the limit of the actuators where it clamps a sine [N m]."""
+        limit = self.limit
+        return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
 
     def begin(self, torque: Torque, start: float) -> Vector3:
         """Take the sine or function of a period that begins at `start` [s].
@@ -75,7 +97,7 @@ class AppliedTorque:
             torque = torque(time, y)
         elif isinstance(torque, SineTorque):
             torque = torque.at(time)
-        return clamped(torque(time) if callable(torque) else torque, self._limit)
+        return clamped(torque(time) if callable(torque) else torque, self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""

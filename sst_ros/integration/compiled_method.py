@@ -23,6 +23,9 @@ JointRanges = Sequence[tuple[int, float, float]]
 StepPoint = tuple[list[float], list[float], tuple[float, ...]]
 """Solution, coarse solution, and the joints' nine angles and nine rates."""
 
+JACOBIAN_COST = 30
+"""Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
+
 
 class CompiledMethod:
     """Steps of a system by a method.
@@ -33,6 +36,11 @@ class CompiledMethod:
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
         derivative: rhs(t, state.., drive..) to use instead of the ODE's, plain and explicit only.
         ranges: joints that `step_many` looks at, see `limits.ranges_of`.
+
+    Attributes:
+        system, method, compiled: as given.
+        pair_cost: evaluations of `step_pair`, which takes three steps.
+        sizes: local error estimates of the periods of the last `step_many`.
 
     """
 
@@ -49,6 +57,7 @@ class CompiledMethod:
         self.method = method
         self.compiled = compiled = compiled and codegen.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
+        self.pair_cost = 3 * (len(method.a) + (JACOBIAN_COST if implicit else 0))
         if derivative is not None and (implicit or compiled):
             raise ValueError("a derivative of its own needs an explicit method and plain Python")
         texts, constants = _source(system, method)

@@ -31,7 +31,6 @@ from sst_ros.integration.events import (
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.state import Vector3, clamped
 
 
 class LimitReached(Exception):
@@ -67,6 +66,7 @@ class Propagator:
 
     Attributes:
         dynamics, ode: of the scene.
+        torque: clamps torques, and evaluates those that are a function.
         budget: as given; `budget.spent` counts evaluations.
         accepted_steps: number of accepted steps since the start.
 
@@ -87,12 +87,11 @@ class Propagator:
         self.dynamics = Dynamics.of(scene)
         self.ode = ode_with_work(self.dynamics)
         self.budget = budget
-        self._untraced = derivative is not None
         self._limits = tuple(limits_of(scene, geometry)) if limits else ()
         self._contacts = tuple(contact_events_of(scene, geometry))
         self._ranges = ranges_of([*self._limits, *free_range(self._contacts)])
-        self._torque_limit = scene.actuators.torque_limit if scene.actuators else None
-        self._torque = AppliedTorque(self.ode, self._torque_limit, derivative)
+        limit = scene.actuators.torque_limit if scene.actuators else None
+        self.torque = AppliedTorque(self.ode, limit, derivative)
         self._new_stepper = partial(
             AdaptiveStepper,
             method=integrator,
@@ -102,20 +101,13 @@ class Propagator:
             budget=budget,
         )
         self._constant = self._stepper = self._new_stepper(self.ode, derivative=derivative)
-        self._sines: dict[SineTorque, AdaptiveStepper] = {}
+        self._others: dict[SineTorque | None, AdaptiveStepper] = {}
         # Torque functions are evaluated in Python, and have no Jacobian.
-        self._function = AdaptiveStepper(
-            self.ode,
-            "auto" if isinstance(METHODS.get(integrator), Rosenbrock) else integrator,
-            tolerance,
-            compiled=False,
-            derivative=self._torque.derivative,
-            budget=budget,
-        )
+        implicit = isinstance(METHODS.get(integrator), Rosenbrock)
+        self._explicit = "auto" if implicit else integrator
         self.accepted_steps = 0
         self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
-        self._first = self._growth, self._constant.checkpoint(), self._function.checkpoint()
-        self._before = self._checkpoint(self._constant)
+        self._first = self._before = self._checkpoint(self._constant)
 
     @property
     def method(self) -> str:
@@ -132,19 +124,6 @@ class Propagator:
         full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
         return Point(full, list(full), self.dynamics.joints(*full[:7]), self._stepper.method.order)
 
-    def acting(self, torque: Torque) -> Torque:
-        """Return what acts: numbers within the limit of the actuators; functions as they are.
-
-        A sine becomes a function where it is no part of the program: the actuators clamp it, or
-        the derivative was given.
-        """
-        if isinstance(torque, SineTorque):
-            return torque.at if self._untraced or self._limit_of(torque) else torque
-        if callable(torque):
-            return torque
-        first, second, third = torque
-        return clamped((first, second, third), self._torque_limit)
-
     def advance(
         self,
         at: Point,
@@ -156,7 +135,7 @@ class Propagator:
     ) -> tuple[Point, int]:
         """Advance by `count` periods of h [s] from `start` [s], or by fewer, but by one at least.
 
-        The torque is one of `acting`.
+        The torque is one of `AppliedTorque.acting`.
 
         Periods that take one pair of steps each are one call; another period is done by itself.
 
@@ -168,10 +147,8 @@ class Propagator:
                 and nothing has changed.
 
         """
-        if type(torque) is tuple:
-            stepper, numbers = self._constant, torque
-        else:
-            stepper, numbers = self._stepper_for(torque), self._torque.begin(torque, start)
+        stepper = self._stepper_for(torque)
+        numbers = torque if type(torque) is tuple else self.torque.begin(torque, start)
         before = self._checkpoint(stepper)
         self._stepper = stepper
         drive = (*numbers, *moment)
@@ -203,22 +180,14 @@ class Propagator:
 
     def reset(self) -> None:
         """Forget what has happened."""
-        self.accepted_steps = 0
-        self._growth, constant, function = self._first
-        self._stepper = self._constant
-        self._constant.restore(constant)
-        self._function.restore(function)
-        self._sines.clear()
-        self._before = self._checkpoint(self._constant)
+        self._restore(self._first)
+        self._others.clear()
+        self._before = self._first
 
     def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
         """Have the code loaded that periods of h [s] under constant torques may need."""
         load_root_finder()
         self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
-
-    def torque_at(self, torque: Torque, time: float, y: list[float]) -> Vector3:
-        """Torques that act at a time [s] and a state, within the limit of the actuators [N m]."""
-        return self._torque.at(torque, time, y)
 
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
@@ -234,20 +203,23 @@ class Propagator:
         stepper.restore(kept)
 
     def _stepper_for(self, torque: Torque) -> AdaptiveStepper:
-        """Return the stepper of constant torques, of a function, or of a sine, which is traced."""
-        if isinstance(torque, SineTorque):
-            if torque not in self._sines:
-                ode = ODE(
-                    self.dynamics, torque, limit=self._limit_of(torque), work=True, phases=True
+        """Return the stepper of constant torques, of functions, or of a sine, which is traced."""
+        if type(torque) is tuple:
+            return self._constant
+        sine = torque if isinstance(torque, SineTorque) else None
+        if sine not in self._others:
+            if sine is None:
+                new = self._new_stepper(
+                    self.ode, method=self._explicit, compiled=False, ranges=(),
+                    derivative=self.torque.derivative,
+                )  # fmt: skip
+            else:
+                limit = self.torque.limit_of(sine)
+                new = self._new_stepper(
+                    ODE(self.dynamics, sine, limit=limit, work=True, phases=True)
                 )
-                self._sines[torque] = self._new_stepper(ode)
-            return self._sines[torque]
-        return self._function if callable(torque) else self._constant
-
-    def _limit_of(self, torque: SineTorque) -> float | None:
-        """Return the limit of the actuators where it clamps a sine."""
-        limit = self._torque_limit
-        return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
+            self._others[sine] = new
+        return self._others[sine]
 
     def _step_many(
         self, at: Point, h: float, count: int, drive: tuple[float, ...]
@@ -256,8 +228,7 @@ class Propagator:
         stepper, coulomb = self._stepper, self._growth.coulomb
         if coulomb:  # the joints are looked at after each period
             count = 1
-        done, (y, z, joints) = stepper.step_many(h, count, at[:3], drive, at.order)
-        end = Point(y, z, joints, stepper.method.order)
+        done, end = stepper.step_many(h, count, at, drive)
         self.accepted_steps += done
         if coulomb and done:
             self._growth = self._growth.after(at, end)

@@ -98,8 +98,8 @@ class TickPropagator(Propagator):
             phases = np.multiply.outer(begin, self._sine.frequency) + self._sine.phase
             return np.asarray(np.fmod(phases, 2.0 * np.pi))
         drives = np.repeat(ticks.drives, parts, axis=0)
-        if self._torque_limit is not None:
-            drives[:, :3] = np.clip(drives[:, :3], -self._torque_limit, self._torque_limit)
+        if self.torque.limit is not None:
+            drives[:, :3] = np.clip(drives[:, :3], -self.torque.limit, self.torque.limit)
         return drives
 
     def _reached(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:

@@ -53,13 +53,13 @@ class _Gap:
         at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
         found = []
         for end, asked in self._pieces(k, t, float(times[-1])):
-            torque = propagator.acting(asked)
+            torque = propagator.torque.acting(asked)
             for time in (*times[(times > t) & (times < end)].tolist(), end):
                 if time > t:
                     at, _ = propagator.advance(at, t, time - t, 1, torque, moment)
                     t = time
                     lagged = at.y[7:10] if len(dynamics.state) > 7 else None
-                    acting = lagged or propagator.torque_at(torque, t, at.y)
+                    acting = lagged or propagator.torque.at(torque, t, at.y)
                     found.append((t, *at.y[:7], *acting))
         states = np.array(found)
         return np.asarray(states[np.searchsorted(states[:, 0], times), 1:])

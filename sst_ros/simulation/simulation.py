@@ -170,7 +170,7 @@ class Simulation:
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
-        return self._propagator.acting(torque)
+        return self._propagator.torque.acting(torque)
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked.
@@ -322,7 +322,7 @@ class Simulation:
         elif type(at.torque) is tuple:
             torque = at.torque
         else:
-            torque = self._propagator.torque_at(at.torque, at.time_ns / NANOSECONDS, y)
+            torque = self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
         return State.of(at.time_ns, y, at.point.joints, torque)
 
     def _initial(self) -> Point:

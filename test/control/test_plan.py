@@ -15,6 +15,7 @@ from models import FAST
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
+from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
 from sst_ros.control.peaks import maximum, minimum
@@ -26,7 +27,6 @@ from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, singularities, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.symmetric_motion import inertia, inertia_slope
 from sst_ros.scene.motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
 from sst_ros.scene.scene import (
     Actuators,

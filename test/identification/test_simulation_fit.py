@@ -7,6 +7,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 from identification import manipulators
+from symmetric_motion import drift_free_rate, inertia
 
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics import kernel, loads
@@ -19,7 +20,6 @@ from sst_ros.identification.scene_numbers import value_of, with_numbers
 from sst_ros.identification.sensitivities import Sensitivities, damping_slope
 from sst_ros.mechanism.generic_math import ZERO, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.symmetric_motion import drift_free_rate, inertia
 from sst_ros.simulation.torque import SineProfile
 
 END, STEPS, COLUMNS = 0.08, 2, 10

@@ -7,11 +7,11 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from symmetric_motion import inertia
+from symmetric_motion import inertia_slope as slope
 
 from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
-from sst_ros.mechanism.symmetric_motion import inertia
-from sst_ros.mechanism.symmetric_motion import inertia_slope as slope
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
