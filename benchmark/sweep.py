@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 
 from benchmark import machine
-from sst_ros import load_scene, simulate
+from sst_ros import load_scene, simulate, sweep
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.sweeps.chunk_task import ChunkTask, run_chunk, versions
 from sst_ros.sweeps.local_engine import run_local
 from sst_ros.sweeps.parts import read_sweep
-from sst_ros.sweeps.prepared import PreparedSweep, prepared
+from sst_ros.sweeps.prepared import prepared
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
@@ -46,6 +46,8 @@ HASHES = 4_000_000
 """Repetitions of SHA-256, some seconds."""
 
 RUNS = 1e9
+ROUNDS, CHUNKS = 3, 16
+"""Of the cluster: times that one worker and two compute so many chunks, in turn."""
 
 
 def study_of(rows: int) -> SweepStudy:
@@ -60,10 +62,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cluster", action="store_true", help="time Dask workers, too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    PreparedSweep(study_of(1000))  # compile, or load what is compiled
     found: dict[str, Any] = {"machine": machine.described("numpy", "numba", "dask", "pyarrow")}
+    began = time.perf_counter()
+    sweep("example2_heavy", VARY, n=1000, progress=False)
+    found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
     found |= _study(options.rows)
     found |= _kernel(min(options.rows, 10 * CHUNK), found["steps"])
+    began = time.perf_counter()
+    _arrays(study_of(100_000), found["steps"])
+    found["seconds to prepare 1e5 rows"] = time.perf_counter() - began
     for clock in ("", ", processor time"):  # the second is what a busy machine leaves comparable
         both = found[f"us a run{clock}"], found[f"us a run, kernel alone{clock}"]
         found[f"ratio to the kernel{clock}"] = both[0] / both[1]
@@ -105,15 +112,20 @@ def _study(rows: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+def _arrays(study: SweepStudy, steps: int) -> tuple[Any, list[Any]]:
+    """Sample and check all rows; return their batch, states, inputs and codes."""
+    values = study.sampler.rows(0, study.rows)
+    ready = prepared(study, steps)
+    scenarios, _, _ = ready.scenarios(values)
+    batch = ready.batch.with_parameters(scenarios)
+    y, code = batch.start(study.scene.initial.gamma, (0.0, 0.0, 0.0))
+    return batch, [y, batch.drives((0.0, 0.0, 0.0), study.rows), code]
+
+
 def _kernel(rows: int, steps: int) -> dict[str, float]:
     """The compiled loop alone, on prepared arrays, on all cores."""
     study = study_of(rows)
-    ready = prepared(study, steps)
-    values = study.sampler.rows(0, rows)
-    scenarios, _, _ = ready._scenarios(values)
-    batch = ready.batch.with_parameters(scenarios)
-    y, code = batch.start(np.tile(study.scene.initial.gamma, (rows, 1)), (0.0, 0.0, 0.0))
-    given = batch.drives((0.0, 0.0, 0.0), rows)
+    batch, (y, given, code) = _arrays(study, steps)
     best, least = np.inf, np.inf
     for _ in range(3):
         arrays = y.copy(), given, code.copy(), np.full(rows, np.nan), np.zeros(rows)
@@ -169,9 +181,9 @@ def _cluster(steps: int) -> dict[str, float]:
     from sst_ros.sweeps.cluster_engine import connect, run_on_cluster, send_code
 
     found: dict[str, float] = {}
-    chunks = 16
-    study = study_of(chunks * CHUNK)
+    study = study_of(CHUNKS * CHUNK)
     ready = prepared(study, steps)
+    times: dict[str, list[float]] = {"1": [], "2": [], "C": []}
     with tempfile.TemporaryDirectory() as folder:
         task = ChunkTask(study, steps, folder, versions())
         began = time.perf_counter()
@@ -183,29 +195,27 @@ def _cluster(steps: int) -> dict[str, float]:
             both = list(client.scheduler_info(n_workers=-1)["workers"])
             for index, worker in enumerate(both):  # each prepares the study once
                 client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
-            bounds = [_bound()]
-            for workers in (1, 2):
+            for _ in range(ROUNDS):
                 began = time.perf_counter()
-                if workers == 1:
-                    futures = [
-                        client.submit(_on_worker, task, i, workers=[both[0]], pure=False)
-                        for i in range(chunks)
-                    ]
-                    client.gather(futures)
-                else:
-                    run_on_cluster(client, task, range(chunks), lambda _: None, print)
-                found[f"seconds of {chunks} chunks, {workers} workers"] = (
-                    time.perf_counter() - began
-                )
-            bounds.append(_bound())
+                futures = [
+                    client.submit(_on_worker, task, i, workers=[both[0]], pure=False)
+                    for i in range(CHUNKS)
+                ]
+                client.gather(futures)
+                times["1"].append(time.perf_counter() - began)
+                began = time.perf_counter()
+                run_on_cluster(client, task, range(CHUNKS), lambda _: None, print)
+                times["2"].append(time.perf_counter() - began)
+                times["C"].append(_bound())
             began = time.perf_counter()
             client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
             found["seconds of an empty task, scheduler and client"] = (
                 time.perf_counter() - began
             ) / 1000
-    one, two = (found[f"seconds of {chunks} chunks, {workers} workers"] for workers in (1, 2))
-    found["two workers against one"] = one / two
-    found["two loops in C against one, before and after"] = float(np.mean(bounds))
+    for workers in ("1", "2"):
+        found[f"seconds of {CHUNKS} chunks, {workers} workers"] = min(times[workers])
+    found["two workers against one"] = float(np.median(np.divide(times["1"], times["2"])))
+    found["two loops in C against one, in turn with them"] = float(np.median(times["C"]))
     # The scheduler serves one task at a time: more threads than this wait for it.
     useful = found["seconds of a chunk"] / found["seconds of an empty task, scheduler and client"]
     found["largest useful number of threads"] = useful

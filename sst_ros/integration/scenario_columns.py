@@ -54,10 +54,12 @@ def valid_rows(
         return np.zeros(count, dtype=bool)
     valid = np.ones(count, dtype=bool)
     for key, values in rows.items():
-        spec, flat = specs[key], values.reshape(count, -1)
-        least = SMALLEST if spec.above == 0.0 else spec.least
-        for column in flat.T:
-            valid &= (column >= max(least, -LARGEST)) & (column <= min(spec.most, LARGEST))
+        spec = specs[key]
+        least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
+        most = min(spec.most, LARGEST)
+        if not (values.min() >= least and values.max() <= most):  # a nan is neither
+            flat = values.reshape(count, -1)
+            valid &= np.all((flat >= least) & (flat <= most), axis=1)
     reach = max(scene.base.radius, scene.star.radius) * (1.0 - RELATIVE_ROUNDING)
     mass: Any = 0.0
     for body in (columns.star, *columns.actuated_links, *columns.intermediate_links):
@@ -122,6 +124,10 @@ def _is_body(body: Any, reach: float) -> Mask:
         # A point mass is what `_mass_problems` refuses; without mass there is nothing to check.
         return np.asarray(valid & np.equal(mass, 0.0))
     xx, yy, zz, xy, xz, yz = _tensor(body.inertia)
+    about_o = _is_inertia((xx, yy, zz, xy, xz, yz))
+    massless = np.equal(mass, 0.0)
+    if massless.all():
+        return np.asarray(valid & about_o)
     trace = xx + yy + zz
     scale = 0.1e-6 * trace
     moments = (
@@ -130,8 +136,6 @@ def _is_body(body: Any, reach: float) -> Mask:
         0.5 * trace - zz - mass * z * z + scale,
         -xy - mass * x * y, -xz - mass * x * z, -yz - mass * y * z,
     )  # fmt: skip
-    massless = np.equal(mass, 0.0)
-    about_o = _is_inertia((xx, yy, zz, xy, xz, yz))
     return np.asarray(valid & about_o & (massless | _is_positive(*moments)))
 
 

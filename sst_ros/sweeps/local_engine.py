@@ -47,6 +47,7 @@ def run_local(
         with lock:
             done(outcome)
 
-    scheduler = "threads" if workers > 1 else "synchronous"
+    # By its name Dask would look for a client first, and import all of distributed.
+    get = require("dask.threaded").get if workers > 1 else require("dask.local").get_sync
     tasks = [dask.delayed(run, pure=False)(index) for index in chunks]
-    dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
+    dask.compute(*tasks, scheduler=get, num_workers=workers)

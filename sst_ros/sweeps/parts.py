@@ -41,23 +41,24 @@ def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) ->
 
     """
     parquet = require("pyarrow.parquet")
-    known = [key for key in about["units"] if key in table.column_names]
-    about = dict(about) | {"units": {key: about["units"][key] for key in known}}
+    names = set(table.column_names)
+    units = {name: unit for name, unit in about["units"].items() if name in names}
+    about = dict(about) | {"units": units}
     table = table.replace_schema_metadata({METADATA: json.dumps(about).encode()})
     handle, temporary = tempfile.mkstemp(prefix=_TEMPORARY, dir=folder)
     try:
-        with os.fdopen(handle, "wb") as file:
-            # Random mantissas do not compress, and their least and greatest help no reader.
-            parquet.write_table(
-                table, file, compression="none", use_dictionary=["reason"], write_statistics=False
-            )
-            file.flush()
-            os.fsync(file.fileno())
+        # Random mantissas do not compress, and their least and greatest help no reader.
+        parquet.write_table(
+            table, temporary, compression="none", use_dictionary=["reason"], write_statistics=False
+        )
+        os.fsync(handle)
         Path(temporary).chmod(0o644)
         Path(temporary).replace(folder / name)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+    finally:
+        os.close(handle)
 
 
 def about_of(path: Path) -> dict[str, Any] | None:

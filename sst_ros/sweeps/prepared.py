@@ -123,7 +123,7 @@ class PreparedSweep:
         }
 
     def _results(self, values: dict[str, Array], rows: NDArray[np.int64]) -> tuple[Columns, Any]:
-        scenarios, starts, faults = self._scenarios(values)
+        scenarios, starts, faults = self.scenarios(values)
         result, extremes, more = self._run(scenarios, starts, rows, self.steps)
         columns: Columns = {
             "status": result.status.astype(np.int8),
@@ -144,7 +144,7 @@ class PreparedSweep:
         columns |= {"reason_texts": texts, "reason": reason}
         return columns, self._trajectory(values, rows)
 
-    def _scenarios(
+    def scenarios(
         self, values: dict[str, Array]
     ) -> tuple[Scenarios, dict[str, Array], dict[int, InputError]]:
         """Scenarios of rows, their starts and gains, and the rows that make no scene."""
@@ -196,7 +196,7 @@ class PreparedSweep:
             return None
         count = min(len(rows), wanted["rows"] - int(rows[0]))
         some = {key: array[:count] for key, array in values.items()}
-        scenarios, starts, _ = self._scenarios(some)
+        scenarios, starts, _ = self.scenarios(some)
         every = max(1, self.steps // wanted["samples"])
         result, _, _ = self._run(scenarios, starts, rows[:count], self.steps, every)
         assert result.kept is not None
@@ -225,7 +225,7 @@ class PreparedSweep:
             values = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         else:
             values = Sampler(study.variations, {}, PILOT, study.seed, "random").rows(0, PILOT)
-        scenarios, starts, _ = self._scenarios(values)
+        scenarios, starts, _ = self.scenarios(values)
         rows = np.arange(len(next(iter(values.values()))))
         unit = 1 if self.controlled is None else self.controlled.samples
         count = max(unit, 16)

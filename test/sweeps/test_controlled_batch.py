@@ -69,7 +69,7 @@ def check_torques(case):
 
     ready.controlled.__dict__["module"] = SimpleNamespace(batch=one_period)
     rows = np.arange(5, 8)
-    scenarios, starts, _ = ready._scenarios(study.sampler.rows(0, 3))
+    scenarios, starts, _ = ready.scenarios(study.sampler.rows(0, 3))
     start = study.controlled.motion.at(0.0)
     # Off the reference, for feedback to act.
     off = np.array([0.01, -0.02, 0.005])
