@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.mechanism.geometry import Geometry
@@ -31,7 +31,7 @@ class Limit(NamedTuple):
     error: type[RunStopped] | None
     joint: int
     sign: float
-    end: float
+    end: Any
 
     @property
     def leg(self) -> int:
@@ -40,7 +40,8 @@ class Limit(NamedTuple):
 
     def distance(self, joints: Sequence[float]) -> float:
         """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
-        return self.sign * (joints[self.joint] - self.end)
+        distance: float = self.sign * (joints[self.joint] - self.end)
+        return distance
 
     def slope(self, joints: Sequence[float]) -> float:
         """Rate of the distance [rad/s]."""
@@ -62,16 +63,23 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
 
 
 def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield serial singularities, and the ends at which the scene stops."""
+    """Yield serial singularities, and the ends at which the scene stops.
+
+    Of many geometries the ends are columns, which no text names.
+    """
     for k in range(3):
         name = f"serial singularity, mu_{k + 1}"
         yield Limit(f"{name} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
         yield Limit(f"{name} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
         if scene.stroke.at_end == "stop":
-            arc, name = float(geometry.arc[k]), f"gamma_{k + 1}"
+            arc, name = geometry.of_leg("arc", k), f"gamma_{k + 1}"
             yield Limit(f"{name} < 0", StrokeExceeded, k, 1.0, 0.0)
-            yield Limit(f"{name} > {arc:.6f} rad", StrokeExceeded, k, -1.0, arc)
+            yield Limit(_above(name, arc), StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
             most, name = geometry.beta_max, f"beta_{k + 1}"
             yield Limit(f"{name} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
-            yield Limit(f"{name} > {most:.6f} rad", WorkspaceLeft, k + 6, -1.0, most)
+            yield Limit(_above(name, most), WorkspaceLeft, k + 6, -1.0, most)
+
+
+def _above(name: str, end: Any) -> str:
+    return f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"

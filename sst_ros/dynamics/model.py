@@ -59,12 +59,12 @@ class Model(NamedTuple):
 def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     """Collect the constants of a scene; its geometry may be given where it is known.
 
-    The numbers of the scene but its geometry may be columns, of many scenes at once.
+    The numbers of the scene and its geometry may be columns, of many scenes at once.
     """
     geometry, star = geometry or Geometry.of(scene), _star(scene)
     legs = []
     for k in range(3):
-        w, v, e = (tuple(row[k].tolist()) for row in (geometry.w, geometry.v, geometry.e))
+        w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
         drive_zz = _tensor(scene.actuated_links[k].inertia)[2]
         if scene.actuators is not None:
             gear = scene.actuators.gear_ratio
@@ -128,7 +128,7 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     stops = None
     if scene.stroke.stiffness is not None:
         damping = damping_of(scene.stroke)
-        stops = CompliantStops(float(geometry.arc[k]), scene.stroke.stiffness, damping)
+        stops = CompliantStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
     heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
     if not (any(friction) or any(by_joint) or heavy or stops):
         return None

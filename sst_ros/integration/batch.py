@@ -145,7 +145,7 @@ class Batch:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
         count = self._scenarios.count
         # One start for all is solved once.
-        alike = np.ndim(gamma) == np.ndim(gamma_dot) == 1 and len(self.columns.geometries) == 1
+        alike = np.ndim(gamma) == np.ndim(gamma_dot) == self.columns.geometries.alpha.ndim == 1
         angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
         which = np.broadcast_to(self.columns.geometry[: len(angles)], len(angles))

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 _BLOCK = 1024
 """Scenarios whose joints are computed at once: all numbers of the program are arrays as long."""
 
+_CODES = 4 * NOT_FINITE
+"""More than there are codes."""
+
 _SCENARIO = ("status", "message", "fault_time", "local_error")
 
 
@@ -195,15 +198,12 @@ class BatchResult(BatchStates):
     def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
         """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
         geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
-        if len(self._columns.geometries) == 1:
-            codes, index = np.unique(self.code, return_inverse=True)
-            pairs = [(0, code) for code in codes.tolist()]
-        else:
-            both = np.stack([geometry, self.code], axis=1)
-            found, index = np.unique(both, axis=0, return_inverse=True)
-            pairs = found.tolist()
-        texts = np.array([self._reason(*pair) for pair in pairs], dtype=object)
-        return texts, index.ravel()
+        limited = (self.code > 0) & (self.code < NOT_FINITE)  # only these depend on the geometry
+        both = np.where(limited, geometry, 0) * _CODES + self.code
+        found, index = np.unique(both, return_inverse=True)
+        pairs = [(one // _CODES, one % _CODES) for one in (found + _CODES // 2).tolist()]
+        texts = [self._reason(first, second - _CODES // 2) for first, second in pairs]
+        return np.array(texts, dtype=object), index
 
     def _reason(self, geometry: int, code: int) -> str:
         if code == 0:
@@ -212,7 +212,7 @@ class BatchResult(BatchStates):
             return REASONS[code]
         if code == NOT_FINITE:
             return "not finite"
-        return self._model.limits(self._columns.geometries[geometry])[code - 1].reason
+        return self._model.limits(self._columns.geometries.of_rows(geometry))[code - 1].reason
 
     def __len__(self) -> int:
         return len(self.status)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +22,7 @@ REASONS = {
 
 
 def initial_states(
-    geometries: Sequence[Geometry],
+    geometries: Geometry,
     which: NDArray[np.intp],
     gamma: Array,
     gamma_dot: Array,
@@ -36,7 +34,7 @@ def initial_states(
     """Quaternions (N, 4), body rates (N, 3) [rad/s] and codes (N,), 0 for those that start.
 
     Args:
-        geometries: the distinct geometries.
+        geometries: the distinct geometries, or one for all scenarios.
         which: number of the geometry of each scenario, shape (N,).
         gamma: actuator angles [rad], shape (N, 3).
         gamma_dot: their rates [rad/s], shape (N, 3).
@@ -48,36 +46,30 @@ def initial_states(
     count = len(gamma)
     quaternion, rate = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3))
     code = np.full(count, NO_ASSEMBLY, dtype=np.int64)
-    order = np.argsort(which, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(geometries)))[:-1])
-    blocks = [
-        (geometry, block)
-        for geometry, rows in zip(geometries, groups, strict=True)
-        for block in _blocks(rows, gamma)
-    ]
-    for part in slices(len(blocks), 0, label, progress):
-        for geometry, rows in blocks[part]:
-            different, same = _distinct(gamma[rows])
-            found = kinematics.direct_many(geometry, different)
-            valid = np.flatnonzero(found.admissible)
-            owner = found.configuration[valid]
-            counts = np.bincount(owner, minlength=len(different))
-            one = np.zeros(len(different), dtype=np.intp)
-            one[owner] = valid
-            starting = counts[same] == 1
-            here, chosen = rows[starting], one[same[starting]]
-            moving = _any(gamma_dot[here] != 0.0)
-            singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
-            code[here] = np.where(singular, NO_RATE, 0)
-            if len(here):
-                quaternion[here] = quaternion_of(found.rotation[one])[same[starting]]
-            moves = moving & ~singular
-            if moves.any():
-                rate[here[moves]] = _body_rates(
-                    geometry, found.rotation[chosen[moves]], gamma_dot[here[moves]]
-                )
-            if stroke:
-                code[rows[_any((gamma[rows] < 0.0) | (gamma[rows] > geometry.arc))]] = OUTSIDE
+    for part in slices(count, _BLOCK, label, progress):
+        different, same = _distinct(np.column_stack([which[part], gamma[part]]))
+        own = geometries.of_rows(different[:, 0].astype(np.intp))
+        found = kinematics.direct_many(own, different[:, 1:])
+        valid = np.flatnonzero(found.admissible)
+        owner = found.configuration[valid]
+        counts = np.bincount(owner, minlength=len(different))
+        one = np.zeros(len(different), dtype=np.intp)
+        one[owner] = valid
+        starting = counts[same] == 1
+        here, chosen = np.flatnonzero(starting) + part.start, one[same[starting]]
+        moving = _any(gamma_dot[here] != 0.0)
+        singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
+        code[here] = np.where(singular, NO_RATE, 0)
+        if len(here):
+            quaternion[here] = quaternion_of(found.rotation[one])[same[starting]]
+        moves = moving & ~singular
+        if moves.any():
+            rows = here[moves]
+            geometry = geometries.of_rows(which[rows])
+            rate[rows] = _body_rates(geometry, found.rotation[chosen[moves]], gamma_dot[rows])
+        if stroke:
+            arc = geometries.of_rows(which[part]).arc
+            code[part][_any((gamma[part] < 0.0) | (gamma[part] > arc))] = OUTSIDE
     return quaternion, rate, code
 
 
@@ -90,15 +82,8 @@ def _any(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(mask[:, 0] | mask[:, 1] | mask[:, 2])
 
 
-def _blocks(rows: NDArray[np.intp], gamma: Array) -> list[NDArray[np.intp]]:
-    """Rows in blocks, in a single one where all start alike."""
-    if (gamma[rows] == gamma[rows[:1]]).all():
-        return [rows] if len(rows) else []
-    return np.array_split(rows, -(-len(rows) // _BLOCK))
-
-
 def _distinct(rows: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Distinct rows of (N, 3), and for each row the index of its own."""
+    """Distinct rows, and for each row the index of its own."""
     if (rows == rows[:1]).all():
         return rows[:1], np.zeros(len(rows), dtype=np.intp)
     different, same = np.unique(rows, axis=0, return_inverse=True)

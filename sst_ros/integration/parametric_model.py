@@ -45,14 +45,14 @@ class ParameterColumns(NamedTuple):
 
     Attributes:
         inputs: the program's varied numbers, shape (numbers, N).
-        geometries: the distinct ones.
+        geometries: the distinct ones, or one for all rows.
         geometry: index of the geometry of each row, shape (N,).
         torque_limit: largest torque of an actuator [N m], infinite without one, shape (N,).
 
     """
 
     inputs: Array
-    geometries: list[Geometry]
+    geometries: Geometry
     geometry: NDArray[np.intp]
     torque_limit: Array
 
@@ -73,8 +73,7 @@ class ParametricModel:
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
         self.scene, self._profile = scenarios.document, profile
         self._count = scenarios.count or 1
-        geometries, geometry = _geometries(scenarios)
-        self._tree, numbers = self._numbers(scenarios, geometries, geometry)
+        self._tree, numbers = self._numbers(scenarios)
         varied = [place for place, value in numbers.items() if _varies(value)]
         self._varied = dict(zip(varied, (f"p{i}" for i in range(len(varied))), strict=True))
         self._fixed = {place: float(np.ravel(value)[0]) for place, value in numbers.items()}
@@ -82,7 +81,7 @@ class ParametricModel:
         self._moved = dynamics.moved
         self._functions: dict[tuple[str, ...], Callable[..., tuple[Any, ...]]] = {}
         self.ode = ODE(dynamics, self.scene.torque if profile else None)
-        self._limits = tuple(limits_of(self.scene, geometries[0]))
+        self._limits = self.limits(Geometry.of(self.scene))
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
         """Return the numbers of scenarios.
@@ -92,8 +91,7 @@ class ParametricModel:
                 does not in the scenarios that this model was made from.
 
         """
-        geometries, geometry = _geometries(scenarios)
-        _, numbers = self._numbers(scenarios, geometries, geometry)
+        _, numbers = self._numbers(scenarios)
         count = scenarios.count or 1
         inputs = np.empty((len(self._varied), count))
         for row, place in zip(inputs, self._varied, strict=True):
@@ -111,7 +109,7 @@ class ParametricModel:
                 raise InputError(self.scene.name, [Problem(str(place), value, allowed)])
         self._refuse_no_lag(numbers)
         limit = self._torque_limit(scenarios, numbers)
-        return ParameterColumns(inputs, geometries, geometry, limit)
+        return ParameterColumns(inputs, *_geometries(scenarios), limit)
 
     def limits(self, geometry: Geometry) -> tuple[Limit, ...]:
         """Return the limits of scenarios with this geometry."""
@@ -171,22 +169,13 @@ class ParametricModel:
         tree: Constants = rebuilt(self._tree, numbers)
         return tree
 
-    def _numbers(
-        self, scenarios: Scenarios, geometries: list[Geometry], geometry: NDArray[np.intp]
-    ) -> tuple[Constants, dict[Place, Any]]:
+    def _numbers(self, scenarios: Scenarios) -> tuple[Constants, dict[Place, Any]]:
         """Constants of scenarios as a tree, and its numbers or columns by place."""
-        if len(geometries) == 1:
-            columns = scenarios.columns()
-            tree = constants_of(self.scene, columns, geometries[0], profile=self._profile)
-            return tree, dict(leaves(tree))
-        numbers: dict[Place, Any] = {}
-        for index, one in enumerate(geometries):
-            rows = np.flatnonzero(geometry == index)
-            columns = scenarios.columns(rows)
-            tree = constants_of(self.scene, columns, one, profile=self._profile)
-            for place, value in leaves(tree):
-                numbers.setdefault(place, np.empty(len(geometry)))[rows] = value
-        return tree, numbers
+        geometries, which = _geometries(scenarios)
+        tree = constants_of(
+            self.scene, scenarios.columns(), geometries.of_rows(which), profile=self._profile
+        )
+        return tree, dict(leaves(tree))
 
     def _refuse_no_lag(self, numbers: dict[Place, Any]) -> None:
         lag = numbers.get(("model", "time_constant"), 1.0)
@@ -219,13 +208,19 @@ def _varies(value: Any) -> bool:
     return isinstance(value, np.ndarray) and bool(np.max(value) != np.min(value))
 
 
-def _geometries(scenarios: Scenarios) -> tuple[list[Geometry], NDArray[np.intp]]:
+def _geometries(scenarios: Scenarios) -> tuple[Geometry, NDArray[np.intp]]:
     """Return the distinct geometries, and the index of that of each row."""
-    count = scenarios.count or 1
-    varied = [
-        scenarios.rows[key].reshape(count, -1) for key in _OF_GEOMETRY if key in scenarios.rows
-    ]
+    scene, count, rows = scenarios.document, scenarios.count or 1, scenarios.rows
+    varied = [rows[key].reshape(count, -1) for key in _OF_GEOMETRY if key in rows]
     if not varied:
-        return [Geometry.of(scenarios.document)], np.zeros(count, dtype=np.intp)
+        return Geometry.of(scene), np.zeros(count, dtype=np.intp)
     _, first, index = np.unique(np.hstack(varied), axis=0, return_index=True, return_inverse=True)
-    return [Geometry.of(scenarios.scene(int(row))) for row in first], index.ravel()
+    nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
+    v, alpha, beta = (
+        rows[key][first] if key in rows else np.repeat([value], len(first), axis=0)
+        for key, value in zip(_OF_GEOMETRY, nominal, strict=True)
+    )
+    found = Geometry.build(v, np.radians(alpha), np.radians(beta))
+    if len(first) == 1:  # one for all rows: its numbers are no columns
+        found = Geometry.build(found.v[0], found.alpha[0], found.beta_max[0])
+    return found, index.ravel()

@@ -29,6 +29,7 @@ _CHECKED = re.compile(
     r"|gravity\.acceleration|moment\.value|torque\.(amplitude|frequency|phase)"
     r"|friction\.(gamma|mu|beta)\.(viscous|coulomb|static|smoothing|stribeck)"
     r"|springs(\[\d+\])?\.(stiffness|rest)|stroke\.(stiffness|damping)"
+    r"|base\.v|star\.alpha_deg|workspace\.beta_max_deg"
     r"|actuators\.(rotor_inertia|gear_ratio|time_constant|torque_limit|idle_damping)"
 )
 """Keys whose checks across fields are those of `valid_rows`."""
@@ -60,6 +61,11 @@ def valid_rows(
         if not (values.min() >= least and values.max() <= most):  # a nan is neither
             flat = values.reshape(count, -1)
             valid &= np.all((flat >= least) & (flat <= most), axis=1)
+    if "base.v" in rows:
+        valid &= _is_base(rows["base.v"])
+    if "star.alpha_deg" in rows:
+        total = np.sum(rows["star.alpha_deg"], axis=1)
+        valid &= np.abs(total - 360.0) < 359.0 * RELATIVE_ROUNDING
     reach = max(scene.base.radius, scene.star.radius) * (1.0 - RELATIVE_ROUNDING)
     mass: Any = 0.0
     for body in (columns.star, *columns.actuated_links, *columns.intermediate_links):
@@ -109,6 +115,14 @@ def _numbers(value: Any) -> Iterator[Any]:
     elif value is not None and not isinstance(value, str):
         for entry in value if isinstance(value, tuple) else vars(value).values():
             yield from _numbers(entry)
+
+
+def _is_base(v: Array) -> Mask:
+    """Whether directions are three corners of a right-handed triangle that is not degenerate."""
+    lengths = np.linalg.norm(v, axis=-1)
+    unit = v / lengths[..., None]
+    volume = np.sum(unit[:, 0] * np.cross(unit[:, 1], unit[:, 2]), axis=-1)
+    return np.asarray((lengths.min(axis=1) > 1.1e-6) & (volume > 2.0 * RELATIVE_ROUNDING))
 
 
 def _is_body(body: Any, reach: float) -> Mask:

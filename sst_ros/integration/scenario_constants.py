@@ -38,12 +38,16 @@ class Constants(NamedTuple):
 def constants_of(scene: Scene, columns: Any, geometry: Geometry, *, profile: bool) -> Constants:
     """Constants of `columns`, which has the structure of `scene` and numbers or arrays."""
     ends = [limit.end for limit in limits_of(scene, geometry)]
-    pairs = tuple(zip(np.cos(ends).tolist(), np.sin(ends).tolist(), strict=True))
+    pairs = tuple((_plain(np.cos(end)), _plain(np.sin(end))) for end in ends)
     if isinstance(columns, SimpleNamespace):
         columns.stroke = _damped(columns.stroke)
     with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
         model = model_of(columns, geometry)
     return Constants(model, pairs, columns.torque if profile else None)
+
+
+def _plain(value: Any) -> Any:
+    return value if value.ndim else float(value)
 
 
 def _damped(stroke: Any) -> Any:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Geometry:
     """Base triangle and star; rows belong to legs. All arrays are read-only.
+
+    Many geometries are one object whose arrays have one more axis in front.
 
     Attributes:
         v: unit vectors O P_k in {B}, shape (3, 3).
@@ -32,7 +35,7 @@ class Geometry:
     e: Array
     alpha: Array
     arc: Array
-    beta_max: float
+    beta_max: Any
 
     @classmethod
     def of(cls, scene: Scene) -> Geometry:
@@ -42,22 +45,39 @@ class Geometry:
         )
 
     @classmethod
-    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: float = np.pi / 2) -> Geometry:
+    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: Any = np.pi / 2) -> Geometry:
         """Derive the geometry from directions v, shape (3, 3), and angles alpha [rad], (3,).
+
+        Shapes (n, 3, 3), (n, 3) and (n,) of beta_max [rad] give n geometries.
 
         The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has admissible
         assemblies over a right-handed base triangle.
         """
         directions = np.array(v, dtype=float)
-        directions /= np.linalg.norm(directions, axis=1)[:, None]
-        following = np.roll(directions, -1, axis=0)
+        directions /= np.linalg.norm(directions, axis=-1)[..., None]
+        following = np.roll(directions, -1, axis=-2)
         normals = np.cross(directions, following)
-        sines = np.linalg.norm(normals, axis=1)
-        cosines = np.einsum("ij,ij->i", directions, following)
+        sines = np.linalg.norm(normals, axis=-1)
+        cosines = np.einsum("...j,...j->...", directions, following)
         angles = np.array(alpha, dtype=float)
-        f = np.array([0.0, angles[0], angles[0] + angles[1]])
-        e = np.stack([-np.sin(f), np.cos(f), np.zeros(3)], axis=1)
-        arrays = (directions, normals / sines[:, None], e, angles, np.arctan2(sines, cosines))
+        first, second = angles[..., 0], angles[..., 1]
+        f = np.stack([np.zeros_like(first), first, first + second], axis=-1)
+        e = np.stack([-np.sin(f), np.cos(f), np.zeros_like(f)], axis=-1)
+        arrays = (directions, normals / sines[..., None], e, angles, np.arctan2(sines, cosines))
         for array in arrays:
             array.setflags(write=False)
-        return cls(*arrays, float(beta_max))
+        return cls(*arrays, beta_max if np.ndim(beta_max) else float(beta_max))
+
+    def of_rows(self, rows: Any) -> Geometry:
+        """Return the geometries of rows, or of a row; this one where it is a single one."""
+        if self.v.ndim == 2:
+            return self
+        arrays = (self.v, self.w, self.e, self.alpha, self.arc, self.beta_max)
+        return Geometry(*(array[rows] for array in arrays))
+
+    def of_leg(self, name: str, k: int) -> Any:
+        """Return what an array has for leg k as floats, or as columns of many geometries."""
+        array = getattr(self, name)
+        if self.v.ndim == 2:
+            return array[k].tolist()
+        return np.ascontiguousarray(array[:, k].T)

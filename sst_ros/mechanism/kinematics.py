@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
-from sst_ros.mechanism.direct_kinematics import cross, rotations
+from sst_ros.mechanism.direct_kinematics import cross, dot, rotations
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.state import Assembly
@@ -58,7 +58,7 @@ def carriage_directions(geometry: Geometry, gamma: ArrayLike) -> Array:
 def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
     """Products r_k . R e_k of gamma (..., 3) [rad] and R (..., 3, 3), zero in closed loops."""
     t = geometry.e @ np.swapaxes(np.asarray(rotation, dtype=float), -1, -2)
-    return _dot(carriage_directions(geometry, gamma), t)
+    return dot(carriage_directions(geometry, gamma), t)
 
 
 def inverse(
@@ -78,12 +78,12 @@ def inverse(
     matrices = np.asarray(rotation, dtype=float)
     t, s = geometry.e @ np.swapaxes(matrices, -1, -2), matrices[..., None, :, 2]
     p = cross(t, geometry.w)
-    sine = np.sqrt(_dot(p, p))
+    sine = np.sqrt(dot(p, p))
     sign = np.asarray(signs, dtype=float)
     p = sign[:, None] * p
-    gamma = np.arctan2(_dot(p, cross(geometry.w, geometry.v)), _dot(p, geometry.v))
-    mu = np.arctan2(sign * sine, _dot(t, geometry.w))
-    beta = np.arctan2(_dot(p, cross(t, s)), _dot(p, s))
+    gamma = np.arctan2(dot(p, cross(geometry.w, geometry.v)), dot(p, geometry.v))
+    mu = np.arctan2(sign * sine, dot(t, geometry.w))
+    beta = np.arctan2(dot(p, cross(t, s)), dot(p, s))
     return gamma, mu, beta
 
 
@@ -111,6 +111,8 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
 def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     """All real assemblies of many gamma [rad], shape (n, 3), at once; the order is `direct`'s.
 
+    The geometry may be one for each of them.
+
     Raises:
         AssemblyError: gamma is not (n, 3) finite numbers.
 
@@ -120,7 +122,9 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
         raise AssemblyError("gamma must be rows of three finite numbers", angles)
     r = carriage_directions(geometry, angles)
     configuration, rotation, isolated = rotations(r, geometry.e)
-    mu, beta, det_j2, admissible = described(geometry, r[configuration], rotation)
+    mu, beta, det_j2, admissible = described(
+        geometry.of_rows(configuration), r[configuration], rotation
+    )
     _freeze(configuration, rotation, mu, beta, det_j2, admissible, isolated)
     return Assemblies(configuration, rotation, mu, beta, det_j2, admissible, isolated)
 
@@ -171,17 +175,14 @@ def described(
 
     """
     t, s = geometry.e @ np.swapaxes(rotation, -1, -2), rotation[..., None, :, 2]
-    mu = np.arctan2(_dot(cross(t, geometry.w), r), _dot(geometry.w, t))
-    beta = np.arctan2(_dot(r, cross(t, s)), _dot(r, s))
+    mu = np.arctan2(dot(cross(t, geometry.w), r), dot(geometry.w, t))
+    beta = np.arctan2(dot(r, cross(t, s)), dot(r, s))
     normal = cross(r, t)
-    volume = _dot(normal[..., 0, :], cross(normal[..., 1, :], normal[..., 2, :]))
-    edge = _dot(np.broadcast_to(s, t.shape), geometry.w) > 0.0
-    valid = np.all(edge & (beta > 0.0) & (beta <= geometry.beta_max), axis=-1)
+    volume = dot(normal[..., 0, :], cross(normal[..., 1, :], normal[..., 2, :]))
+    edge = dot(np.broadcast_to(s, t.shape), geometry.w) > 0.0
+    most = np.asarray(geometry.beta_max)[..., None]
+    valid = np.all(edge & (beta > 0.0) & (beta <= most), axis=-1)
     return mu, beta, -volume, valid
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.sum(a * b, axis=-1))
 
 
 def _freeze(*arrays: NDArray[np.generic]) -> None:

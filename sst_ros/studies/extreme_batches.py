@@ -90,9 +90,8 @@ def compared(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bool]
         return "bits", True
     reason, stop = "", 0.0
     if code[0]:
-        geometry = batch.columns.geometries[
-            int(np.broadcast_to(batch.columns.geometry, count)[row])
-        ]
+        index = int(np.broadcast_to(batch.columns.geometry, count)[row])
+        geometry = batch.columns.geometries.of_rows(index)
         reason, stop = batch.model.limits(geometry)[int(code[0]) - 1].reason, float(when[0])
     agree = _agrees(run(case), y[:7, 0].tolist(), reason, stop, h)
     return ("bits and end" if agree else "another end than the simulation"), agree

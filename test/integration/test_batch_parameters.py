@@ -270,6 +270,8 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
         "star.inertia.zz": rng.uniform(0.25, 0.3, 1000),
         "intermediate_links[1].inertia.xx": rng.uniform(8e-6, 1e-5, 1000),
         "torque.amplitude": rng.uniform(0.5, 4.0, (1000, 3)),
+        "base.v": np.array(EXAMPLE2.base.v) + rng.uniform(-0.05, 0.05, (1000, 3, 3)),
+        "star.alpha_deg": 120.0 + rng.uniform(-3.0, 3.0, (1000, 1)) * (1.0, 0.0, -1.0),
     }
     together = Batch(EXAMPLE2, RK4, profile=True, parameters=parameters)
     assert not built
