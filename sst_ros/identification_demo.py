@@ -20,7 +20,7 @@ from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA
-from sst_ros.identification.scene_numbers import value_of, with_numbers
+from sst_ros.identification.scene_numbers import value_of
 from sst_ros.plot.identification import draw_tracking_errors
 from sst_ros.plot.style import save_figure
 from sst_ros.recording.recording import read as read_bag
@@ -81,7 +81,7 @@ def unknown(scene: Scene, share: float = SHARE) -> Scene:
     names = [f"{body}.{part}" for body in signs for part in parts]
     factors = [1.0 + sign * share for sign in signs.values() for _ in parts]
     numbers = np.array([value_of(scene, name) for name in names], dtype=float) * factors
-    plant = with_numbers(scene, names, numbers)
+    plant = scene.with_values(dict(zip(names, numbers.tolist(), strict=True)))
     return dataclasses.replace(plant, name=f"{scene.name}_plant")
 
 

@@ -17,6 +17,7 @@ from sst_ros.control.star_motions import PIECES, timed
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import axpy, scaled
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.motions import Sweep, ToAngles
 
@@ -116,16 +117,11 @@ def _alike(quaternions: list[list[float]], before: Quadruple) -> Iterator[Quadru
 
 def straight_path(start: Triple, goal: ToAngles) -> Path:
     """From one gamma straight to another, with minimum jerk."""
-    span = [b - a for a, b in zip(start, goal.gamma, strict=True)]
+    span = axpy(1.0, goal.gamma, -1.0, start)
 
     def path(time: float) -> tuple[Triple, Triple, Triple]:
         s, rate, acceleration = timed(time, goal.duration)
-        (p1, p2, p3), (w1, w2, w3) = start, span
-        return (
-            (p1 + s * w1, p2 + s * w2, p3 + s * w3),
-            (rate * w1, rate * w2, rate * w3),
-            (acceleration * w1, acceleration * w2, acceleration * w3),
-        )
+        return axpy(1.0, start, s, span), scaled(rate, span), scaled(acceleration, span)
 
     return path
 

@@ -12,6 +12,7 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.quintic import minimum_jerk
 from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
 from sst_ros.errors import SingularConfiguration
+from sst_ros.mechanism.generic_math import axpy, scaled
 from sst_ros.mechanism.geometry import Geometry
 
 PIECES = 8
@@ -60,15 +61,10 @@ class GeodesicMotion(StarMotion):
     def star(self, time: float) -> StarState:
         """See `StarMotion.star`; the axis is the same in {B} and in {E}."""
         s, rate, acceleration = timed(time, self.duration)
-        x, y, z = self._vector
         half = 0.5 * s * self._angle
         part = math.sin(half) / self._angle if self._angle else 0.0
-        q = product(self._start, (part * x, part * y, part * z, math.cos(half)))
-        return (
-            q,
-            (rate * x, rate * y, rate * z),
-            (acceleration * x, acceleration * y, acceleration * z),
-        )
+        q = product(self._start, (*scaled(part, self._vector), math.cos(half)))
+        return q, scaled(rate, self._vector), scaled(acceleration, self._vector)
 
 
 class SpiralMotion(StarMotion):
@@ -107,16 +103,8 @@ class SpiralMotion(StarMotion):
         dx = -self._theta * (self._phi * cb * cc - third * sb * sc) + self._phi * third * cc
         dy = self._theta * (self._phi * cb * sc + third * sb * cc) - self._phi * third * sc
         dz = -self._theta * self._phi * sb
-        square = rate * rate
-        return (
-            product(self._start, q),
-            (rate * x, rate * y, rate * z),
-            (
-                acceleration * x + square * dx,
-                acceleration * y + square * dy,
-                acceleration * z + square * dz,
-            ),
-        )
+        turning = axpy(acceleration, (x, y, z), rate * rate, (dx, dy, dz))
+        return product(self._start, q), scaled(rate, (x, y, z)), turning
 
 
 def timed(time: float, duration: float) -> tuple[float, float, float]:

@@ -19,6 +19,7 @@ from sst_ros.control.peaks import maximum
 from sst_ros.control.plan import MotionPlan
 from sst_ros.control.reference import Triple
 from sst_ros.dynamics import kernel
+from sst_ros.mechanism.generic_math import scaled
 from sst_ros.mechanism.geometry import Array
 
 SLOWEST = 1e-4
@@ -136,12 +137,9 @@ class _Torques:
     def at(self, factor: float, time: float) -> Triple:
         """Torques [N m] at the time [s] of the motion as it is planned."""
         at = self._plan.motion.at(time)
-        (x, y, z), (ax, ay, az) = at.body_rate, at.body_acceleration
-        square = factor * factor
+        rate, acceleration = at.body_rate, at.body_acceleration
         return self._inverse.torque(
-            at.quaternion,
-            (factor * x, factor * y, factor * z),
-            (square * ax, square * ay, square * az),
+            at.quaternion, scaled(factor, rate), scaled(factor * factor, acceleration)
         )
 
 

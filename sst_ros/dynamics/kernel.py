@@ -33,6 +33,7 @@ from sst_ros.mechanism.generic_math import (
     axpy,
     cross,
     dot,
+    quaternion_rate,
     rotation_rows,
     scaled,
     solve_symmetric,
@@ -92,14 +93,7 @@ def derivative(model: Model, state: State, torque: Triple, moment: Triple | None
         )
         torque = (given[0], given[1], given[2])
     acceleration = body_acceleration(model, (x, y, z, w), (wx, wy, wz), torque, moment)
-    return (
-        0.5 * (w * wx + y * wz - z * wy),
-        0.5 * (w * wy + z * wx - x * wz),
-        0.5 * (w * wz + x * wy - y * wx),
-        -0.5 * (x * wx + y * wy + z * wz),
-        *acceleration,
-        *more,
-    )
+    return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *more)
 
 
 def body_acceleration(

@@ -90,6 +90,11 @@ class Dynamics:
         """Kinetic and potential energy [J] and power put in [W], of state and drive."""
         return compiled(trace(self._energies, (*self.state, *self.drive)))
 
+    def stored_energy(self, state: Sequence[float]) -> float:
+        """Kinetic and potential energy [J] of a state, whose further numbers are not looked at."""
+        kinetic, potential, _ = self.energies(*state[: len(self.state)], *(0.0,) * len(self.drive))
+        return kinetic + potential
+
     def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
         return kernel.derivative(self.model, *self._split(inputs))
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 
@@ -84,19 +85,16 @@ class VirtualWorkDerivative:
             ArithmeticError: the posture is singular.
 
         """
-        x, y, z, w, wx, wy, wz = inputs[:7]
+        x, y, z, w, *rate = inputs[:7]
         torque = np.array(inputs[8:11])
         moment = self._moment + inputs[11:14] if len(inputs) > 11 else self._moment
         try:
             acceleration, gamma_dot = body_acceleration(self._mechanism, inputs[:7], torque, moment)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
-        omega = rotation_matrix(np.array(inputs[:4])) @ inputs[4:7]
+        omega = rotation_matrix(np.array(inputs[:4])) @ rate
         return (
-            0.5 * (w * wx + y * wz - z * wy),
-            0.5 * (w * wy + z * wx - x * wz),
-            0.5 * (w * wz + x * wy - y * wx),
-            -0.5 * (x * wx + y * wy + z * wz),
+            *quaternion_rate((x, y, z, w), (rate[0], rate[1], rate[2])),
             *acceleration.tolist(),
             float(torque @ gamma_dot + moment @ omega),
         )

@@ -15,7 +15,7 @@ from sst_ros.identification.consistency import consistent_values, scales
 from sst_ros.identification.least_squares import LinearFit
 from sst_ros.identification.parameters import STANDARD
 from sst_ros.identification.parameters import values as parameter_values
-from sst_ros.identification.scene_numbers import value_of, with_numbers
+from sst_ros.identification.scene_numbers import value_of
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 
@@ -32,18 +32,18 @@ def possible_scene(
         InputError: other numbers than those of inertias make no scene.
 
     """
+    wanted = dict(zip(names, numbers.tolist(), strict=True))
     noted = {re.split(r"[.\[]", name)[0] for name in names}
     try:
-        return _with_notes(with_numbers(scene, names, numbers), noted, note), numbers, ()
+        changed = scene.with_values(wanted)
+        return _with_notes(changed, noted, note), numbers, ()
     except InputError:
-        inertias = [i for i, name in enumerate(names) if ".inertia." in name]
+        inertias = {name: wanted.pop(name) for name in names if ".inertia." in name}
         if not inertias:
             raise
-    changed = with_numbers(
-        scene, *_split([i for i in range(len(names)) if i not in inertias], names, numbers)
-    )
-    found = _nearest_inertias(changed, *_split(inertias, names, numbers))
-    adjusted = with_numbers(changed, list(found), np.array(list(found.values())))
+    changed = scene.with_values(wanted)
+    found = _nearest_inertias(changed, list(inertias), np.array(list(inertias.values())))
+    adjusted = changed.with_values(found)
     values = np.array([value_of(adjusted, name) for name in names], dtype=float)
     warning = "no bodies have the inertias that fit best: the scene has the nearest"
     return _with_notes(adjusted, noted, note), values, (warning,)
@@ -68,10 +68,6 @@ def _nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dic
     fit = LinearFit(numbers, covariance, root, np.ones(3), np.zeros((0, 3)), 1.0)
     values, _ = consistent_values(entries, given, base, fit, 1.0)
     return dict(zip(entries, values.tolist(), strict=True))
-
-
-def _split(places: list[int], names: Sequence[str], numbers: Array) -> tuple[list[str], Array]:
-    return [names[i] for i in places], numbers[places]
 
 
 def _with_notes(scene: Scene, sections: Iterable[str], note: str) -> Scene:

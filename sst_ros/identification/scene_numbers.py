@@ -9,12 +9,10 @@ from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
-from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Actuators, Friction
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section
-from sst_ros.scene.yaml_document import from_values, values_of
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -26,19 +24,6 @@ def value_of(scene: Scene, name: str) -> float | None:
     except (AttributeError, IndexError, TypeError):
         return None
     return float(value) if isinstance(value, (int, float)) else None
-
-
-def with_numbers(scene: Scene, names: Sequence[str], numbers: Array) -> Scene:
-    """Return the scene with other numbers by key; a list without index means all its entries.
-
-    Raises:
-        InputError: the numbers make no scene.
-
-    """
-    document = values_of(scene)
-    for name, number in zip(names, numbers.tolist(), strict=True):
-        set_number(document, re.findall(r"\w+", name), number)
-    return from_values(Scene, document, scene.name)
 
 
 def at(value: Any, words: Sequence[str]) -> Any:
@@ -64,7 +49,7 @@ def opened(value: Any) -> Any:
 
 
 def set_number(value: Any, words: Sequence[str], symbol: Any) -> None:
-    """Set a number; a list without an index means all of its entries."""
+    """Set a number of an `opened` section; a list without an index means all of its entries."""
     first, *rest = words
     if isinstance(value, list):
         if not first.isdigit():
@@ -75,7 +60,7 @@ def set_number(value: Any, words: Sequence[str], symbol: Any) -> None:
         else:
             value[int(first)] = symbol
         return
-    known = value if isinstance(value, dict) else vars(value)
+    known = vars(value)
     if rest:
         if known.get(first) is None:
             known[first] = _absent(first)

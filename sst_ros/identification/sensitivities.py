@@ -33,7 +33,8 @@ from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, comp
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.regressor import present
-from sst_ros.identification.scene_numbers import value_of, with_numbers
+from sst_ros.identification.scene_numbers import value_of
+from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueProfile
@@ -97,8 +98,7 @@ class Sensitivities:
         """
         # Inertias between iterations of a fit need not be those of bodies that can exist.
         outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
-        names = [self.names[i] for i in outer]
-        scene = with_numbers(self.scene, names, values[outer])
+        scene = self.scene.with_values({self.names[i]: float(values[i]) for i in outer})
         inner = values[self._inner].copy()
         chain = np.ones(len(values))
         if RESTITUTION in self.names:
@@ -180,12 +180,7 @@ class Sensitivities:
             if name.startswith("initial.gamma_dot"):
                 slopes[4:7, column] = turn
                 continue
-            x, y, z, w = quaternion
-            a, b, c = turn
-            along = 0.5 * np.array(
-                [w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a,
-                 -x * a - y * b - z * c]
-            )  # fmt: skip
+            along: Any = np.array(quaternion_rate(tuple(quaternion), tuple(turn)))
             slopes[:4, column] = along
             # Complex step: exact to rounding, as the map is rational.
             slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30

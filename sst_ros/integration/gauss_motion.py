@@ -143,22 +143,14 @@ class GaussMotion:
         y = tuple(self.at(times).T)
         torque: Any = tuple(self.torque(times).T)
         work = float(np.sum(weights * energy.power(model, y, torque)))
-        start, stop = (self._stored(self.at(np.array([t]))[0]) for t in (0.0, end))
+        start, stop = map(self._dynamics.stored_energy, self.at(np.array([0.0, end])).tolist())
         return stop - start - work
 
     def torque(self, times: Array) -> Array:
         """Torques that are commanded at times [s], shape (m, 3) [N m]."""
         if isinstance(self._torque, SineTorque):
-            parts = self._torque.amplitude, self._torque.frequency, self._torque.phase
-            amplitude, frequency, phase = (np.array(part) for part in parts)
-            return np.asarray(amplitude * np.sin(np.multiply.outer(times, frequency) + phase))
+            return self._torque.values(times)
         return np.tile(self._torque, (len(times), 1))
-
-    def _stored(self, y: Array) -> float:
-        kinetic, potential, _ = self._dynamics.energies(
-            *y.tolist(), *(0.0,) * len(self._dynamics.drive)
-        )
-        return kinetic + potential
 
     @cached_property
     def _single(self) -> PreparedMotion:

@@ -91,6 +91,18 @@ def rotation_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Rows:
     )
 
 
+def quaternion_rate(q: tuple[Scalar, Scalar, Scalar, Scalar], rate: Triple) -> tuple[Scalar, ...]:
+    """Differentiate a quaternion (x, y, z, w) by time at the body rate W [rad/s]."""
+    x, y, z, w = q
+    wx, wy, wz = rate
+    return (
+        0.5 * (w * wx + y * wz - z * wy),
+        0.5 * (w * wy + z * wx - x * wz),
+        0.5 * (w * wz + x * wy - y * wx),
+        -0.5 * (x * wx + y * wy + z * wz),
+    )
+
+
 def added(a: Triple, b: Triple) -> Triple:
     """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])

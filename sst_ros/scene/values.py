@@ -13,6 +13,8 @@ import numpy as np
 def replaced(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a document with other values; a list without an index means all of its entries.
 
+    So does a single value in place of a list of numbers.
+
     A section that the document does not have is made; None takes a value or a section away.
 
     Raises:
@@ -44,7 +46,13 @@ def _set(section: dict[str, Any], words: list[str], value: Any) -> None:
     if parts is None:
         raise ValueError(words[0])
     name, index = parts.groups()
-    if len(words) == 1 and index is None:
+    if len(words) == 1 and index is not None:
+        section[name][int(index)] = value
+        return
+    if len(words) == 1:
+        known = section.get(name)
+        if isinstance(known, list) and isinstance(value, (int, float)):
+            value = [value] * len(known)
         section.update({name: value})
         if value is None:
             del section[name]

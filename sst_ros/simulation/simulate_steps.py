@@ -42,11 +42,15 @@ def stepped(
     """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
 
     A function whose torques are held is called once a period and may have a memory: one run.
-    Arguments are those of `SteppedMotion` and `SteppedMotion.run`.
+
+    Arguments are those of `Simulation`, of `SteppedMotion` and of its `run`; `reason`, why this
+    method was chosen ("" where the caller chose it), ends the method of the trajectory.
     """
     local, once, spent = tolerance, period is not None or method == RK4.name, 0
     for attempt in range(1, _ATTEMPTS + 1):
-        motion = SteppedMotion(scene, law, method, local, span, period, reason).run(times, progress)
+        simulation = Simulation(scene, method, tolerance=local, step_budget=WHOLE_MOTION_BUDGET)
+        motion = SteppedMotion(simulation, law, span, period).run(times, progress)
+        motion.method += reason
         motion.evaluations = spent = spent + motion.evaluations
         excess = motion.error_estimate / tolerance
         if once or attempt == _ATTEMPTS or motion.status < 0 or not excess > 1.0:
@@ -59,31 +63,22 @@ class SteppedMotion:
     """A motion by the steps of `Simulation`.
 
     Args:
-        scene: what moves.
+        simulation: of what moves, at its start.
         law: torques that act.
-        method, tolerance: see `Simulation`.
         span: length of the motion [ns].
         period: control period [ns]; None where torques are not held.
-        reason: why this method was chosen, for the trajectory; "" where the caller chose it.
 
     """
 
     def __init__(
         self,
-        scene: Scene,
+        simulation: Simulation,
         law: TorqueProfile | FeedbackFunction,
-        method: str,
-        tolerance: float,
         span: int,
         period: int | None,
-        reason: str,
     ) -> None:
-        self._scene, self._law, self._span, self._period = scene, law, span, period
-        self._reason = reason
-        self._simulation = Simulation(
-            scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
-        )
-        self._method = self._simulation.method
+        self._simulation, self._law, self._span, self._period = simulation, law, span, period
+        self._scene, self._method = simulation.scene, simulation.method
         if not isinstance(law, TorqueProfile):
             self._feedback = StateFeedback(_checked(law), self._simulation.dynamics)
         self._samples: list[State] = []
@@ -177,7 +172,7 @@ class SteppedMotion:
             joints=np.array([sum(state.joints, ()) for state in samples]).reshape(-1, 18),
             status=status,
             message=message,
-            method=", then ".join([self._method, *changes]) + self._reason,
+            method=", then ".join([self._method, *changes]),
             error_estimate=simulation.error_estimate,
             energy_residual=simulation.energy_residual,
             evaluations=simulation.evaluations,

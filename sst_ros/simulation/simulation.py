@@ -228,7 +228,7 @@ class Simulation:
         self._propagator.reset()
         self._now = self._before = _Instant(0, self._start)
         self._shown = self._now, self._as_state(self._now)
-        self._energy = self._stored()
+        self._energy = self.dynamics.stored_energy(self._start.y)
         return self.state
 
     def load_code(self, dt_ns: int) -> None:
@@ -290,7 +290,8 @@ class Simulation:
     @property
     def energy_residual(self) -> float:
         """Energy now, less energy at the start, less the work done on the manipulator [J]."""
-        return self._stored() - self._energy - self._now.point.y[-1]
+        y = self._now.point.y
+        return self.dynamics.stored_energy(y) - self._energy - y[-1]
 
     @property
     def closure_residual(self) -> float:
@@ -306,14 +307,6 @@ class Simulation:
         rotation = rotation_matrix(self.state.quaternion)
         _, _, determinant, _ = kinematics.described(self.geometry, r, rotation)
         return {"sin_mu": float(np.sin(self.state.joints.mu).min()), "det_j2": float(determinant)}
-
-    def _stored(self) -> float:
-        """Kinetic and potential energy [J]."""
-        size = len(self.dynamics.state)
-        kinetic, potential, _ = self.dynamics.energies(
-            *self._now.point.y[:size], *(0.0,) * len(self.dynamics.drive)
-        )
-        return kinetic + potential
 
     def _as_state(self, at: _Instant) -> State:
         y = at.point.y

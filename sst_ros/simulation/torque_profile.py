@@ -71,17 +71,11 @@ class SineProfile(TorqueProfile):
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
-        parts = (np.array(part) for part in self._parts())
-        amplitude, frequency, phase = parts
-        return np.asarray(amplitude * np.sin(np.multiply.outer(t, frequency) + phase))
+        return self.sine.values(t)
 
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
-        amplitude, frequency, phase = self._parts()
-        return {"kind": "sine", "amplitude": amplitude, "frequency": frequency, "phase": phase}
-
-    def _parts(self) -> tuple[Vector3, Vector3, Vector3]:
-        return self.sine.amplitude, self.sine.frequency, self.sine.phase
+        return {"kind": "sine", **vars(self.sine)}
 
     def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s], by the sine of the C library."""
@@ -114,7 +108,9 @@ class PolynomialTorque(TorqueProfile):
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         piece = np.clip(np.searchsorted(self.x, t, side="right") - 1, 0, self.c.shape[1] - 1)
-        total = self._sum(self.c[:, piece], t - self.x[piece])
+        total: Array = np.zeros((len(t), 3))
+        for factors in self.c[:, piece]:
+            total = total * (t - self.x[piece])[:, None] + factors
         total[(t < self.x[0]) | (t > self.x[-1])] = 0.0
         return total
 
@@ -141,13 +137,6 @@ class PolynomialTorque(TorqueProfile):
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
         return {"kind": "polynomial", "c": self.c.tolist(), "x": self.x.tolist()}
-
-    @staticmethod
-    def _sum(c: Array, t: Array) -> Array:
-        total: Array = np.zeros_like(c[0])
-        for row in c:
-            total = total * t[:, None] + row
-        return total
 
 
 class FunctionTorque(TorqueProfile):

@@ -78,7 +78,7 @@ class LoopOutput:
         self.times.append(time.thread_time())
 
     def _nothing(self, *_: Any, **__: Any) -> None:
-        """Do nothing: there is nobody to publish to."""
+        """Do nothing: there is nothing to publish to."""
 
     start = ticks = idle = phase_changed = _nothing
 

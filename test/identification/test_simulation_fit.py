@@ -16,7 +16,7 @@ from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
-from sst_ros.identification.scene_numbers import value_of, with_numbers
+from sst_ros.identification.scene_numbers import value_of
 from sst_ros.identification.sensitivities import Sensitivities, damping_slope
 from sst_ros.mechanism.generic_math import ZERO, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
@@ -250,7 +250,8 @@ def test_one_reading_of_example_1_fixes_only_a_product():
     assert "star.inertia.zz" in found.undetermined[0] and "gamma_dot" in found.undetermined[0]
     # Along what stays open the product stays: relative changes cancel.
     step = 1e-3 * found.directions[-1]
-    moved = with_numbers(found.scene, found.names, found.values * (1.0 + step))
+    changed = found.values * (1.0 + step)
+    moved = found.scene.with_values(dict(zip(found.names, changed.tolist(), strict=True)))
     product = inertia(moved, 0.0) * moved.initial.gamma_dot[0]
     assert product == pytest.approx(inertia(found.scene, 0.0) * rate, rel=2e-5)
     assert "not determined: " in found.table()

@@ -21,6 +21,8 @@ def test_numbers_lists_sections_and_choices():
             "gravity.acceleration": (0.0, 0.0, -9.81),
             "stroke.at_end": "ignore",
             "torque": None,
+            "initial.gamma_dot": 0.5,
+            "initial.gamma[1]": 0.25,
         }
     )
     assert other.star.inertia.zz == 0.3
@@ -28,6 +30,8 @@ def test_numbers_lists_sections_and_choices():
     assert [link.inertia.xx for link in other.actuated_links] == [0.02] * 3
     assert [link.inertia.zz for link in other.actuated_links] == [0.018375, 0.021, 0.018375]
     assert other.gravity.acceleration == (0.0, 0.0, -9.81)
+    assert other.initial.gamma_dot == (0.5, 0.5, 0.5)
+    assert other.initial.gamma == (EXAMPLE2.initial.gamma[0], 0.25, EXAMPLE2.initial.gamma[2])
     assert (other.stroke.at_end, other.torque) == ("ignore", None)
     assert EXAMPLE2.star.inertia.zz == 0.26
     assert EXAMPLE2.with_values({}) == EXAMPLE2
