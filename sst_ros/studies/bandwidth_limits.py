@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,22 +19,6 @@ OFFSET = 1e-8
 _TICKS, _TICKS_OF_DELAY = 600, 200
 _FIRST, _FACTOR, _ACCURACY = 0.5, 1.15, 2e-3
 _GONE, _LOST = 1e-3, 1e2 * OFFSET
-
-
-@dataclass(frozen=True)
-class BandwidthLimit:
-    """Bandwidths below which computed torque with an exact model is stable [rad/s].
-
-    Attributes:
-        delay: samples by which commands are late.
-        theory: of the sampled double integrator, `sampled_data.stability_limit`.
-        simulated: of the simulation, the pose at the start of the motion held at rest.
-
-    """
-
-    delay: int
-    theory: float
-    simulated: float
 
 
 class RestMotion(ReferenceMotion):
@@ -59,14 +42,19 @@ def ideal_plant(scene: Scene) -> Scene:
     return dataclasses.replace(scene, friction=None, actuators=actuators)
 
 
-def bandwidth_limit(loop: ControlLoop) -> BandwidthLimit:
-    """Find the limit of a loop in mode computed_torque by bisection on its bandwidth."""
-    delay, period = loop.channel.delay, loop.period_ns / NANOSECONDS
-    theory = stability_limit(loop.settings.damping_ratio, delay) / period
-    found = largest_stable(
-        lambda bandwidth: stable(loop, bandwidth), _FIRST * theory, _FACTOR, _ACCURACY
-    )
-    return BandwidthLimit(delay, theory, found)
+def bandwidth_in_theory(loop: ControlLoop) -> float:
+    """Return the limit of the sampled double integrator, `stability_limit` [rad/s]."""
+    limit = stability_limit(loop.settings.damping_ratio, loop.channel.delay)
+    return limit * NANOSECONDS / loop.period_ns
+
+
+def bandwidth_limit(loop: ControlLoop) -> float:
+    """Find the largest stable bandwidth [rad/s] in mode computed_torque by bisection.
+
+    The pose at the start of the motion is held at rest; the model is exact.
+    """
+    first = _FIRST * bandwidth_in_theory(loop)
+    return largest_stable(lambda bandwidth: stable(loop, bandwidth), first, _FACTOR, _ACCURACY)
 
 
 def stable(loop: ControlLoop, bandwidth: float) -> bool:

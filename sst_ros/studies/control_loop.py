@@ -1,26 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control loop: one controller on one plant, in lockstep in this process."""
+"""A control loop: one controller on one plant, in lockstep in this process; errors of its hold."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.controller_settings import ControllerSettings
-from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.reference import ReferenceMotion, Triple
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.studies.channel import Channel, ChannelState
 
 WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
+
+EXACT_TOLERANCE = 1e-13
+"""Local error of the simulation whose torques are a function of time."""
+
+_SAMPLES = 20
 
 
 @dataclass(frozen=True)
@@ -102,4 +107,39 @@ def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scen
     start = motion.at(0.0)
     a, b, c = (angle + offset for angle in start.gamma)
     initial = Initial(gamma=(a, b, c), gamma_dot=start.gamma_dot, orientation=start.quaternion)
-    return dataclasses.replace(plant, initial=initial)
+    return replace(plant, initial=initial)
+
+
+def held_error(loop: ControlLoop) -> float:
+    """Return the largest error of gamma [rad] under feedforward alone, held over the periods.
+
+    nan where the loop fails.
+    """
+    settings = replace(loop.settings, mode="feedforward")
+    track, _, failure = run_loop(replace(loop, settings=settings, rest_s=0.0))
+    return math.nan if failure else float(np.abs(track.error).max())
+
+
+def unheld_error(scene: Scene, motion: ReferenceMotion) -> tuple[float, float]:
+    """Give a scene the torques of a motion as a function of time: nothing is held.
+
+    Returns:
+        The largest error of gamma over the motion, and the error estimate at its end [rad].
+
+    """
+    inverse = InverseDynamics(scene)
+
+    def torque(time: float) -> Triple:
+        now = motion.at(time)
+        return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
+
+    simulation = Simulation(
+        at_start(scene, motion), "dop853", tolerance=EXACT_TOLERANCE,
+        step_budget=WHOLE_MOTION_BUDGET,
+    )  # fmt: skip
+    worst, step = 0.0, round(motion.duration * NANOSECONDS / _SAMPLES)
+    for _ in range(_SAMPLES):
+        state = simulation.step(torque, step)
+        wanted = motion.at(state.time_ns / NANOSECONDS).gamma
+        worst = max(worst, float(np.abs(np.subtract(wanted, state.joints.gamma)).max()))
+    return worst, simulation.error_estimate

@@ -21,7 +21,7 @@ of `sampled_data.stability_limit`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -36,10 +36,9 @@ from sst_ros.control.tracking import evaluate
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.studies.bandwidth_limits import BandwidthLimit, bandwidth_limit, ideal_plant
+from sst_ros.studies.bandwidth_limits import bandwidth_in_theory, bandwidth_limit, ideal_plant
 from sst_ros.studies.channel import Channel
-from sst_ros.studies.control_loop import ControlLoop, run_loop
-from sst_ros.studies.hold_order import HoldError, UnheldError, held_error, unheld_error
+from sst_ros.studies.control_loop import ControlLoop, held_error, run_loop, unheld_error
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
 from sst_ros.studies.results import table
 from sst_ros.studies.sampled_data import slope
@@ -100,9 +99,11 @@ class FeedforwardStudy:
         seconds: length of the motion [s].
         left_out: errors that the plant cannot have.
         loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
-        holds: feedforward alone with an exact model, by instant and period.
-        unheld: the same with torques as a function of time.
-        limits: of the plant of the theory (`ideal_plant`), and of the plant as it is.
+        holds: feedforward alone with an exact model: instant `at` of the torque that is held,
+            period_s, largest error of gamma [rad].
+        unheld: the same with torques as a function of time: error, and its estimate [rad].
+        limits: largest stable bandwidths of computed torque [rad/s] by delay in samples: theory;
+            ideal, the plant of the theory (`ideal_plant`); real, the plant as it is.
 
     """
 
@@ -110,9 +111,9 @@ class FeedforwardStudy:
     seconds: float
     left_out: tuple[str, ...]
     loops: DataFrame
-    holds: tuple[HoldError, ...]
-    unheld: UnheldError
-    limits: tuple[tuple[BandwidthLimit, BandwidthLimit], ...]
+    holds: DataFrame
+    unheld: tuple[float, float]
+    limits: DataFrame
 
     def rms(self, error: str, mode: str, bandwidth: float) -> float | None:
         """Root of the mean square error of all gamma [rad]; None where the loop failed."""
@@ -136,9 +137,9 @@ class FeedforwardStudy:
     def orders(self) -> dict[str, float]:
         """Power of the period with which the error of a hold falls, by instant."""
         found = {}
-        for at in INSTANTS:
-            holds = [(hold.period_s, hold.error) for hold in self.holds if hold.at == at]
-            found[at] = slope(*zip(*holds, strict=True)) if len(holds) > 1 else float("nan")
+        for at, holds in self.holds.groupby("at", sort=False):
+            errors = holds.period_s.tolist(), holds.error.tolist()
+            found[str(at)] = slope(*errors) if len(holds) > 1 else float("nan")
         return found
 
 
@@ -156,68 +157,54 @@ def feedforward_study(
     errors = [error for error in plan.errors if error.name == "nominal" or error.changes(scene)]
     left_out = tuple(error.name for error in plan.errors if error not in errors)
     basic = ControllerSettings(damping_ratio=plan.damping_ratio)
-    plants = (ideal_plant(scene), scene)
     # What takes longest comes first, so that no core waits for another at the end.
-    jobs: list[Callable[[], Any]] = [
-        partial(_limit, plant, basic, plan.period_ns, delay)
-        for delay in plan.delays for plant in plants
-    ]  # fmt: skip
-    ends = [len(jobs)]
-    jobs += _loops(plan, basic, errors)
-    ends.append(len(jobs))
+    jobs: list[Callable[[], dict[str, Any]]] = [
+        partial(_limit, scene, basic, plan.period_ns, delay) for delay in plan.delays
+    ]
+    schemes = [
+        dataclasses.replace(basic, mode=mode, bandwidth=bandwidth)
+        for mode in MODES
+        for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
+    ]
+    jobs += [partial(_tracked, plan, error, settings) for error in errors for settings in schemes]
     jobs += [
         partial(_held, scene, dataclasses.replace(basic, feedforward_at=at), plan.period_ns * n)
         for at in INSTANTS for n in plan.multiples
     ]  # fmt: skip
     jobs.append(partial(_unheld, scene))
     found = run_jobs(_call, jobs, f"{scene.name:<16}" if shown else "", workers)
-    bounds, loops, holds = found[: ends[0]], found[ends[0] : ends[1]], found[ends[1] : -1]
+    limits, holds = len(plan.delays), len(INSTANTS) * len(plan.multiples)
     return FeedforwardStudy(
-        plan, motion.duration, left_out, table(loops, COLUMNS), tuple(holds), found[-1],
-        tuple(zip(bounds[::2], bounds[1::2], strict=True)),
+        plan, motion.duration, left_out, table(found[limits : -holds - 1], COLUMNS),
+        table(found[-holds - 1 : -1]), (found[-1]["error"], found[-1]["estimate"]),
+        table(found[:limits], ("delay", "theory", "ideal", "real")),
     )  # fmt: skip
 
 
-def _loops(
-    plan: FeedforwardPlan, basic: ControllerSettings, errors: Sequence[ModelError]
-) -> Iterator[Callable[[], dict[str, Any]]]:
-    for error in errors:
-        model = error.model(plan.scene)
-        for mode in MODES:
-            for bandwidth in (None,) if mode == OPEN_LOOP else plan.bandwidths:
-                settings = dataclasses.replace(basic, mode=mode)
-                if bandwidth is not None:
-                    settings = dataclasses.replace(settings, bandwidth=bandwidth)
-                named = {
-                    "scene": plan.scene.name, "error": error.name, "mode": mode,
-                    "bandwidth_rad_per_s": bandwidth, "damping_ratio": plan.damping_ratio,
-                    "period_s": plan.period_ns / NANOSECONDS, "seed": plan.seed,
-                }  # fmt: skip
-                yield partial(
-                    _tracked, named, plan.scene, model, settings, plan.period_ns, error.channel
-                )
-
-
 def _tracked(
-    named: dict[str, Any],
-    plant: Scene,
-    model: Scene,
-    settings: ControllerSettings,
-    period_ns: int,
-    channel: Channel,
+    plan: FeedforwardPlan, error: ModelError, settings: ControllerSettings
 ) -> dict[str, Any]:
     """Run a loop: its row of the table."""
-    motion, seed = _motion(plant), named["seed"]
-    loop = ControlLoop(plant, model, motion, settings, period_ns, channel, seed, rest_s=REST_S)
-    track, limited, failure = run_loop(loop)
+    motion, open_loop = _motion(plan.scene), settings.mode == OPEN_LOOP
+    named = {
+        "scene": plan.scene.name, "error": error.name, "mode": settings.mode,
+        "bandwidth_rad_per_s": None if open_loop else settings.bandwidth,
+        "damping_ratio": plan.damping_ratio, "period_s": plan.period_ns / NANOSECONDS,
+        "seed": plan.seed,
+    }  # fmt: skip
+    track, limited, failure = run_loop(
+        ControlLoop(
+            plan.scene, error.model(plan.scene), motion, settings, plan.period_ns, error.channel,
+            plan.seed, rest_s=REST_S,
+        )
+    )  # fmt: skip
     if failure:
         return named | {"failure": failure}
     found = evaluate(track, int(limited.sum()))
-    if settings.mode != OPEN_LOOP:
-        late = track.time >= motion.duration + 0.5 * REST_S
-        failure = _restless(track.error[late], limited[late], found.band)
-        if failure:
-            return named | {"failure": failure}
+    late = track.time >= motion.duration + 0.5 * REST_S
+    failure = "" if open_loop else _restless(track.error[late], limited[late], found.band)
+    if failure:
+        return named | {"failure": failure}
     power = found.torque_rms**2
     shares = [
         float(np.nansum(share * power) / power.sum()) if power.any() else None
@@ -241,17 +228,22 @@ def _restless(error: Array, limited: NDArray[np.bool_], band: float) -> str:
 
 def _limit(
     plant: Scene, settings: ControllerSettings, period_ns: int, delay: int
-) -> BandwidthLimit:
-    channel = Channel(delay=delay)
-    return bandwidth_limit(ControlLoop(plant, plant, _motion(plant), settings, period_ns, channel))
+) -> dict[str, Any]:
+    ideal, real = (
+        ControlLoop(each, each, _motion(each), settings, period_ns, Channel(delay=delay))
+        for each in (ideal_plant(plant), plant)
+    )
+    return {"delay": delay, "theory": bandwidth_in_theory(real), "ideal": bandwidth_limit(ideal),
+            "real": bandwidth_limit(real)}  # fmt: skip
 
 
-def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> HoldError:
-    return held_error(ControlLoop(plant, plant, _motion(plant), settings, period_ns))
+def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[str, Any]:
+    error = held_error(ControlLoop(plant, plant, _motion(plant), settings, period_ns))
+    return {"at": settings.feedforward_at, "period_s": period_ns / NANOSECONDS, "error": error}
 
 
-def _unheld(plant: Scene) -> UnheldError:
-    return unheld_error(plant, _motion(plant))
+def _unheld(plant: Scene) -> dict[str, Any]:
+    return dict(zip(("error", "estimate"), unheld_error(plant, _motion(plant)), strict=True))
 
 
 @lru_cache(maxsize=4)

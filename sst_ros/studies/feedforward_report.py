@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,14 +96,14 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
     """Yield predictions of the theory beside what was found, line by line."""
     for at, order in study.orders().items():
         cells = ", ".join(f"{hold.error:.2e} rad at {1e3 * hold.period_s:g} ms"
-                          for hold in study.holds if hold.at == at)  # fmt: skip
+                          for hold in study.holds.itertuples() if hold.at == at)  # fmt: skip
         yield (
             f"Exact model, feedforward alone, torque at the {at} of the hold: {cells}; order "
             f"{order:.3f}, theory {ORDERS[at]}"
         )
     yield (
-        f"Torque as a function of time, nothing held: {study.unheld.error:.1e} rad; error estimate "
-        f"of the integrator {study.unheld.estimate:.1e} rad"
+        f"Torque as a function of time, nothing held: {study.unheld[0]:.1e} rad; error estimate "
+        f"of the integrator {study.unheld[1]:.1e} rad"
     )
     for sign in "+-":
         error = f"inertia {sign}{SHARE:.0%}"
@@ -116,10 +115,10 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
                     f"times smaller than that of pd with equal gains; theory: at least {bound:.2f}"
                 )
     yield "Largest stable bandwidth of computed_torque [rad/s]: theory; without friction; as it is"
-    for ideal, real in study.limits:
+    for row in study.limits.itertuples():
         yield (
-            f"  delay {ideal.delay}: {ideal.theory:8.1f} {ideal.simulated:9.1f} "
-            f"({ideal.simulated / ideal.theory - 1.0:+.2%}) {real.simulated:9.1f}"
+            f"  delay {row.delay}: {row.theory:8.1f} {row.ideal:9.1f} "
+            f"({row.ideal / row.theory - 1.0:+.2%}) {row.real:9.1f}"
         )
 
 
@@ -162,11 +161,11 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
         "loops": records(study.loops),
         "holds": [
             {"at": at, "order": None if np.isnan(order) else order, "order_of_theory": ORDERS[at],
-             "errors": [asdict(hold) for hold in study.holds if hold.at == at]}
+             "errors": records(study.holds[study.holds["at"] == at])}
             for at, order in study.orders().items()
         ],
-        "exact_holds": asdict(study.unheld),
-        "limits": [{"ideal": asdict(a), "as_it_is": asdict(b)} for a, b in study.limits],
+        "exact_holds": dict(zip(("error", "estimate"), study.unheld, strict=True)),
+        "limits": records(study.limits),
     }  # fmt: skip
 
 
@@ -181,15 +180,13 @@ def figure(study: FeedforwardStudy) -> Figure:
     if reasons:
         listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:4])
         lines.insert(0, f"Failed: {listed}. The table and the CSV have the reason of each.")
-    limits = table({"delay": ideal.delay, "theory": ideal.theory, "ideal": ideal.simulated,
-                    "real": real.simulated} for ideal, real in study.limits)  # fmt: skip
     return draw_feedforward(
         study.loops,
-        table(asdict(hold) for hold in study.holds),
-        limits,
+        study.holds,
+        study.limits,
         bandwidths=study.plan.bandwidths,
         orders={at: (order, ORDERS[at]) for at, order in study.orders().items()},
-        unheld=study.unheld.error,
+        unheld=study.unheld[0],
         title=title(study),
         footnote="\n".join(lines),
     )
