@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import sphere
 from sst_ros.plot.joints import applied
 from sst_ros.plot.pictures import known, save
@@ -25,27 +24,8 @@ from sst_ros.plot.style import LINES, legend, positive, stack, styled, three
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
 
-
-class Difference(NamedTuple):
-    """How far a run is from the first one.
-
-    Attributes:
-        name: of the run.
-        common: samples that both have.
-        of: samples of the run.
-        gamma: largest difference of an angle gamma_k, and root of the mean square over samples and
-            legs [rad]; nan where nothing is common.
-        gamma_dot: the same of the rates [rad/s].
-        turn: largest angle between the orientations of the star [rad].
-
-    """
-
-    name: str
-    common: int
-    of: int
-    gamma: tuple[float, float]
-    gamma_dot: tuple[float, float]
-    turn: float
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 class Overlay(NamedTuple):
@@ -151,31 +131,40 @@ def _sphere(_: Overlay, runs: Drawn) -> Figure:
     return figure
 
 
-def differences(runs: Sequence[Signals]) -> list[Difference]:
-    """Compare each run with the first one, at the stamps that both have."""
-    return [
-        _compared(runs[0], run, name)
-        for run, name in list(zip(runs, labels(runs), strict=True))[1:]
-    ]
+def differences(runs: Sequence[Signals]) -> DataFrame:
+    """Compare each run with the first one, at the stamps that both have.
+
+    Returns:
+        A row a run, by the labels of runs: samples in common, of how many; largest difference of an
+        angle gamma_k, and root of the mean square over samples and legs [rad]; the same of the
+        rates [rad/s]; largest angle between the orientations of the star [rad]; nan for what
+        cannot be compared.
+
+    """
+    from pandas import DataFrame
+
+    first, names = runs[0], labels(runs)
+    return DataFrame([_compared(first, run) for run in runs[1:]], index=names[1:])
 
 
-def _compared(first: Signals, run: Signals, name: str) -> Difference:
+def _compared(first: Signals, run: Signals) -> dict[str, float]:
     here, there = _common(first, run)
+    absent = {*first.missing, *run.missing}
     of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
-    numbers: list[float] = []
-    for quantity in ("gamma", "gamma_dot"):
-        if "joint_states" in first.missing or "joint_states" in run.missing:
-            numbers += [np.nan, np.nan]
-            continue
-        apart = run.legs(quantity)[there] - first.legs(quantity)[here]
-        apart = apart[np.isfinite(apart)]
-        squares = float(np.mean(apart**2)) if len(apart) else np.nan
-        numbers += [_largest(np.abs(apart)), float(np.sqrt(squares))]
-    turn = np.nan
-    if "orientation" not in (*first.missing, *run.missing):
+    row: dict[str, float] = {"samples": len(here), "of": of}
+    for quantity, name, unit in (("gamma", "γ", "rad"), ("gamma_dot", "rate", "rad/s")):
+        apart = np.empty(0)
+        if JOINTS not in absent:
+            apart = run.legs(quantity)[there] - first.legs(quantity)[here]
+            apart = apart[np.isfinite(apart)]
+        row[f"{name} max [{unit}]"] = float(np.abs(apart).max()) if len(apart) else np.nan
+        row[f"{name} rms [{unit}]"] = float(np.sqrt(np.mean(apart**2))) if len(apart) else np.nan
+    turn = np.empty(0)
+    if TURN not in absent:
         q = ("q_x", "q_y", "q_z", "q_w")
-        turn = _largest(angle_between(first.take(*q)[here], run.take(*q)[there]))
-    return Difference(name, len(here), of, (numbers[0], numbers[1]), (numbers[2], numbers[3]), turn)
+        turn = angle_between(first.take(*q)[here], run.take(*q)[there])
+        turn = turn[np.isfinite(turn)]
+    return row | {"turn max [rad]": float(turn.max()) if len(turn) else np.nan}
 
 
 def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -184,11 +173,6 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
     both = np.intersect1d(first.time_ns("samples"), run.time_ns("samples"), True, True)
     return both[1], both[2]
-
-
-def _largest(values: Array) -> float:
-    known_values = values[np.isfinite(values)]
-    return float(known_values.max()) if len(known_values) else float("nan")
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:
@@ -203,20 +187,11 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 
 def table(runs: Sequence[Signals]) -> str:
     """Write the differences as text."""
-    from pandas import DataFrame
-
-    head = (
+    found = differences(runs)
+    shown = found.drop(columns=["samples", "of"])
+    shown.insert(0, "samples", [f"{row.samples:.0f} of {row.of:.0f}" for row in found.itertuples()])
+    return (
         f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
-        "the start of each run\n(whole nanoseconds, nothing interpolated):\n"
+        "the start of each run\n(whole nanoseconds, nothing interpolated):\n\n"
+        f"{shown.to_string(na_rep='-', float_format=lambda x: f'{x:.3e}')}\n"
     )
-    rows = [
-        {
-            "": found.name, "samples": f"{found.common} of {found.of}",
-            "γ max [rad]": found.gamma[0], "γ rms [rad]": found.gamma[1],
-            "rate max [rad/s]": found.gamma_dot[0], "rate rms [rad/s]": found.gamma_dot[1],
-            "turn max [rad]": found.turn,
-        }
-        for found in differences(runs)
-    ]  # fmt: skip
-    text = DataFrame(rows).to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.3e}")
-    return f"{head}\n{text}\n"
