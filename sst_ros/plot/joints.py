@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.downsampling import few
-from sst_ros.plot.style import BLUE, GREEN, GREY, VERMILION, legend, lines, span, stack, three
+from sst_ros.plot.style import BLUE, GREY, VERMILION, legend, lines, mark_ends, span, stack, three
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.time_series import NANOSECONDS, Integers
 from sst_ros.scene.scene import Scene
@@ -39,11 +39,8 @@ def phase(run: Signals, _: Scene | None) -> Figure:
     figure = Figure(figsize=(10.5, 3.8))
     angle, rate = np.degrees(run.legs("gamma")), run.legs("gamma_dot")
     for leg, axes in enumerate(figure.subplots(1, 3)):
-        known = np.isfinite(angle[:, leg])
-        x, y = angle[known, leg], rate[known, leg]
         axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
-        axes.plot(x[:1], y[:1], "o", color=GREEN, markersize=7, label="start")
-        axes.plot(x[-1:], y[-1:], "s", color=VERMILION, markersize=6, label="end")
+        mark_ends(axes, angle[:, leg], rate[:, leg])
         axes.set_xlabel(f"{three('γ')[leg]} [deg]")
         axes.set_ylabel(f"{three('γ̇')[leg]} [rad/s]")
     figure.axes[-1].legend(loc="best", fontsize=8)

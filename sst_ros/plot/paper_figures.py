@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, lines, positive, span, widen
+from sst_ros.plot.style import BLUE, GREY, LINES, lines, mark_ends, positive, span, widen
 from sst_ros.scene.scene import Scene
 
 NUMBERS = {
@@ -46,14 +46,14 @@ class Solution(NamedTuple):
     @property
     def degrees(self) -> Array:
         """ZYZ angles [deg] without jumps, shape (n, 3)."""
-        computed = zyz_angles(rotations(self.quaternion))
+        computed = zyz_angles(rotation_matrix(self.quaternion))
         if self.euler is not None:
             computed = np.where(np.isfinite(self.euler), self.euler, computed)
         return np.asarray(np.degrees(_unwrapped(computed)))
 
     def position(self, scene: Scene) -> Array:
         """Position of E in {B} [m], shape (n, 3)."""
-        return np.asarray(scene.star.radius * rotations(self.quaternion)[:, :, 2])
+        return np.asarray(scene.star.radius * rotation_matrix(self.quaternion)[:, :, 2])
 
 
 def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
@@ -66,14 +66,6 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     if number is None:
         return name, title
     return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
-
-
-def rotations(quaternion: Array) -> Array:
-    """Rotations R, shape (n, 3, 3), of quaternions (n, 4); nan stays nan."""
-    result = np.full((len(quaternion), 3, 3), np.nan)
-    whole = np.isfinite(quaternion[:, 0])
-    result[whole] = rotation_matrix(quaternion[whole])
-    return result
 
 
 def position_of_e(scene: Scene, solutions: Sequence[Solution]) -> Figure:
@@ -167,8 +159,7 @@ def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
         axes.plot(*solution.position(scene).T, label=name, **looks)
     position = solutions[0].position(scene)
     known = position[np.isfinite(position[:, 0])]
-    axes.plot(*known[:1].T, "o", color=GREEN, markersize=7, label="start", linestyle="none")
-    axes.plot(*known[-1:].T, "s", color=VERMILION, markersize=5, label="end", linestyle="none")
+    mark_ends(axes, *known.T)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect((1, 1, 1))
     shown = np.concatenate([base * outline, star * outline, known])

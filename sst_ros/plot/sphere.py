@@ -15,9 +15,9 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from sst_ros.mechanism import workspace
+from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.paper_figures import rotations
-from sst_ros.plot.style import BLUE, GREEN, VERMILION
+from sst_ros.plot.style import BLUE, mark_ends
 from sst_ros.plot.workspace import View, frame
 from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene
@@ -31,7 +31,7 @@ def sphere(run: Signals, scene: Scene) -> Figure:
     figure, axes, view = ground(scene)
     x, y = view.flat(directions(run))
     axes.plot(x, y, color=BLUE, linewidth=1.8, label="path of E")
-    ends(axes, x, y)
+    mark_ends(axes, x, y)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     return figure
 
@@ -62,17 +62,7 @@ def ground(scene: Scene) -> tuple[Figure, Axes, View]:
 
 def directions(run: Signals) -> Array:
     """Direction of E in {B} at each sample, shape (n, 3)."""
-    return rotations(run.take("q_x", "q_y", "q_z", "q_w"))[:, :, 2]
-
-
-def ends(axes: Axes, x: Array, y: Array) -> None:
-    """Mark where a path begins and ends."""
-    known = np.flatnonzero(np.isfinite(x))
-    for at, mark, colour, name in (
-        (known[:1], "o", GREEN, "start"),
-        (known[-1:], "s", VERMILION, "end"),
-    ):
-        axes.plot(x[at], y[at], mark, color=colour, markersize=6, label=name)
+    return rotation_matrix(run.take("q_x", "q_y", "q_z", "q_w"))[:, :, 2]
 
 
 @lru_cache(maxsize=4)

@@ -140,6 +140,16 @@ def legend(axes: Axes) -> None:
     )  # fmt: skip
 
 
+def mark_ends(axes: Axes, *path: Array) -> None:
+    """Mark the first and the last known point of a path, shape (n,) a coordinate."""
+    known = np.flatnonzero(np.isfinite(path[0]))
+    for at, marker, colour, name in (
+        (known[:1], "o", GREEN, "start"), (known[-1:], "s", VERMILION, "end"),
+    ):  # fmt: skip
+        place = [column[at] for column in path]
+        axes.plot(*place, marker, color=colour, markersize=6, label=name, linestyle="none")
+
+
 def span(panels: Sequence[Axes], seconds: Array) -> None:
     """Show the whole run and no more."""
     for axes in panels:
