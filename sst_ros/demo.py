@@ -17,7 +17,7 @@ from pathlib import Path
 from sst_ros import child_process
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
-from sst_ros.report import tracking_report
+from sst_ros.report import tracking
 from sst_ros.report.run import report
 from sst_ros.report.verdict import text
 from sst_ros.scene import scene
@@ -60,7 +60,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
         bag = empty_bag(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
         follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
-        print(tracking_report.report(bag, out / mode), flush=True)
+        print(tracking.report(bag, out / mode), flush=True)
     return 0
 
 

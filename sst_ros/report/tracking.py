@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a recorded run followed its reference, from the bag alone."""
+"""How well a recorded run followed its reference, from the bag alone: figures, table, picture."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
+from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate, table
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.plot.run_figures import draw_tracking
+from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refused
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR
 
+PICTURE, TABLE = "tracking.png", "tracking.txt"
 KEYS = (REFERENCE.topic.key, TRACKING_ERROR.topic.key)
 
 
@@ -92,6 +95,33 @@ def of(run: Recording) -> TrackedRun | None:
 def metrics(tracked: TrackedRun) -> TrackingMetrics:
     """Return the figures of the tracking."""
     return evaluate(tracked.track, tracked.limited)
+
+
+def report(bag: Path, out: Path) -> str:
+    """Evaluate a recorded run: write the table and the picture into `out`, return the table.
+
+    Raises:
+        InputError: the bag is no whole recording of a run that tracked a reference.
+
+    """
+    tracked = read(bag)
+    found = metrics(tracked)
+    out.mkdir(parents=True, exist_ok=True)
+    name = tracked.recording.scene.name
+    lines = [f"Tracking of {name}, from {bag}", "", table(found)]
+    if np.isfinite(tracked.orientation_error).any():
+        worst = float(np.nanmax(tracked.orientation_error))
+        lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
+    text = "\n".join(lines)
+    (out / TABLE).write_text(text, encoding="utf-8")
+    title = f"Tracking of {name}: {found.seconds:g} s, {found.samples} samples"
+    track = tracked.track
+    figure = draw_tracking(
+        track.time, track.gamma, track.error, tracked.orientation_error,
+        (track.feedforward, track.feedback), title,
+    )  # fmt: skip
+    save_figure(figure, out / PICTURE)
+    return text
 
 
 def _limited(run: Recording) -> int | None:

@@ -37,8 +37,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.studies.bandwidth_limits import bandwidth_in_theory, bandwidth_limit, ideal_plant
-from sst_ros.studies.channel import Channel
-from sst_ros.studies.control_loop import ControlLoop, held_error, run_loop, unheld_error
+from sst_ros.studies.control_loop import Channel, ControlLoop, held_error, run_loop, unheld_error
 from sst_ros.studies.model_errors import SHARE, ModelError, model_errors
 from sst_ros.studies.results import table
 from sst_ros.studies.sampled_data import slope

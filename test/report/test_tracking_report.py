@@ -10,7 +10,7 @@ import pytest
 from sst_ros.errors import InputError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
-from sst_ros.report import tracking, tracking_report
+from sst_ros.report import tracking
 from sst_ros.scene import scene
 
 HOME = np.array(scene.load("example2").initial.gamma)
@@ -60,7 +60,7 @@ def test_the_companions_last_word_says_how_often_a_torque_was_limited(entries, t
 
 
 def test_the_report_writes_a_table_and_a_picture(bag, tmp_path):
-    told = tracking_report.report(bag, tmp_path)
+    told = tracking.report(bag, tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
     assert "error, largest" in told and "nan" not in told
     assert (tmp_path / "tracking.png").stat().st_size > 10_000
@@ -69,7 +69,7 @@ def test_the_report_writes_a_table_and_a_picture(bag, tmp_path):
 def test_a_recording_without_a_reference_is_refused(entries, tmp_path):
     bag = bags.write(tmp_path / "bag", bags.without(entries, bags.DESIRED))
     with pytest.raises(InputError, match="reference"):
-        tracking_report.report(bag, tmp_path)
+        tracking.report(bag, tmp_path)
 
 
 def test_messages_of_other_joints_are_refused(entries, tmp_path):

@@ -22,8 +22,7 @@ from sst_ros.studies.bandwidth_limits import (
     ideal_plant,
     stable,
 )
-from sst_ros.studies.channel import Channel
-from sst_ros.studies.control_loop import ControlLoop, run_loop
+from sst_ros.studies.control_loop import Channel, ControlLoop, run_loop
 from sst_ros.studies.feedforward import COLUMNS, RESTLESS, FeedforwardPlan, feedforward_study
 from sst_ros.studies.feedforward_report import document, figure, page, text
 from sst_ros.studies.model_errors import SHARE, model_errors
