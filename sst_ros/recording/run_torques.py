@@ -10,8 +10,8 @@ import numpy as np
 
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.bag_reader import refused
-from sst_ros.recording.signals import Series, Signals
-from sst_ros.recording.time_series import Integers, usual
+from sst_ros.recording.signals import Signals
+from sst_ros.recording.time_series import Integers, Series, usual
 from sst_ros.recording.topic_tables import COMMANDS, STAMPED_COMMANDS, TICKS
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from sst_ros.errors import Problem
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.bag_reader import Bag, Message, refused
-from sst_ros.recording.time_series import NANOSECONDS, Integers
+from sst_ros.recording.time_series import NANOSECONDS, Integers, Series
 from sst_ros.recording.topic_tables import (
     DIAGNOSTICS,
     EULER,
@@ -28,30 +28,11 @@ from sst_ros.recording.topic_tables import (
     TABLES,
     TICKS,
     TOPIC_TABLES,
-    Column,
     InvalidMessage,
     TopicTable,
 )
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class Series:
-    """Rows of one table: of one topic, or of all topics at the stamps of samples.
-
-    Attributes:
-        columns: what the numbers are.
-        stamp_ns: stamps of the messages [ns], shape (n,); 0 where they have none.
-        received_ns: reception by the recorder, by its clock [ns], shape (n,); 0 where it failed.
-        values: shape (n, number of columns); nan where a message was lost.
-
-    """
-
-    columns: tuple[Column, ...]
-    stamp_ns: Integers
-    received_ns: Integers
-    values: Array
 
 
 @dataclass(frozen=True)

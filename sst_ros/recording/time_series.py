@@ -3,15 +3,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.mechanism.geometry import Array
+from sst_ros.recording.topic_tables import Column
 from sst_ros.state import NANOSECONDS as NANOSECONDS
 
 Integers: TypeAlias = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Rows of one table: of one topic, or of all topics at the stamps of samples.
+
+    Attributes:
+        columns: what the numbers are.
+        stamp_ns: stamps of the messages [ns], shape (n,); 0 where they have none.
+        received_ns: reception by the recorder, by its clock [ns], shape (n,); 0 where it failed.
+        values: shape (n, number of columns); nan where a message was lost.
+
+    """
+
+    columns: tuple[Column, ...]
+    stamp_ns: Integers
+    received_ns: Integers
+    values: Array
 
 
 def aligned(wanted_ns: Integers, stamps_ns: Integers, rows: Array) -> Array:

@@ -14,15 +14,15 @@ from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.run_figures import draw_tracking
-from sst_ros.plot.style import save_figure
+from sst_ros.output_folder import writing
+from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refused
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR
 
-PICTURE, TABLE = "tracking.png", "tracking.txt"
+PICTURES, TABLE = ("tracking", "tracking_error", "control_torques"), "tracking.txt"
 KEYS = (REFERENCE.topic.key, TRACKING_ERROR.topic.key)
 
 
@@ -98,29 +98,22 @@ def metrics(tracked: TrackedRun) -> TrackingMetrics:
 
 
 def report(bag: Path, out: Path) -> str:
-    """Evaluate a recorded run: write the table and the picture into `out`, return the table.
+    """Evaluate a recorded run: write the table and the pictures into `out`, return the table.
 
     Raises:
-        InputError: the bag is no whole recording of a run that tracked a reference.
+        InputError: the bag is no whole recording of a run that tracked a reference, or `out`
+            cannot be written.
 
     """
     tracked = read(bag)
-    found = metrics(tracked)
-    out.mkdir(parents=True, exist_ok=True)
-    name = tracked.recording.scene.name
-    lines = [f"Tracking of {name}, from {bag}", "", table(found)]
+    lines = [f"Tracking of {tracked.recording.scene.name}, from {bag}", "", table(metrics(tracked))]
     if np.isfinite(tracked.orientation_error).any():
         worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
     text = "\n".join(lines)
-    (out / TABLE).write_text(text, encoding="utf-8")
-    title = f"Tracking of {name}: {found.seconds:g} s, {found.samples} samples"
-    track = tracked.track
-    figure = draw_tracking(
-        track.time, track.gamma, track.error, tracked.orientation_error,
-        (track.feedforward, track.feedback), title,
-    )  # fmt: skip
-    save_figure(figure, out / PICTURE)
+    with writing(out, "report"):
+        (out / TABLE).write_text(text, encoding="utf-8")
+    pictures.draw(tracked.recording.signals, out, PICTURES, ["png"])
     return text
 
 

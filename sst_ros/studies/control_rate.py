@@ -103,10 +103,10 @@ def run_controlled(
     assert scene.torque is not None
     profile, period_ns = scene.torque, NANOSECONDS // rate
     shift_ns = period_ns // 2 if hold == MIDDLE else 0
-    compiled = compiled and numba_version() is not None
 
     def build(built: Scene) -> Simulation:
-        return Simulation(built, method, tolerance=TOLERANCE, compiled=compiled)
+        fast = compiled and numba_version() is not None
+        return Simulation(built, method, tolerance=TOLERANCE, compiled=fast)
 
     def torque(simulation: Simulation) -> Any:
         if hold == EXACT:
@@ -209,9 +209,9 @@ def control_study(
         rate, method, hold = points[part.start]
         run = run_controlled(scene, rate, method, hold, problem.seconds, compiled=compiled)
         rows.append(row_of(problem, reference, run))
-    for rate, hold in itertools.product(NODE_RATES, (START, MIDDLE)) if recorded else ():
-        assert recorded is not None
-        rows.append(row_of(problem, reference, recorded(rate, hold), NODES))
+    if recorded is not None:
+        pairs = itertools.product(NODE_RATES, (START, MIDDLE))
+        rows += [row_of(problem, reference, recorded(*pair), NODES) for pair in pairs]
     return ControlStudy(scene.name, problem.seconds, reference, table(rows, COLUMNS))
 
 
@@ -230,7 +230,8 @@ def row_of(
 
 def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
-    own = {name: rate for name, rate in study.least_rates.items() if rate > min(RATES)}
+    late = "; ".join(f"{name}, below {rate:g} Hz,"
+                     for name, rate in study.least_rates.items() if rate > min(RATES))  # fmt: skip
     largest = max((study.spread(hold) for hold in (START, MIDDLE)), default=math.nan)
     if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
         return (
@@ -242,7 +243,6 @@ def advice(study: ControlStudy) -> str:
         rows[rows.rate_Hz == least].largest_rad.max()
         for rows in map(study.resolved, (START, MIDDLE))
     )
-    late = "; ".join(f"{name}, below {rate:g} Hz," for name, rate in own.items())
     other, own_errors = ("other ", f"; {late} has errors of its own") if late else ("", "")
     return (
         "raise the rate or command the torque of the middle of the hold; do not change the method: "

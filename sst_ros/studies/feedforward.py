@@ -24,6 +24,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -157,7 +158,7 @@ def feedforward_study(
     left_out = tuple(error.name for error in plan.errors if error not in errors)
     basic = ControllerSettings(damping_ratio=plan.damping_ratio)
     # What takes longest comes first, so that no core waits for another at the end.
-    jobs: list[Callable[[], dict[str, Any]]] = [
+    jobs: list[Callable[[], Any]] = [
         partial(_limit, scene, basic, plan.period_ns, delay) for delay in plan.delays
     ]
     schemes = [
@@ -171,11 +172,11 @@ def feedforward_study(
         for at in INSTANTS for n in plan.multiples
     ]  # fmt: skip
     jobs.append(partial(_unheld, scene))
-    found = run_jobs(_call, jobs, f"{scene.name:<16}" if shown else "", workers)
+    found = run_jobs(methodcaller("__call__"), jobs, f"{scene.name:<16}" if shown else "", workers)
     limits, holds = len(plan.delays), len(INSTANTS) * len(plan.multiples)
     return FeedforwardStudy(
         plan, motion.duration, left_out, table(found[limits : -holds - 1], COLUMNS),
-        table(found[-holds - 1 : -1]), (found[-1]["error"], found[-1]["estimate"]),
+        table(found[-holds - 1 : -1]), found[-1],
         table(found[:limits], ("delay", "theory", "ideal", "real")),
     )  # fmt: skip
 
@@ -201,8 +202,7 @@ def _tracked(
         return named | {"failure": failure}
     found = evaluate(track, int(limited.sum()))
     late = track.time >= motion.duration + 0.5 * REST_S
-    failure = "" if open_loop else _restless(track.error[late], limited[late], found.band)
-    if failure:
+    if failure := "" if open_loop else _restless(track.error[late], limited[late], found.band):
         return named | {"failure": failure}
     power = found.torque_rms**2
     shares = [
@@ -241,8 +241,8 @@ def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[st
     return {"at": settings.feedforward_at, "period_s": period_ns / NANOSECONDS, "error": error}
 
 
-def _unheld(plant: Scene) -> dict[str, Any]:
-    return dict(zip(("error", "estimate"), unheld_error(plant, _motion(plant)), strict=True))
+def _unheld(plant: Scene) -> tuple[float, float]:
+    return unheld_error(plant, _motion(plant))
 
 
 @lru_cache(maxsize=4)
@@ -250,7 +250,3 @@ def _motion(scene: Scene) -> ReferenceMotion:
     from sst_ros.recording.recorded_motion import samples
 
     return reference_motion(scene, samples)
-
-
-def _call(job: Callable[[], Any]) -> Any:
-    return job()

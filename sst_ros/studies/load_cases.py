@@ -11,14 +11,12 @@ from functools import partial
 
 import numpy as np
 
-from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.studies import extreme_scenes as extremes
 from sst_ros.studies.extreme_cases import LOOSE, Case
 from sst_ros.studies.extreme_scenes import REST, Triple
-from sst_ros.studies.model_errors import scaled
 from sst_ros.studies.sampled_data import pole
 
 QUARTER = math.pi / 4
@@ -214,32 +212,6 @@ def jumps() -> Iterator[Case]:
             _like_tight(lambda _: extremes.PUSH, 37, period_ns),
             name=f"control period of {period_ns} ns",
             difficulty="a period that no step size divides; time is whole nanoseconds",
-        )  # fmt: skip
-
-
-def ratios() -> Iterator[Case]:
-    """Yield extreme ratios of inertias."""
-    for star, links in ((1e9, 1e-9), (1e-9, 1e9)):
-        yield Case(
-            f"star x {star:g} with links x {links:g}",
-            "energy is constant",
-            partial(extremes.with_inertias, star, links),
-            REST, 10, 10_000_000, extremes.energy_drift, 1e-8,
-            difficulty="inertias 1e18 apart in one mass matrix",
-        )  # fmt: skip
-    for scale in (1.0, 1e-12):
-
-        def bare(a: float = scale) -> Scene:
-            scene, links = extremes.spun(2.0), (Link(), Link(), Link())
-            inertia = scaled(Inertia(xx=0.39, yy=0.39, zz=0.26), a)
-            return replace(scene, star=replace(scene.star, inertia=inertia),
-                           actuated_links=links, intermediate_links=links)  # fmt: skip
-
-        yield Case(
-            f"star x {scale:g} beside massless links",
-            "energy is constant",
-            bare, REST, 20, 10_000_000, extremes.energy_drift, 1e-9,
-            difficulty="the star is all that has inertia",
         )  # fmt: skip
 
 

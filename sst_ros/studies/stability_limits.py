@@ -28,7 +28,7 @@ from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
 from sst_ros.studies.sampled_data import largest_stable
-from sst_ros.studies.step_advice import step_advice
+from sst_ros.studies.step_advice import eigenvalues, step_advice
 from sst_ros.sweeps.job_list import run_jobs
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
@@ -155,15 +155,6 @@ FAMILIES: dict[str, tuple[Callable[[float], Scene], tuple[float, ...]]] = {
     "decay": (damped, VISCOSITIES),
     "oscillation": (oscillating, STIFFNESSES),
 }
-
-
-def eigenvalues(scene: Scene) -> NDArray[np.complex128]:
-    """Eigenvalues of the linearised dynamics at the start [1/s]."""
-    dynamics = Dynamics.of(scene)
-    start = initial_state(scene, Geometry.of(scene))
-    lagged = (0.0,) * (len(dynamics.state) - 7)
-    drive = (0.0,) * len(dynamics.drive)
-    return np.asarray(ODE(dynamics).eigenvalues(0.0, (*start, *lagged), drive), dtype=complex)
 
 
 def largest_step(family: str, method: Method, coefficient: float) -> LargestStep:

@@ -70,7 +70,7 @@ GROUPS = (
     ("Friction and actuators", load_cases.friction, ""),
     ("Compliant stops", load_cases.contacts, ""),
     ("Torques that jump", load_cases.jumps, ""),
-    ("Extreme ratios of inertia", load_cases.ratios, ""),
+    ("Extreme ratios of inertia", scaling_cases.ratios, ""),
     ("Long runs", load_cases.long_runs, ""),
 )
 """Headings of the page, the cases below each, and why they are hard where a case names nothing."""

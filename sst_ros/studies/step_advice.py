@@ -10,10 +10,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import SstError
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 
@@ -59,11 +62,7 @@ def step_advice(scene: Scene) -> StepAdvice:
         simulation = Simulation(scene, step_budget=WHOLE_MOTION_BUDGET)
     except SstError as error:
         return StepAdvice(f"none, the scene cannot start: {error}")
-    state, dynamics = simulation.state, simulation.dynamics
-    lagged = (0.0,) * (len(dynamics.state) - 7)
-    y = (*state.quaternion, *state.body_rate, *lagged)
-    eigenvalues = ODE(dynamics).eigenvalues(0.0, y, (0.0,) * len(dynamics.drive))
-    fastest = float(np.abs(eigenvalues).max())
+    fastest = float(np.abs(eigenvalues(scene)).max())
     name = DORMAND_PRINCE.name
     if fastest == 0.0:
         text = f"{name} with steps of {LONGEST_STEP:g} s; nothing moves fast at the start"
@@ -81,6 +80,15 @@ def step_advice(scene: Scene) -> StepAdvice:
         "unstable"
     )
     return StepAdvice(text, name, step)
+
+
+def eigenvalues(scene: Scene) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised dynamics at the start [1/s]."""
+    dynamics = Dynamics.of(scene)
+    start = initial_state(scene, Geometry.of(scene))
+    lagged = (0.0,) * (len(dynamics.state) - 7)
+    drive = (0.0,) * len(dynamics.drive)
+    return np.asarray(ODE(dynamics).eigenvalues(0.0, (*start, *lagged), drive), dtype=complex)
 
 
 def _stiff(simulation: Simulation, scene: Scene) -> bool:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,46 +21,22 @@ from sst_ros.scene.scene import Scene
 from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.reference_solution import EXTENDED, ReferenceSolution, solve_reference
 from sst_ros.studies.results import table
-from sst_ros.studies.solver_grid import TOLERANCE, SolverSetting, solver_grid
+from sst_ros.studies.solver_grid import (
+    ABOVE_REFERENCE,
+    COLUMNS,
+    ERROR,
+    LONGEST_RUN_S,
+    ROUNDING,
+    refined,
+    solver_grid,
+)
 from sst_ros.studies.step_advice import StepAdvice, step_advice
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-ABOVE_REFERENCE = 100.0
-"""Errors are reported only if they are so many times larger than the reference's own."""
-
-USELESS = 0.1
-"""An orientation error above this [rad] is a failure."""
-
 SAME_EQUATIONS = 1e-10
 """Kernel and the paper's equations must agree to this part."""
-
-ROUNDING = 2e-14
-"""Finer steps are not expected to give less than this [rad]."""
-
-LONGEST_RUN_S = 0.4
-"""No finer settings are tried after a run that took longer than this [s]."""
-
-LEAST_SETTINGS = 3
-"""So many settings of each method are tried even where they take longer: a busy machine slows one
-run, but must not empty the grid."""
-
-SLOWER = 5.0
-"""`Simulation` under torques that are functions is plain Python and may take so much longer."""
-
-_REPEAT_S, _REPEATS = 0.15, 15
-
-ERROR = "largest_orientation_rad"
-COLUMNS = (
-    "scene", "method", "kind", "setting", "evaluations", "wall_min_s", "wall_median_s",
-    "final_orientation_rad", "final_gamma_rad", "final_gamma_dot_rad_per_s", ERROR,
-    "largest_gamma_rad", "largest_gamma_dot_rad_per_s", "energy_residual_J", "closure_residual",
-    "below_floor", "failure",
-)  # fmt: skip
-"""Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
-`evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
-for a failure, and `failure` for a success."""
 
 
 @dataclass(frozen=True)
@@ -152,17 +128,13 @@ def work_precision(
     target = InitialValueProblem(scene)
     problem = target if solved is None else InitialValueProblem(solved, like=target)
     grid = solver_grid(problem, compiled)
+    truth = solve_reference(target, kind, compiled=compiled)
     rows: list[dict[str, Any]] = []
     ends: list[Array] = []
-    truth: ReferenceSolution | None = None
-    for part in slices(len(grid) + 1, 1, f"{scene.name:<16}", shown):
-        if truth is None:
-            truth = solve_reference(target, kind, compiled=compiled)
-            continue
-        for row, end in _refined(grid[part.start - 1], problem, truth, longest_s):
+    for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
+        for row, end in refined(grid[part.start], problem, truth, longest_s):
             rows.append({"scene": scene.name, **row})
             ends.append(end)
-    assert truth is not None
     instants = (k * target.interval for k in range(len(truth.states)))
     torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
     along = zip(truth.states.astype(float), torques, strict=True)
@@ -173,66 +145,6 @@ def work_precision(
         _measured(problem, truth, advice), difference,
         tuple(_warnings(problem, truth, rows, ends, difference)),
     )  # fmt: skip
-
-
-def _refined(
-    settings: Iterator[SolverSetting],
-    problem: InitialValueProblem,
-    truth: ReferenceSolution,
-    longest_s: float,
-) -> Iterator[tuple[dict[str, Any], Array]]:
-    """Go from coarse to fine until a run takes long or two errors lie below the floor."""
-    below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
-    for number, setting in enumerate(settings, start=1):
-        row, end = _result(setting, problem, truth)
-        yield row, end
-        error = row.get(ERROR, math.inf)
-        below += error < max(floor, ROUNDING)
-        slower = SLOWER if problem.kinked and setting.kind == TOLERANCE else 1.0
-        if (row["wall_min_s"] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
-            return
-
-
-def _result(
-    setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
-) -> tuple[dict[str, Any], Array]:
-    """Run one setting: its row of the grid, and its last state, nan for a failure."""
-    states, evaluations, failure = np.full((1, len(problem.start)), np.nan), None, ""
-    wall = (0.0, 0.0)
-    with np.errstate(all="ignore"):
-        try:
-            states, evaluations = setting.solve()
-            wall = _timed(setting.timed)
-        except (SstError, ArithmeticError, ValueError) as error:
-            failure = str(error).splitlines()[0] if str(error) else "not finite"
-    if not failure and not np.isfinite(states[:, :7]).all():
-        failure = "not finite"
-    row = {
-        "method": setting.method, "kind": setting.kind, "setting": setting.setting,
-        "evaluations": evaluations, "wall_min_s": wall[0], "wall_median_s": wall[1],
-    }  # fmt: skip
-    if not failure:
-        final, largest = problem.errors(states, truth.states)
-        if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
-            failure = f"off by {largest.orientation:.1g} rad"
-        else:
-            errors = (*asdict(final).values(), *asdict(largest).values())
-            row |= dict(zip(COLUMNS[7:13], errors, strict=True))
-            energy, row["closure_residual"] = problem.residuals(states[-1])
-            row["energy_residual_J"] = energy if math.isfinite(energy) else None
-            row["below_floor"] = largest.orientation < ABOVE_REFERENCE * truth.own.orientation
-    return row | {"failure": failure}, states[-1]
-
-
-def _timed(run: Callable[[], object]) -> tuple[float, float]:
-    walls: list[float] = []
-    while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
-        began = time.perf_counter()
-        run()
-        walls.append(time.perf_counter() - began)
-        if walls[-1] > LONGEST_RUN_S:
-            break
-    return min(walls), float(np.median(walls))
 
 
 def _measured(

@@ -63,7 +63,8 @@ def test_the_report_writes_a_table_and_a_picture(bag, tmp_path):
     told = tracking.report(bag, tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
     assert "error, largest" in told and "nan" not in told
-    assert (tmp_path / "tracking.png").stat().st_size > 10_000
+    for name in ("tracking", "tracking_error", "control_torques"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
 def test_a_recording_without_a_reference_is_refused(entries, tmp_path):

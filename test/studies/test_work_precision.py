@@ -32,9 +32,9 @@ from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.reference_solution import EXTENDED, MPMATH, HighPrecisionDop853
 from sst_ros.studies.results import table, write
 from sst_ros.studies.scene_summary import summary
-from sst_ros.studies.solver_grid import FIXED, TOLERANCE
+from sst_ros.studies.solver_grid import ABOVE_REFERENCE, COLUMNS, ERROR, FIXED, TOLERANCE
 from sst_ros.studies.term_costs import cost_table, operations
-from sst_ros.studies.work_precision import ABOVE_REFERENCE, COLUMNS, ERROR, work_precision
+from sst_ros.studies.work_precision import work_precision
 
 SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
