@@ -16,6 +16,9 @@ BAND = 0.02
 
 ROWS = 10
 
+_KEPT = 4096
+"""Rows of the history of a record that is added in parts: above it every other row goes."""
+
 
 @dataclass(frozen=True)
 class TrackingRecord:
@@ -74,33 +77,108 @@ class TrackingMetrics:
     history: Array
 
 
+class TrackingSums:
+    """Metrics of a record that comes part by part, of which a bounded number of rows is kept."""
+
+    def __init__(self) -> None:
+        self.samples = 0
+        self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
+        self._largest = np.zeros((2, 3))  # error, torque
+        self._range = np.array([np.full(3, np.inf), np.full(3, -np.inf)])
+        self._first = self._last = 0.0
+        self._last_error = np.zeros(3)
+        self._end: float | None = None
+        self._settled: float | None = None
+        self._history, self._newest, self._stride = np.empty((0, 4)), np.empty(4), 1
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of all errors [rad]."""
+        return float(np.sqrt(self._sums[0].sum() / (3 * max(self.samples, 1))))
+
+    @property
+    def largest(self) -> float:
+        """Largest error [rad]."""
+        return float(self._largest[0].max())
+
+    def add(self, track: TrackingRecord) -> None:
+        """Add the next part of the record, of one sample or more."""
+        error, torque = np.abs(track.error), track.torque
+        count = self.samples + np.arange(1, len(error) + 1)
+        square = self._sums[0].mean() + np.cumsum(np.mean(error**2, axis=1))
+        worst = error.max(axis=1)
+        so_far = np.maximum(np.maximum.accumulate(worst), self.largest)
+        rows = np.stack([count - 1, track.time, np.sqrt(square / count), so_far], axis=1)
+        parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
+        self._sums += [np.sum(part, axis=0) for part in parts]
+        largest = error.max(axis=0), np.abs(torque).max(axis=0)
+        self._largest = np.maximum(self._largest, largest)
+        lowest, highest = self._range
+        self._range = np.array([
+            np.minimum(lowest, track.gamma.min(axis=0)),
+            np.maximum(highest, track.gamma.max(axis=0)),
+        ])  # fmt: skip
+        self._settle(track, worst <= self._band())
+        self._first = self._first if self.samples else float(track.time[0])
+        self._last, self._last_error = float(track.time[-1]), error[-1]
+        while len(self._history) > _KEPT:
+            self._history, self._stride = self._history[::2], 2 * self._stride
+        self._history = np.vstack([self._history, rows[rows[:, 0] % self._stride == 0.0]])
+        self._newest, self.samples = rows[-1], int(count[-1])
+
+    def metrics(self, limited: int | None = None) -> TrackingMetrics:
+        """Return the metrics of what was added; `limited` is passed on."""
+        squares, powers, *shares = self._sums / self.samples
+        with np.errstate(invalid="ignore", divide="ignore"):
+            feedforward, feedback = (share / powers for share in shares)
+        settling = None
+        if self._end is not None and self._settled is not None:
+            settling = self._settled - self._end
+        wanted = np.linspace(0, self.samples - 1, ROWS + 1).round()
+        history = np.vstack([self._history, self._newest])
+        shown = np.unique(np.searchsorted(history[:, 0], wanted))
+        return TrackingMetrics(
+            samples=self.samples,
+            seconds=self._last - self._first,
+            rms=np.sqrt(squares),
+            largest=self._largest[0],
+            last=self._last_error,
+            settling=settling,
+            band=self._band(),
+            torque_rms=np.sqrt(powers),
+            torque_largest=self._largest[1],
+            feedforward=feedforward,
+            feedback=feedback,
+            limited=limited,
+            history=history[shown, 1:],
+        )
+
+    def _band(self) -> float:
+        return BAND * float(np.max(self._range[1] - self._range[0]))
+
+    def _settle(self, track: TrackingRecord, inside: NDArray[np.bool_]) -> None:
+        """Find the end of the motion, and since when the error has been inside the band."""
+        moving = np.flatnonzero(np.any(track.gamma_dot != 0.0, axis=1))
+        rest = int(moving[-1]) + 1 if len(moving) else 0
+        if rest:
+            self._end = self._settled = None
+        if rest == len(inside):
+            return
+        if self._end is None:
+            self._end = float(track.time[rest])
+        outside = np.flatnonzero(~inside[rest:])
+        first = rest + (int(outside[-1]) + 1 if len(outside) else 0)
+        if len(outside):
+            self._settled = None
+        if self._settled is None and first < len(inside):
+            self._settled = float(track.time[first])
+
+
 def evaluate(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
     """Return the metrics of a record of one sample or more; `limited` is passed on."""
-    error, torque = np.abs(track.error), track.torque
-    worst, square = error.max(axis=1), np.mean(error**2, axis=1)
-    rms_so_far = np.sqrt(np.cumsum(square) / np.arange(1, len(square) + 1))
-    so_far = np.stack([track.time, rms_so_far, np.maximum.accumulate(worst)], axis=1)
-    shown = np.unique(np.linspace(0, len(worst) - 1, ROWS + 1).round().astype(int))
-    power = np.mean(torque**2, axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        feedforward = np.mean(track.feedforward * torque, axis=0) / power
-        feedback = np.mean(track.feedback * torque, axis=0) / power
-    band = BAND * float(np.ptp(track.gamma, axis=0).max())
-    return TrackingMetrics(
-        samples=len(worst),
-        seconds=float(track.time[-1] - track.time[0]),
-        rms=np.sqrt(np.mean(error**2, axis=0)),
-        largest=error.max(axis=0),
-        last=error[-1],
-        settling=_settling(track, worst <= band),
-        band=band,
-        torque_rms=np.sqrt(power),
-        torque_largest=np.abs(torque).max(axis=0),
-        feedforward=feedforward,
-        feedback=feedback,
-        limited=limited,
-        history=so_far[shown],
-    )
+    sums = TrackingSums()
+    sums.add(track)
+    return sums.metrics(limited)
 
 
 def table(found: TrackingMetrics) -> str:
@@ -129,13 +207,3 @@ def _lines(found: TrackingMetrics) -> Iterator[str]:
     yield f"{'run time [s]':>16}{'RMS to then [rad]':>20}{'largest to then [rad]':>24}"
     for time, rms, largest in found.history:
         yield f"{time:16.4f}{rms:20.3e}{largest:24.3e}"
-
-
-def _settling(track: TrackingRecord, inside: NDArray[np.bool_]) -> float | None:
-    moving = np.flatnonzero(np.any(track.gamma_dot != 0.0, axis=1))
-    end = int(moving[-1]) + 1 if len(moving) else 0
-    if end >= len(inside) or not inside[-1]:
-        return None
-    outside = np.flatnonzero(~inside[end:])
-    first = end + (int(outside[-1]) + 1 if len(outside) else 0)
-    return float(track.time[first] - track.time[end])

@@ -182,6 +182,7 @@ class InverseDynamicsController:
     def _report(self) -> None:
         """Publish the diagnostics."""
         follower = self._follower
+        rms, largest = follower.errors
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         values: dict[str, object] = {
             "stage": stage,
@@ -189,8 +190,8 @@ class InverseDynamicsController:
             "samples": follower.samples,
             "samples_irregular": follower.irregular,
             "samples_limited": follower.limited,
-            "error_rms_rad": follower.rms,
-            "error_max_rad": follower.largest,
+            "error_rms_rad": rms,
+            "error_max_rad": largest,
             "trajectories_refused": follower.refused,
             "last_refusal": follower.last_refusal,
         }

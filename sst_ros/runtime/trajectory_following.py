@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from array import array
 from enum import Enum
 from typing import Any
@@ -17,11 +16,11 @@ from sst_ros.control.plan import check
 from sst_ros.control.reference import Reference
 from sst_ros.control.reference_motions import MotionSamples, ReferenceMotion, reference_motion
 from sst_ros.control.stopping_motion import StoppingMotion
-from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate
+from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, TrackingSums
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.generic_math import ZERO, axpy, dot
+from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime import joint_trajectory
 from sst_ros.runtime.settings import ControllerNodeParameters
@@ -30,6 +29,8 @@ from sst_ros.simulation.simulation import NANOSECONDS
 
 _COLUMNS = 22
 """Numbers of a sample of a `TrackingRecord`."""
+_ROWS = 256
+"""Samples that are added to the tracking metrics at once."""
 
 
 class Stage(Enum):
@@ -49,7 +50,6 @@ class TrajectoryFollower:
         stage: present stage.
         samples, irregular: samples answered, and those that came at another period.
         limited: samples of the motion in which a torque was limited.
-        largest: largest error since the start of the motion [rad].
         refused, last_refusal: trajectories that were refused, and the reason of the last one.
 
     Raises:
@@ -72,8 +72,8 @@ class TrajectoryFollower:
 
     def restart(self) -> None:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
-        self.stage, self._last_ns, self._rows = Stage.WAITING, 0, array("d")
-        self._square = self.largest = 0.0
+        self.stage, self._last_ns = Stage.WAITING, 0
+        self._rows, self._sums = array("d"), TrackingSums()
         self._last: Command | None = None
         if self._planned is not None:
             self._prepare(self._planned)
@@ -165,11 +165,8 @@ class TrajectoryFollower:
 
     def tracking(self) -> TrackingMetrics | None:
         """Return the tracking errors of the motion; None before two samples of it."""
-        if len(self._rows) < 2 * _COLUMNS:
-            return None
-        rows = np.array(self._rows).reshape(-1, _COLUMNS)
-        time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
-        return evaluate(TrackingRecord(time[:, 0], *columns), self.limited)
+        self._add_rows()
+        return self._sums.metrics(self.limited) if self._sums.samples > 1 else None
 
     @property
     def time(self) -> float:
@@ -177,10 +174,10 @@ class TrajectoryFollower:
         return (self._last_ns - (self._start_ns or self._last_ns)) / NANOSECONDS
 
     @property
-    def rms(self) -> float:
-        """Root of the mean square of all errors since the start of the motion [rad]."""
-        count = len(self._rows) // _COLUMNS
-        return math.sqrt(self._square / (3 * count)) if count else 0.0
+    def errors(self) -> tuple[float, float]:
+        """Root of the mean square and largest of all errors of the motion so far [rad]."""
+        self._add_rows()
+        return self._sums.rms, self._sums.largest
 
     def _prepare(self, motion: ReferenceMotion) -> None:
         period_s = self._period_ns / NANOSECONDS
@@ -191,15 +188,12 @@ class TrajectoryFollower:
     def _begin(self, motion: ReferenceMotion, start_ns: int | None) -> None:
         """Follow a motion from an instant on; None for the next sample."""
         self._motion, self._start_ns = motion, start_ns
-        self._rows = array("d")
-        self._square = self.largest = 0.0
+        self._rows, self._sums = array("d"), TrackingSums()
         self.limited = 0
 
     def _log(self, time: float, measured: Measurement, command: Command) -> None:
         desired = command.desired
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
-        self._square += dot(error, error)
-        self.largest = max(self.largest, *map(abs, error))
         self._rows.extend(
             (
                 time,
@@ -212,6 +206,16 @@ class TrajectoryFollower:
                 *command.torque,
             )
         )
+        if len(self._rows) >= _ROWS * _COLUMNS:
+            self._add_rows()
+
+    def _add_rows(self) -> None:
+        """Add the samples since the last call to the metrics."""
+        if self._rows:
+            rows = np.array(self._rows).reshape(-1, _COLUMNS)
+            time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
+            self._sums.add(TrackingRecord(time[:, 0], *columns))
+            self._rows = array("d")
 
     def _standing(self, seen: Measurement | None) -> Reference:
         """Return the reference at rest at the measured angles."""

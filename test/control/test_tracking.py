@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import BAND, TrackingRecord, evaluate, table
+from sst_ros.control.tracking import BAND, TrackingRecord, TrackingSums, evaluate, table
 
 TIME = np.linspace(0.0, 2.0, 2001)
 
@@ -68,3 +68,15 @@ def test_the_table_says_what_it_knows():
     assert "nan" not in lines
     assert "7  (of 2001)" in lines
     assert lines.count("\n") == 10 + 2 + 11
+
+
+@pytest.mark.parametrize("size", [1, 7, 400, 1500])
+def test_a_record_in_parts_has_the_metrics_of_the_whole(size):
+    error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
+    whole, sums = track(error, feedforward=np.sin(TIME), feedback=np.cos(TIME)), TrackingSums()
+    for first in range(0, len(TIME), size):
+        part = {name: column[first : first + size] for name, column in vars(whole).items()}
+        sums.add(TrackingRecord(**part))
+    found, expected = vars(sums.metrics(3)), vars(evaluate(whole, 3))
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, rel=1e-12), name

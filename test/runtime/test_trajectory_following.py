@@ -2,13 +2,14 @@
 """The companion's work without its node: when it begins, goes on, ends, and what it refuses."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
 
+from sst_ros.control import tracking
 from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.tracking import BAND
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
@@ -46,9 +47,10 @@ def test_it_follows_holds_and_ends_with_zero_torque():
     assert stages == [Stage.FOLLOWING] * 25 + [Stage.HOLDING] * 5 + [Stage.ENDED]
     assert commands[-1].torque == (0.0, 0.0, 0.0) and follower.samples == 31
     judged = follower.tracking()
-    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / BAND
-    assert follower.largest == judged.largest.max()
-    assert follower.rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
+    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / tracking.BAND
+    rms, largest = follower.errors
+    assert largest == judged.largest.max()
+    assert rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
 
 
 def test_samples_that_come_twice_or_late_are_told_apart():
@@ -57,6 +59,21 @@ def test_samples_that_come_twice_or_late_are_told_apart():
     for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
         assert (follower.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
     assert (follower.samples, follower.irregular) == (3, 1)
+
+
+def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
+    monkeypatch.setattr(tracking, "_KEPT", 100)
+    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(hold=1e6))
+    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
+    for k in range(600):
+        follower.answer(START_NS + k * PERIOD_NS, here)
+    tracemalloc.start()
+    for k in range(600, 1200):
+        follower.answer(START_NS + k * PERIOD_NS, here)
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 70_000  # 600 rows of a record are 106 000
+    assert follower.tracking().samples == 1200
 
 
 def test_a_reset_of_the_simulator_begins_the_motion_anew():
