@@ -27,7 +27,7 @@ import rclpy
 
 from benchmark.nodes import Process, Watch, markdown
 from sst_ros.nodes import middleware, topics
-from sst_ros.nodes.messages import StateMessages, TorqueLog
+from sst_ros.nodes.messages import StateMessages, TorqueLog, stamp
 from sst_ros.runtime import realtime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
@@ -75,7 +75,7 @@ def publisher(number: int) -> Callable[[int], None]:
     named = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ, topics.APPLIED_TORQUES)
     publishers = [topic.publisher(node, 1000) for topic in named]
     messages, log = StateMessages(), TorqueLog(2, TICK_NS)
-    messages.fill(Simulation("swing").state)
+    messages.fill(*Simulation("swing").sample)
     states = (messages.joints, messages.orientation, messages.euler)
     end = time.monotonic() + 60.0
     while not all(one.get_subscription_count() for one in publishers):
@@ -88,7 +88,7 @@ def publisher(number: int) -> Callable[[int], None]:
             log.append(ZERO, ZERO, 2)
             publishers[3].publish(log.take(stamp_ns))
         for one, message in zip(publishers, states, strict=False):
-            one.publish(message.stamped(stamp_ns))
+            one.publish(message.stamped(stamp(stamp_ns)))
 
     return publish
 

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
 from sst_ros.nodes.graph import UNNAMED, publishers
-from sst_ros.nodes.messages import clock_message
+from sst_ros.nodes.messages import clock_message, stamp
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must not stand still with simulated time."""
@@ -59,7 +59,7 @@ class PublishedClock:
 
     def repeat(self) -> None:
         """Publish the time again, for late subscribers."""
-        self._publisher.publish(self._message.stamped(self.now_ns))
+        self._publisher.publish(self._message.stamped(stamp(self.now_ns)))
 
     def rivals(self) -> list[str]:
         """Names of other nodes that publish /clock."""

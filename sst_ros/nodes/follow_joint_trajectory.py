@@ -10,12 +10,10 @@ from __future__ import annotations
 import contextlib
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -23,6 +21,7 @@ from sst_ros.control.controller import Command, Measurement
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.nodes import topics
+from sst_ros.nodes.action_goal import ActionGoal
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
@@ -41,16 +40,11 @@ _SPIN_S = 0.01
 """Least time to deliver the result of a goal that the end of the node aborts: 0.2 s."""
 
 
-@dataclass
-class _ActiveGoal:
-    handle: Any
-    goal: TrajectoryGoal
-    result: Future[Any] = field(default_factory=Future)
-    feedback: Any = None
-
-    async def wait(self, _: Any) -> Any:
-        """Return the result when the goal has ended."""
-        return await self.result
+class _ActiveGoal(ActionGoal):
+    def __init__(self, handle: Any, goal: TrajectoryGoal) -> None:
+        super().__init__(handle)
+        self.goal = goal
+        self.feedback: Any = None
 
 
 class FollowJointTrajectoryServer:
@@ -132,7 +126,6 @@ class FollowJointTrajectoryServer:
         self.interrupt("preempted by a new goal")
         assert self._accepted is not None
         self._active = _ActiveGoal(handle, self._accepted)
-        handle.execute(self._active.wait)
 
     def _cancel(self, handle: Any) -> CancelResponse:
         """Stop; the goal ends after this call, when its handle has changed to canceling."""
@@ -148,15 +141,9 @@ class FollowJointTrajectoryServer:
     def _end(self, code: ErrorCode, message: str) -> None:
         active, self._active = self._active, None
         assert active is not None
-        if active.handle.is_cancel_requested:
-            active.handle.canceled()
-        elif code is ErrorCode.SUCCESSFUL:
-            active.handle.succeed()
-        else:
-            active.handle.abort()
         self._node.get_logger().info(f"follow_joint_trajectory: {message}")
         result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
-        active.result.set_result(result)
+        active.end(result, success=code is ErrorCode.SUCCESSFUL)
 
     def _report(self) -> None:
         """Publish feedback of the last sample, once."""

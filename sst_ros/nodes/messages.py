@@ -19,7 +19,7 @@ from sst_ros.description.headers import BASE_FRAME
 from sst_ros.errors import SstError
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS
-from sst_ros.simulation.simulation import NANOSECONDS, State
+from sst_ros.simulation.simulation import NANOSECONDS
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _STAMP = struct.Struct("<iI")
@@ -49,7 +49,7 @@ class CdrMessage:
     def time(self, nanoseconds: int) -> None:
         """Append a builtin_interfaces Time or Duration."""
         self._align(4)
-        self._data += _STAMP.pack(*divmod(nanoseconds, NANOSECONDS))
+        self._data += stamp(nanoseconds)
 
     def length(self, count: int) -> None:
         """Append the length of a sequence."""
@@ -81,9 +81,9 @@ class CdrMessage:
         self.length(count)
         return self.doubles(count) if count else _nothing
 
-    def stamped(self, nanoseconds: int) -> bytes:
-        """Return the message with this stamp [ns] in the header that it begins with."""
-        _STAMP.pack_into(self._data, len(_ENCAPSULATION), *divmod(nanoseconds, NANOSECONDS))
+    def stamped(self, stamp: bytes) -> bytes:
+        """Return the message with this stamp in the header that it begins with."""
+        self._data[4:12] = stamp
         return bytes(self._data)
 
     def _align(self, size: int) -> None:
@@ -92,6 +92,11 @@ class CdrMessage:
 
 def _nothing() -> None:
     """Write no value."""
+
+
+def stamp(nanoseconds: int) -> bytes:
+    """Return the bytes of a builtin_interfaces Time or Duration."""
+    return _STAMP.pack(*divmod(nanoseconds, NANOSECONDS))
 
 
 class NotFinite(SstError):
@@ -121,24 +126,27 @@ class StateMessages:
         self.euler.header(BASE_FRAME)
         self._angles = self.euler.doubles(3)
 
-    def fill(self, state: State) -> None:
+    def fill(self, y: Sequence[float], joints: Sequence[float], torque: Sequence[float]) -> None:
         """Write a state; the effort is the torque over the step that ended at it.
+
+        Args:
+            y: numbers that begin with the quaternion (x, y, z, w).
+            joints: nine angles [rad], then nine rates [rad/s], by kind and leg.
+            torque: of the actuators [N m].
 
         Raises:
             NotFinite: nothing has been written.
 
         """
-        gamma, mu, beta, gamma_dot, mu_dot, beta_dot = state.joints
-        angles = gamma + mu + beta
-        rates = gamma_dot + mu_dot + beta_dot
+        quaternion = y[:4]
         # One number that is not finite makes the sum so.
-        if not math.isfinite(sum(angles + rates + state.quaternion + state.torque)):
-            raise NotFinite(f"a state that is not finite is not published: {state}")
-        self._position(*angles)
-        self._velocity(*rates)
-        self._effort(*state.torque, *_ZEROS[3:])
-        self._quaternion(*state.quaternion)
-        self._angles(*zyz_angles(state.quaternion))
+        if not math.isfinite(sum(joints) + sum(quaternion) + sum(torque)):
+            raise NotFinite(f"not finite, so not published: {quaternion}, {joints}, {torque}")
+        self._position(*joints[:9])
+        self._velocity(*joints[9:])
+        self._effort(*torque, *_ZEROS[3:])
+        self._quaternion(*quaternion)
+        self._angles(*zyz_angles(quaternion))
 
     def set_at_rest(self) -> None:
         """Set all rates and efforts to zero."""
@@ -203,7 +211,7 @@ class TorqueLog:
         for write, row in zip(writes, self._rows, strict=True):
             write(*row)
         self._rows.clear()
-        return message.stamped(stamp_ns)
+        return message.stamped(stamp(stamp_ns))
 
     def _layout(self, count: int) -> tuple[CdrMessage, list[Write]]:
         message, writes = CdrMessage(), []

@@ -42,31 +42,36 @@ def take(subscription: Subscription[Any], *, raw: bool) -> tuple[Any, dict[str, 
 
 
 class Reader:
-    """Messages of a topic, each as soon as it has arrived."""
+    """Messages of a topic, each as soon as it has arrived.
+
+    Attributes:
+        waiting: a message is known that arrived after the time of the last `take`.
+
+    """
 
     def __init__(self, node: Node, topic: Endpoint) -> None:
         self._subscription = node.create_subscription(
             topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
         )
+        self._handle: Any = self._subscription.handle
         self._next: tuple[Any, int] | None = None
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a message is known that arrived after the time of the last `take`."""
-        return self._next is not None
+        self.waiting = False
 
     def take(self, until_ns: float) -> Any:
         """Return the next message if it arrived until this monotonic time [ns], or None."""
         if self._next is None:
             # As bytes: otherwise an empty message is made each time that there is none.
-            if (taken := take(self._subscription, raw=True)) is None:
+            with self._handle:
+                taken = self._handle.take_message(self._subscription.msg_type, True)
+            if taken is None:
                 return None
             data, information = taken
             message = deserialize_message(data, self._subscription.msg_type)
             ago = max(0, time.time_ns() - information["received_timestamp"])
             self._next = message, time.monotonic_ns() - ago
         message, arrived_ns = self._next
-        if arrived_ns > until_ns:
+        self.waiting = arrived_ns > until_ns
+        if self.waiting:
             return None
         self._next = None
         return message

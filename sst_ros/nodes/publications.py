@@ -23,7 +23,7 @@ from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
-from sst_ros.nodes.messages import NotFinite, StateMessages, TorqueLog
+from sst_ros.nodes.messages import CdrMessage, NotFinite, StateMessages, TorqueLog, stamp
 from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene
@@ -33,7 +33,7 @@ from sst_ros.simulation.simulation import State, Triple
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
-_COUNT_NS = 5_000_000
+_COUNT_NS = 20_000_000
 """Subscribers are counted this often: to count those of four topics takes as long as a tick."""
 
 
@@ -59,7 +59,8 @@ class SimulatorTopics:
                 topics.APPLIED_TORQUES,
             )
         )
-        self._read: set[Publisher[Any]] = set()
+        self._read: list[Publisher[Any]] = []
+        self._states: list[tuple[Any, CdrMessage]] = []
         self._counted_ns = 0
         self._phase = topics.PHASE.publisher(node)
         self._scene = topics.SCENE.publisher(node)
@@ -107,17 +108,18 @@ class SimulatorTopics:
 
         """
         self._count_subscribers(_COUNT_NS)
-        read = self._subscribed(self._samples)
-        if read:
-            self._samples.fill(simulation.state)
+        if self._states:
+            self._samples.fill(*simulation.sample)
         if self._clock is not None:
             self._clock.publish(stamp_ns)
-        if self._log and self._torques in self._read:
-            began_ns = stamp_ns - len(self._log) * self._period_ns
-            self._torques.publish(self._log.take(began_ns))
-        self._log.clear()
-        for publisher, message in read:
-            publisher.publish(message.stamped(stamp_ns))
+        if (ticks := len(self._log)) and self._torques in self._read:
+            self._torques.publish(self._log.take(stamp_ns - ticks * self._period_ns))
+        else:
+            self._log.clear()
+        at = stamp(stamp_ns)
+        for handle, message in self._states:
+            with handle:  # as Publisher.publish, without its look at the type
+                handle.publish_raw(message.stamped(at))
 
     def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts.
@@ -129,12 +131,13 @@ class SimulatorTopics:
         self._log.clear()
         self._torques.publish(self._log.take(0))
         with contextlib.suppress(NotFinite):  # then the last valid one is shown
-            self._idles.fill(state)
+            self._idles.fill(state.quaternion, sum(state.joints, ()), state.torque)
         if at_rest:
             self._idles.set_at_rest()
         self._count_subscribers(0)
-        for publisher, message in self._subscribed(self._idles):
-            publisher.publish(message.stamped(stamp_ns if publisher is self._joints else 0))
+        for publisher, message in self._messages(self._idles):
+            at = stamp_ns if publisher is self._joints else 0
+            publisher.publish(message.stamped(stamp(at)))
 
     def phase_changed(self, phase: str) -> None:
         """Publish and log the phase, with the reason of a fault."""
@@ -155,16 +158,14 @@ class SimulatorTopics:
         if now - self._counted_ns >= age_ns:
             self._counted_ns = now
             every = (self._joints, self._orientation, self._euler, self._torques)
-            self._read = {topic for topic in every if topic.get_subscription_count()}
+            self._read = [topic for topic in every if topic.get_subscription_count()]
+            self._states = [(one.handle, data) for one, data in self._messages(self._samples)]
 
-    def _subscribed(self, messages: StateMessages) -> list[tuple[Publisher[Any], Any]]:
-        """Messages of the state whose topics have subscribers."""
-        pairs = (
-            (self._joints, messages.joints),
-            (self._orientation, messages.orientation),
-            (self._euler, messages.euler),
-        )
-        return [pair for pair in pairs if pair[0] in self._read] if self._read else []
+    def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], CdrMessage]]:
+        """Messages of a state whose topics have subscribers."""
+        publishers = (self._joints, self._orientation, self._euler)
+        pairs = zip(publishers, (of.joints, of.orientation, of.euler), strict=True)
+        return [pair for pair in pairs if pair[0] in self._read]
 
     def _named(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
         own = {publisher.topic_name: publisher for publisher in self._node.publishers}

@@ -14,9 +14,9 @@ from typing import Any
 
 from rclpy.action.server import ActionServer, CancelResponse
 from rclpy.node import Node
-from rclpy.task import Future
 
 from sst_ros.nodes import topics
+from sst_ros.nodes.action_goal import ActionGoal
 from sst_ros.nodes.simulated_star import OK, UNSUPPORTED, SimulatedStar, answer, replied
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
@@ -138,15 +138,10 @@ class StepsAction:
         )
 
     def _begin(self, handle: Any) -> None:
-        result: Future[Any] = Future()
+        threading.Thread(target=self._run, args=(ActionGoal(handle),), daemon=True).start()
 
-        async def wait(_: Any) -> Any:
-            return await result
-
-        handle.execute(wait)
-        threading.Thread(target=self._run, args=(handle, result), daemon=True).start()
-
-    def _run(self, handle: Any, result: Future[Any]) -> None:
+    def _run(self, goal: ActionGoal) -> None:
+        handle = goal.handle
         steps, reply = int(handle.request.steps), Reply(True, "")
         feedback = action.SimulateSteps.Feedback()
         for done in range(1, steps + 1):
@@ -157,13 +152,7 @@ class StepsAction:
                 break
             feedback.completed_steps, feedback.remaining_steps = done, steps - done
             handle.publish_feedback(feedback)
-        if handle.is_cancel_requested:
-            handle.canceled()
-        elif reply.success:
-            handle.succeed()
-        else:
-            handle.abort()
-        result.set_result(replied(action.SimulateSteps.Result(), reply))
+        goal.end(replied(action.SimulateSteps.Result(), reply), success=reply.success)
 
 
 def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:

@@ -23,6 +23,8 @@ from sst_ros.recording.mcap_file import LIBRARY
 VERSION: Final = 9
 FLUSH_PERIOD_S = 1.0
 """A process that is killed loses the messages of this time at most."""
+_CHUNK_BYTES = 16 * 1024 * 1024
+"""Above what a run gives between two flushes: the index of a chunk stays in memory to the end."""
 
 
 class RecordingAborted(SstError):
@@ -36,7 +38,10 @@ class _McapStorage:
         self.path = path / f"{path.name}.mcap"
         self._file = self.path.open("xb")
         self._writer: Any = McapWriter(  # partly untyped
-            self._file, compression=CompressionType.NONE, enable_data_crcs=True
+            self._file,
+            chunk_size=_CHUNK_BYTES,
+            compression=CompressionType.NONE,
+            enable_data_crcs=True,
         )
         self._writer.start("ros2", LIBRARY)
         self._schemas: dict[str, int] = {}

@@ -30,30 +30,38 @@ class HeldTorques:
         self._second: Triple | None = None
         self._last: Triple | None = None
         self._impulse = [0.0, 0.0, 0.0]
-        self._seconds, self._changes = 0.0, 0
+        self._seconds = self._held = 0.0
+        self._changes = 0
 
     def add(self, torque: Triple | SineTorque, seconds: float) -> None:
         """Add torques [N m] that were held for some time [s]; a sine is not held."""
-        if isinstance(torque, SineTorque):
-            return
-        if torque != self._last:
+        if torque is not self._last and torque != self._last:
+            if isinstance(torque, SineTorque):
+                return
+            self._sum()
             self._changes += 1
             self._last = torque
             if self._first is None:
                 self._first = torque
             elif self._second is None:
                 self._second = torque
-        self._seconds += seconds
-        impulse = self._impulse
-        impulse[0] += torque[0] * seconds
-        impulse[1] += torque[1] * seconds
-        impulse[2] += torque[2] * seconds
+        self._held += seconds
+
+    def _sum(self) -> None:
+        """Add what the last torque has done."""
+        if self._last is not None:
+            self._seconds += self._held
+            self._impulse = [
+                p + torque * self._held for p, torque in zip(self._impulse, self._last, strict=True)
+            ]
+            self._held = 0.0
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
 
         None where fewer than two torques were held, or where the torques of the actuators lag.
         """
+        self._sum()
         first, second, last = self._first, self._second, self._last
         lags = len(simulation.dynamics.state) > 7
         if first is None or second is None or last is None or lags:

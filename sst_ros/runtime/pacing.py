@@ -23,9 +23,7 @@ class TimeSource(Protocol):
 class SteadyTime:
     """The monotonic clock of the machine."""
 
-    def now_ns(self) -> int:
-        """Return the time [ns]."""
-        return time.monotonic_ns()
+    now_ns = staticmethod(time.monotonic_ns)
 
     def sleep(self, ns: int) -> None:
         """Wait for this time [ns]."""
@@ -37,6 +35,7 @@ class Pacer:
 
     Attributes:
         speed: real-time factor; 0 for deadlines that have always come.
+        interval_ns: time between deadlines [ns]; 0 without any.
         missed: ticks dropped.
         overruns: times that ticks were dropped.
         jumps: times that the clock went back.
@@ -50,7 +49,7 @@ class Pacer:
         """Lateness up to `tolerance_ns` is made up for: the step of a followed clock."""
         self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
         self._anchor = self._count = self._seen = 0
-        self.speed = speed
+        self._set(speed)
         self.missed = self.overruns = self.jumps = self.late_ns = 0
 
     def ticks_within(self, ns: int) -> int:
@@ -58,12 +57,7 @@ class Pacer:
 
         It is 1 on a clock that is followed: the next deadline is not known by it.
         """
-        return 1 if self._tolerance_ns else max(1, int(ns * self.speed // self._period_ns))
-
-    @property
-    def interval_ns(self) -> int:
-        """Time between deadlines [ns]; 0 without any."""
-        return round(self._period_ns / self.speed) if self.speed else 0
+        return 1 if self._tolerance_ns else max(1, int(ns // self._interval))
 
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
@@ -72,40 +66,42 @@ class Pacer:
 
     def change(self, speed: float) -> None:
         """Go on at another speed, without a burst."""
-        self.speed = speed
+        self._set(speed)
         self.start()
+
+    def _set(self, speed: float) -> None:
+        self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
+        self.interval_ns = round(self._interval)
 
     def excuse(self, ticks: int) -> None:
         """Put the deadlines off if the last of the next ticks is past: that is no overrun."""
         if self.speed > 0.0:
-            self._anchor += max(0, self._late(self._source.now_ns(), ticks))
+            self._anchor += max(0, self._source.now_ns() - self._due(ticks))
 
-    def _late(self, now: int, ticks: int) -> int:
-        """Return the time from the last of the next ticks to now [ns]; negative before it."""
-        interval = self._period_ns / self.speed
-        return now - self._anchor - round((self._count + ticks - 1) * interval)
+    def _due(self, ticks: int) -> int:
+        """Return the deadline of the last of the next ticks [ns]."""
+        return self._anchor + round((self._count + ticks - 1) * self._interval)
 
     def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
         """Wait for the next deadline, or the last of several; False if interrupted before."""
         if self.speed == 0.0:
             self.late_ns = 0
             return not interrupted()
-        interval = self._period_ns / self.speed
+        due = self._due(ticks)
         while True:
             now = self._source.now_ns()
             if now < self._seen:
                 self.jumps += 1
                 self.start()
-                now = self._anchor
+                now, due = self._anchor, self._due(ticks)
             self._seen = now
-            late = self._late(now, ticks)
-            if late >= 0:
+            if (late := now - due) >= 0:
                 break
             if interrupted():
                 return False
             self._source.sleep(min(-late, _LONGEST_SLEEP_NS))
-        if late >= max(interval, self._tolerance_ns):
-            dropped = int(late // interval)
+        if late >= self._interval and late >= self._tolerance_ns:
+            dropped = int(late // self._interval)
             self.missed += dropped
             self.overruns += 1
             self._count += dropped

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple, Protocol
 
@@ -41,6 +42,10 @@ class HasState(Protocol):
     @property
     def state(self) -> State:
         """Present state; built when it is read."""
+
+    @property
+    def sample(self) -> tuple[Sequence[float], Sequence[float], Triple]:
+        """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
 
 
 class RunOutput(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 import threading
 import time
 
@@ -119,10 +120,10 @@ class TickLoop:
         self._owner, self._input, self._pacer, self._output = owner, torque_input, pacer, output
         self._lockstep = given.sync == "lockstep"
         self._period_ns, self._ticks_per_sample = given.period_ns, given.ticks_per_sample
-        self._last_tick = math.ceil(given.duration * given.rate - 1e-6) or math.inf
+        self._last_tick = math.ceil(given.duration * given.rate - 1e-6) or sys.maxsize
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
         self._kept: Triple | None = None  # in lockstep, an answer whose deadline has not come
-        self._awaited_since = time.monotonic()
+        self._awaited_since = self._waits_since = time.monotonic()
 
     def warm_up(self) -> None:
         """Load the code of every method, take the first step and go back.
@@ -188,23 +189,17 @@ class TickLoop:
             self._kept = self._kept or self._answer(paced)
             if self._kept is None:
                 return False
-        at_once = self._lockstep or not paced or self._pacer.speed == 0.0
-        longest = time.monotonic() + _LONGEST_WAIT_S
-
-        def interrupted() -> bool:
-            late = self.requested.is_set() and time.monotonic() > longest
-            return late or self.stopped.is_set()
-
+        interval_ns = self._pacer.interval_ns if paced and not self._lockstep else 0
+        self._waits_since = time.monotonic()
         while True:
-            ticks, interval_ns, unread = self._ticks_left(), 0, 0
-            if at_once and paced and not self._lockstep and self._output.unread:
-                unread = self._unread_samples(ticks)
-                ticks += unread * self._ticks_per_sample
-            if not at_once:
-                interval_ns = self._pacer.interval_ns
+            ticks, unread = self._ticks_left(), 0
+            if interval_ns:
                 longest_ns = _LONGEST_SLEEP_NS if self.simulation.compiled else 0
                 ticks = min(ticks, self._pacer.ticks_within(longest_ns))
-            if paced and not self._pacer.wait(interrupted, ticks):
+            elif paced and not self._lockstep and self._output.unread:
+                unread = self._unread_samples(ticks)
+                ticks += unread * self._ticks_per_sample
+            if paced and not self._pacer.wait(self._interrupted, ticks):
                 return False
             now = time.monotonic_ns()
             while ticks:
@@ -218,6 +213,10 @@ class TickLoop:
                 self._kept = None
                 self._publish()
                 return True
+
+    def _interrupted(self) -> bool:
+        late = self.requested.is_set() and time.monotonic() - self._waits_since > _LONGEST_WAIT_S
+        return late or self.stopped.is_set()
 
     def publish_rest(self) -> None:
         """Publish what has been done since the last sample, if anything."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from sst_ros.description.headers import nanoseconds
@@ -80,8 +80,7 @@ class TorqueInput:
     def clear(self) -> None:
         """Forget the command and what has arrived: zero torque until the next command."""
         for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
-            for _ in _arrived(arrivals):
-                pass
+            _arrived(arrivals)
         self._forget()
 
     def _forget(self) -> None:
@@ -168,18 +167,15 @@ class TorqueInput:
         if self._moments is not None:
             self._take_moments(now_ns)
 
-    def _commanded(self, until_ns: float = math.inf) -> Iterator[Any]:
-        """Yield stamped commands; with partial_commands nan is zero torque, all nan no command."""
-        for message in _arrived(self._stamped, until_ns):
-            if self._owner.parameters.partial_commands:
-                missing = [*map(math.isnan, message.effort)]
-                if missing and all(missing):
-                    continue
-                message.effort = [
-                    0.0 if none else torque
-                    for none, torque in zip(missing, message.effort, strict=True)
-                ]
-            yield message
+    def _commanded(self, until_ns: float = math.inf) -> Sequence[Any]:
+        """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""
+        found = _arrived(self._stamped, until_ns)
+        if not (found and self._owner.parameters.partial_commands):
+            return found
+        given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
+        for message in given:
+            message.effort = [0.0 if math.isnan(torque) else torque for torque in message.effort]
+        return given
 
     def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
@@ -221,12 +217,14 @@ class TorqueInput:
         return old
 
 
-def _arrived(arrivals: Arrivals, until_ns: float = math.inf) -> Iterator[Any]:
-    """Yield what has arrived until this monotonic time [ns], within bounds."""
-    for _ in range(_MESSAGES_PER_TICK):
-        if (message := arrivals.take(until_ns)) is None:
-            return
-        yield message
+def _arrived(arrivals: Arrivals, until_ns: float = math.inf) -> Sequence[Any]:
+    """Return what has arrived until this monotonic time [ns], within bounds."""
+    if (message := arrivals.take(until_ns)) is None:
+        return ()
+    found = [message]
+    while len(found) < _MESSAGES_PER_TICK and (message := arrivals.take(until_ns)) is not None:
+        found.append(message)
+    return found
 
 
 def three(data: Sequence[float], what: str = "torques [N m]") -> Vector3:

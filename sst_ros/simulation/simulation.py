@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -249,6 +250,12 @@ class Simulation:
         return self._shown[1]
 
     @property
+    def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
+        """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
+        now = self._now
+        return now.point.y, now.point.joints, self._torque(now)
+
+    @property
     def time_ns(self) -> int:
         """Time of the last valid state [ns]."""
         return self._now.time_ns
@@ -309,14 +316,15 @@ class Simulation:
         return {"sin_mu": float(np.sin(self.state.joints.mu).min()), "det_j2": float(determinant)}
 
     def _as_state(self, at: _Instant) -> State:
+        return State.of(at.time_ns, at.point.y, at.point.joints, self._torque(at))
+
+    def _torque(self, at: _Instant) -> Vector3:
         y = at.point.y
         if len(self.dynamics.state) > 7:  # the torques of the actuators lag
-            torque = (y[7], y[8], y[9])
-        elif type(at.torque) is tuple:
-            torque = at.torque
-        else:
-            torque = self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
-        return State.of(at.time_ns, y, at.point.joints, torque)
+            return y[7], y[8], y[9]
+        if type(at.torque) is tuple:
+            return at.torque
+        return self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
 
     def _initial(self) -> Point:
         gamma = np.array(self.scene.initial.gamma)

@@ -21,6 +21,7 @@ from sst_ros.nodes.messages import (
     StateMessages,
     TorqueLog,
     clock_message,
+    stamp,
 )
 from sst_ros.nodes.messages import (
     zyz_angles as angles_of,
@@ -41,9 +42,14 @@ def state():
 def stamped(messages, stamp_ns):
     """joint_states, orientation, euler_zyz."""
     return [
-        message.stamped(stamp_ns)
+        message.stamped(stamp(stamp_ns))
         for message in (messages.joints, messages.orientation, messages.euler)
     ]
+
+
+def numbers(state):
+    """Those of `Simulation.sample`."""
+    return state.quaternion, sum(state.joints, ()), state.torque
 
 
 def strictly(data, name):
@@ -53,7 +59,7 @@ def strictly(data, name):
 
 def test_a_state_is_read_as_it_is(state):
     messages = StateMessages()
-    messages.fill(state)
+    messages.fill(*numbers(state))
     joints, orientation, euler = stamped(messages, STAMP_NS)
     read = deserialize_message(joints, JointState)
     at = state.joints
@@ -78,7 +84,7 @@ def test_a_state_is_read_as_it_is(state):
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 def test_what_is_not_finite_is_not_taken_over(state, bad):
     messages = StateMessages()
-    messages.fill(state)
+    messages.fill(*numbers(state))
     before = stamped(messages, 5)
     joints = state.joints._replace(mu_dot=(0.0, bad, 0.0))
     for broken in (
@@ -87,7 +93,7 @@ def test_what_is_not_finite_is_not_taken_over(state, bad):
         replace(state, quaternion=(bad, *state.quaternion[1:])),
     ):
         with pytest.raises(NotFinite, match="not finite"):
-            messages.fill(broken)
+            messages.fill(*numbers(broken))
     assert stamped(messages, 5) == before
 
 
@@ -125,10 +131,10 @@ def test_ticks_noted_at_once_are_those_noted_one_by_one():
 def test_the_layout_is_that_of_the_middleware(state, frame_id):
     """Byte for byte, except padding, which the middleware leaves as it is."""
     messages = StateMessages(frame_id)
-    messages.fill(state)
+    messages.fill(*numbers(state))
     log = TorqueLog(2, 1_000_000, moments=True)
     log.append((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 2)
-    clock = clock_message().stamped(STAMP_NS)
+    clock = clock_message().stamped(stamp(STAMP_NS))
     kinds = (JointState, QuaternionStamped, Vector3Stamped, JointTrajectory, Clock)
     for data, kind in zip([*stamped(messages, 7), log.take(9), clock], kinds, strict=True):
         again = serialize_message(deserialize_message(data, kind))

@@ -108,6 +108,7 @@ def test_steps_by_count_and_by_the_action(client):
 
     status, reply = result(send(7))
     assert (status, reply.result) == (GoalStatus.STATUS_SUCCEEDED, OK)
+    client.observer.until(lambda: len(feedback) >= 7, "feedback, which may come after the result")
     counts = [(message.completed_steps, message.remaining_steps) for message in feedback]
     assert counts == [(k, 7 - k) for k in range(1, 8)]
     client.observer.until(partial(samples, 12), "twelve samples")
