@@ -47,11 +47,6 @@ class Limit(NamedTuple):
         """Rate of the distance [rad/s]."""
         return self.sign * joints[self.joint + 9]
 
-    def may_be_crossed(self, begin: Sequence[float], end: Sequence[float]) -> bool:
-        """Cheap test before a search: it ends beyond, or it went in and came back."""
-        turned = self.slope(begin) < 0.0 < self.slope(end)
-        return self.distance(end) < 0.0 or turned or self.distance(begin) <= 0.0
-
 
 def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
     """Joint, lower and upper end of what the limits allow; infinite where there is none."""

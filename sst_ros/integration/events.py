@@ -34,13 +34,15 @@ def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
 
 
 def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
-    """Test cheaply whether a contact may begin or end in a step, given the joints at both ends.
+    """Test cheaply whether an event may lie in a step, given the joints at both ends.
 
-    A contact event that the step starts on does not count again.
+    A limit counts where the step starts on it; a contact that the step starts on does not.
     """
-    if event.distance(begin) <= GRAZING and not (
-        event.distance(begin) > -CONTACT_BAND and event.slope(begin) > 0.0
-    ):
+    before = event.distance(begin)
+    if event.error is not None:
+        if before <= 0.0:
+            return True
+    elif before <= GRAZING and not (before > -CONTACT_BAND and event.slope(begin) > 0.0):
         return False
     return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
 

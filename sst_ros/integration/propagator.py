@@ -87,9 +87,10 @@ class Propagator:
         self.dynamics = Dynamics.of(scene)
         self.ode = ode_with_work(self.dynamics)
         self.budget = budget
-        self._limits = tuple(limits_of(scene, geometry)) if limits else ()
-        self._contacts = tuple(contact_events_of(scene, geometry))
-        self._ranges = ranges_of([*self._limits, *free_range(self._contacts)])
+        ends = tuple(limits_of(scene, geometry)) if limits else ()
+        contacts = tuple(contact_events_of(scene, geometry))
+        self._events = (*ends, *contacts)
+        self._ranges = ranges_of([*ends, *free_range(contacts)])
         limit = scene.actuators.torque_limit if scene.actuators else None
         self.torque = AppliedTorque(self.ode, limit, derivative)
         self._new_stepper = partial(
@@ -254,37 +255,33 @@ class Propagator:
             end = self._point(step.y, step.z, step.order)
             self.accepted_steps += 1
             self._growth = self._growth.after(at, end)
-            if step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
-                at = end
-                continue
-            part = cache(partial(self._part, self._stepper, step, at, end, drive))
-            found = first_event(self._near(at, end), lambda x: part(x).joints, step.h)  # noqa: B023
-            if found is not None:
-                x, event = found
-                if event.error is None:
-                    x = just_beyond(event, x, part(x).joints, step.h)
-                return part(x), step.t + x, event
+            if not step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
+                found = self._event_in(step, at, end, drive)
+                if found is not None:
+                    return found
             at = end
         return at, h, None
 
-    def _near(self, at: Point, end: Point) -> list[Limit]:
-        """Limits and contact events that may lie inside a step."""
-        near = [x for x in self._limits if x.may_be_crossed(at.joints, end.joints)]
-        return near + [x for x in self._contacts if may_occur(x, at.joints, end.joints)]
+    def _event_in(
+        self, step: AcceptedStep, at: Point, end: Point, drive: tuple[float, ...]
+    ) -> tuple[Point, float, Limit] | None:
+        """Return state, time and event of the first one in an accepted step from `at` to `end`."""
 
-    def _part(
-        self,
-        stepper: AdaptiveStepper,
-        step: AcceptedStep,
-        at: Point,
-        end: Point,
-        drive: tuple[float, ...],
-        x: float,
-    ) -> Point:
-        """Repeat a part x [s] of an accepted step that led from `at` to `end`."""
-        if x == step.h:
-            return end
-        return self._point(*stepper.repeat(step.t, x, at.y, at.z, drive, at.order))
+        @cache
+        def part(x: float) -> Point:
+            """Repeat a part x [s] of the step."""
+            if x == step.h:
+                return end
+            return self._point(*self._stepper.repeat(step.t, x, at.y, at.z, drive, at.order))
+
+        near = [event for event in self._events if may_occur(event, at.joints, end.joints)]
+        found = first_event(near, lambda x: part(x).joints, step.h)
+        if found is None:
+            return None
+        x, event = found
+        if event.error is None:
+            x = just_beyond(event, x, part(x).joints, step.h)
+        return part(x), step.t + x, event
 
     def _point(self, y: list[float], z: list[float], order: int) -> Point:
         return Point(y, z, self.dynamics.joints(*y[:7]), order)
