@@ -39,7 +39,7 @@ _QUEUE = topics.VIEWED[0].depth
 
 
 class Viewer:
-    """Worker of the process `viewer`; a `ViewSource` of the page and its own `RunControl`."""
+    """Worker of the process `viewer`; a `RunControl` of the page."""
 
     def __init__(self) -> None:
         self.node = Node("sst_viewer")
@@ -71,10 +71,6 @@ class Viewer:
         self._page.close()
         if self._commands is not None:
             self._commands.publish(Float64MultiArray(data=array("d", ZERO)))
-
-    def controls(self) -> Viewer:
-        """Return itself: it can be paused and driven."""
-        return self
 
     def states(self) -> Sequence[ViewState]:
         """Return the joint states that came since the last call, the last _QUEUE of them."""

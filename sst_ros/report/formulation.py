@@ -8,7 +8,6 @@ Loads that a scene may have beside them are no part of the paper and are left ou
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,23 +28,17 @@ PAPER = (
 """Sections of a scene that the paper has."""
 
 
-@dataclass(frozen=True)
-class Formulation:
-    """Difference of the two formulations.
+def compare(
+    scene: Scene, given: Iterable[tuple[Array, Sequence[float]]]
+) -> tuple[float | None, int]:
+    """Compare W_dot at states (seven numbers or more) under torques [N m]; loads are left out.
 
-    Attributes:
-        relative: largest difference of W_dot, as a part of the largest W_dot of all states; None
-            where no state could be compared.
-        states: number of states compared; those at a singularity of the paper's J2 are left out.
+    Returns:
+        The largest difference as a part of the largest W_dot of all states, None where no state
+        could be compared; and the number of states compared, without those at a singularity of
+        the paper's J2.
 
     """
-
-    relative: float | None
-    states: int
-
-
-def compare(scene: Scene, given: Iterable[tuple[Array, Sequence[float]]]) -> Formulation:
-    """Compare W_dot at states (seven numbers or more) under torques [N m]; loads are left out."""
     bare = Scene(**{name: getattr(scene, name) for name in PAPER})
     mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
     differences, sizes = [], []
@@ -59,13 +52,13 @@ def compare(scene: Scene, given: Iterable[tuple[Array, Sequence[float]]]) -> For
         differences.append(float(np.linalg.norm(ours - paper)))
         sizes.append(float(np.linalg.norm(paper)))
     if not sizes:
-        return Formulation(None, 0)
+        return None, 0
     scale = max(sizes)
-    return Formulation(max(differences) / scale if scale > 0.0 else max(differences), len(sizes))
+    return max(differences) / (scale if scale > 0.0 else 1.0), len(sizes)
 
 
-def check(recording: Recording, count: int = STATES) -> Formulation:
-    """Compare W_dot at samples spread over the run, under the torques recorded there."""
+def check(recording: Recording, count: int = STATES) -> tuple[float | None, int]:
+    """Compare at samples spread over the run, under the torques recorded there."""
     whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
     chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
     samples = whole[chosen] if len(whole) else np.empty(0, dtype=int)

@@ -14,11 +14,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.run_figures import ErrorCurves, draw_error_panel
-from sst_ros.plot.run_overview import (
+from sst_ros.plot.run_figures import (
     NOT_RECORDED,
+    ErrorCurves,
     OverviewPanel,
     curve_panel,
+    draw_error_panel,
     draw_latency,
     draw_losses,
     draw_overview,

@@ -21,7 +21,6 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS
 from sst_ros.report import tracking
-from sst_ros.report.formulation import Formulation
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.states import begins, lags
 from sst_ros.report.verdict import ERROR_LIMIT_RAD
@@ -33,7 +32,7 @@ def summarise(
     recording: Recording,
     integration: Comparison,
     ideal: Comparison | None,
-    formulation: Formulation,
+    formulation: tuple[float | None, int],
 ) -> dict[str, Any]:
     """Collect all figures of the report."""
     summary: dict[str, Any] = {"scene": recording.scene.name, "bag": str(recording.path)}
@@ -52,8 +51,8 @@ def summarise(
         summary |= _largest("ideal_reference_error", ideal.own)
         summary["hold_order"] = hold_order(recording)
     summary |= {
-        "formulation_difference_relative": formulation.relative,
-        "formulation_states": formulation.states,
+        "formulation_difference_relative": formulation[0],
+        "formulation_states": formulation[1],
         **_effort(recording),
         "actuators_lag": lags(recording.scene),
         "topics_missing": list(recording.missing),
@@ -215,14 +214,15 @@ def made_on() -> dict[str, Any]:
         "python": platform.python_version(),
         **versions,
         "numba": numba_version(),
-        "processor": _processor(),
+        "processor": processor(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the name of the processor."""
     try:
         with Path("/proc/cpuinfo").open(encoding="utf-8") as file:
             names = (line.partition(":")[2] for line in file if line.startswith("model name"))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.plot.control_rate import draw_control_rates
+from sst_ros.plot.work_precision import draw_control_rates
 from sst_ros.recording import recording
 from sst_ros.report.states import recorded as recorded_states
 from sst_ros.scene import scene as scenes

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Array
@@ -80,7 +81,7 @@ def solve_reference(
         rough, fine = (
             solver.solve(problem.start, problem.interval, problem.count, n) for n in steps
         )
-        how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers.name}"
+        how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers}"
     else:
         fine = solution.astype(np.longdouble)
         rough = problem.fixed_steps(machine, best // 2).astype(np.longdouble)
@@ -119,48 +120,6 @@ def _own(problem: InitialValueProblem, rough: LongArray, fine: LongArray) -> Sta
     )
 
 
-@dataclass(frozen=True)
-class NumberType:
-    """Numbers to calculate with.
-
-    Attributes:
-        name: for reports.
-        number: converts a float or an integer.
-        functions: elementary functions by the names that programs use.
-        back: converts to a long double.
-
-    """
-
-    name: str
-    number: Callable[[Any], Any]
-    functions: dict[str, Any]
-    back: Callable[[Any], Any]
-
-
-def number_type(name: str) -> NumberType:
-    """Return long doubles or mpmath's numbers of 30 digits.
-
-    Raises:
-        InputError: mpmath is asked for and not installed.
-
-    """
-    names = ("sqrt", "sin", "cos", "tanh", "exp")
-    if name == EXTENDED:
-        functions = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
-        return NumberType(f"{np.finfo(np.longdouble).precision}-digit floats",
-                          np.longdouble, functions, np.longdouble)  # fmt: skip
-    try:
-        import mpmath
-    except ImportError:
-        allowed = "needs mpmath: pip install mpmath"
-        raise InputError("accuracy", [Problem("reference", name, allowed)]) from None
-    context = mpmath.mp.clone()
-    context.dps = DIGITS
-    functions = {each: getattr(context, each) for each in (*names, "atan2")}
-    return NumberType(f"mpmath, {DIGITS} digits", context.mpf, functions,
-                      lambda x: np.longdouble(mpmath.nstr(x, DIGITS)))  # fmt: skip
-
-
 class HighPrecisionDop853:
     """DOP853 with fixed steps on a number type: the integration package runs on doubles only.
 
@@ -171,14 +130,33 @@ class HighPrecisionDop853:
         kind: EXTENDED or MPMATH.
         drive: constant inputs.
 
+    Attributes:
+        numbers: which numbers it calculates with, for reports.
+
+    Raises:
+        MissingDependency: mpmath is asked for and not installed.
+
     """
 
     def __init__(self, program: Program, kind: str, drive: Sequence[float]) -> None:
-        self.numbers = number_type(kind)
-        namespace: dict[str, Any] = dict(self.numbers.functions)
+        names = ("sqrt", "sin", "cos", "tanh", "exp")
+        if kind == EXTENDED:
+            self.numbers = f"{np.finfo(np.longdouble).precision}-digit floats"
+            namespace = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
+            self._number: Any = np.longdouble
+            self._long: Callable[[Any], np.longdouble] = np.longdouble
+        else:
+            mpmath = require("mpmath")
+            context = mpmath.mp.clone()
+            context.dps = DIGITS
+            self.numbers = f"mpmath, {DIGITS} digits"
+            namespace = {each: getattr(context, each) for each in (*names, "atan2")}
+            self._number = context.mpf
+            self._long = lambda x: np.longdouble(mpmath.nstr(x, DIGITS))
         exec(program.source("rhs"), namespace)
         self._rhs: Callable[..., tuple[Any, ...]] = namespace["rhs"]
-        number = self.numbers.number
+        self._sqrt: Callable[[Any], Any] = namespace["sqrt"]
+        number = self._number
         self._drive = tuple(map(number, drive))
         self._a = [[(i, number(w)) for i, w in enumerate(row) if w] for row in DOP853.a]
         weights = [number(w) for w in DOP853.b]
@@ -193,21 +171,21 @@ class HighPrecisionDop853:
         The first four numbers are a quaternion, which is kept at length 1. A row of nan stands
         where there is no finite state.
         """
-        number, back = self.numbers.number, self.numbers.back
+        number = self._number
         result = np.full((count + 1, len(start)), np.nan, dtype=np.longdouble)
         y = [number(x) for x in start]
         h = number(interval) / steps
-        result[0] = [back(x) for x in y]
+        result[0] = [self._long(x) for x in y]
         with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
             for k in range(count):
                 for step in range(steps):
                     y = self._step((k * steps + step) * h, y, h)
-                result[k + 1] = [back(x) for x in y]
+                result[k + 1] = [self._long(x) for x in y]
         return result
 
     def evaluate(self, start: Sequence[float]) -> tuple[Any, ...]:
         """Evaluate the derivative once, at time zero, to measure its computing time."""
-        number = self.numbers.number
+        number = self._number
         return self._rhs(number(0), *map(number, start), *self._drive)
 
     def _step(self, t: Any, y: list[Any], h: Any) -> list[Any]:
@@ -216,5 +194,5 @@ class HighPrecisionDop853:
             at = [x + h * sum(w * slopes[i][j] for i, w in row) for j, x in enumerate(y)]
             slopes.append(self._rhs(t + node * h, *at, *self._drive))
         new = [x + h * sum(w * slopes[i][j] for i, w in self._b) for j, x in enumerate(y)]
-        length = self.numbers.functions["sqrt"](sum(x * x for x in new[:4]))
+        length = self._sqrt(sum(x * x for x in new[:4]))
         return [x / length for x in new[:4]] + new[4:]

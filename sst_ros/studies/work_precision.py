@@ -138,7 +138,7 @@ def work_precision(
     instants = (k * target.interval for k in range(len(truth.states)))
     torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
     along = zip(truth.states.astype(float), torques, strict=True)
-    difference = formulation.compare(scene, along).relative
+    difference, _ = formulation.compare(scene, along)
     advice = step_advice(scene)
     return WorkPrecision(
         scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS), advice,

@@ -17,7 +17,7 @@ from sst_ros.view.buttons import PlaybackButtons, RunButtons, buttons
 from sst_ros.view.panel import Panel
 from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import LOCAL, PORT, PageServer
-from sst_ros.view.source import ViewSource, ViewState
+from sst_ros.view.source import Playback, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
 _SHOW_EVERY, _DRAW_EVERY = 3, 6
@@ -35,7 +35,7 @@ class Page:
 
     """
 
-    def __init__(self, source: ViewSource, host: str = LOCAL, port: int = PORT) -> None:
+    def __init__(self, source: RunControl | Playback, host: str = LOCAL, port: int = PORT) -> None:
         self._source = source
         self._server = PageServer(host, port)
         self.url = self._server.url
@@ -96,7 +96,7 @@ class Page:
         self._parts = (
             SceneDrawing(server, scene),
             Panel(server, scene),
-            buttons(server, scene, self._source.controls()),
+            buttons(server, scene, self._source),
         )
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)

@@ -16,7 +16,7 @@ from sst_ros.view.source import RunStatus, ViewState
 
 
 class Replay:
-    """Plays a bag; a `ViewSource` and its own `Playback`, used from two threads of the page.
+    """Plays a bag; a `Playback`, used from two threads of the page.
 
     Raises:
         InputError: the bag is no whole recording of a run.
@@ -45,10 +45,6 @@ class Replay:
     def playing(self) -> bool:
         """Whether it is playing."""
         return self._playing
-
-    def controls(self) -> Replay:
-        """Return itself: it can be played."""
-        return self
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""

@@ -62,11 +62,8 @@ class ViewSource(Protocol):
     def status(self) -> RunStatus:
         """Return the latest status of the run."""
 
-    def controls(self) -> RunControl | Playback:
-        """Return what the buttons act on."""
 
-
-class RunControl(Protocol):
+class RunControl(ViewSource, Protocol):
     """A run that can be paused and driven; requests return success and a message."""
 
     def pause(self, paused: bool) -> tuple[bool, str]:
@@ -86,7 +83,7 @@ class RunControl(Protocol):
 
 
 @runtime_checkable
-class Playback(Protocol):
+class Playback(ViewSource, Protocol):
     """A recording that can be played."""
 
     @property
