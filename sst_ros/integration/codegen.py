@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Source of a scene's functions and the loops around them, as an interpreted or compiled module.
+"""Source of explicit steps, and functions as an interpreted or compiled module.
 
 The text is the same for the interpreter and for numba, so both take the same operations in the
 same order. Under numba it is written to a cache folder whose file names are digests of the text
@@ -9,7 +9,6 @@ and of all versions; a folder that cannot be written means compiling anew in thi
 from __future__ import annotations
 
 import hashlib
-import inspect
 import os
 import platform
 import sys
@@ -18,26 +17,8 @@ from functools import lru_cache
 from types import CodeType, ModuleType
 from typing import Any
 
-from sst_ros.dynamics.expression import Program
-from sst_ros.integration import step_loops
 from sst_ros.integration.cache_folder import cache_folder, imported
-from sst_ros.integration.methods import Rosenbrock, Tableau
-
-_EXPLICIT = (
-    step_loops.size_of,
-    step_loops.normalise,
-    step_loops.step_pair,
-    step_loops.step_fixed,
-    step_loops.all_far,
-    step_loops.step_many,
-    step_loops.step_sequence,
-)
-_IMPLICIT = (
-    step_loops.factorise,
-    step_loops.substitute,
-    step_loops.attempt_linearly_implicit,
-    *_EXPLICIT,
-)
+from sst_ros.integration.methods import Tableau
 
 _PLAIN = """\
 from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
@@ -84,46 +65,6 @@ def numba_version() -> str | None:
     except ImportError:
         return None
     return str(numba.__version__)
-
-
-def source(
-    program: Program,
-    jacobian: Program | None,
-    joints: Program,
-    method: Tableau | Rosenbrock,
-    size: int,
-    drive: int,
-) -> list[str]:
-    """Functions of the module, one text each, in the order in which they need each other.
-
-    Args:
-        program: derivative of the state; inputs t, state, drive.
-        jacobian: derivative, and its derivatives by t and by each state; for implicit methods.
-        joints: nine angles and nine rates; inputs are the first seven numbers of the state.
-        method: the integrator.
-        size: numbers in the state.
-        drive: numbers in the drive.
-
-    """
-    y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(drive)]
-    texts = [program.source("rhs"), joints.source("angles_and_rates"), _joints_of()]
-    if isinstance(method, Tableau):
-        new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
-        texts += [explicit_step(method, size, drive), _attempt(y, d, new)]
-        return texts + [inspect.getsource(function) for function in _EXPLICIT]
-    assert jacobian is not None
-    slope = [f"slope[{i}]" for i in range(size)]
-    outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
-    outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
-    inputs = ", ".join(["t", *y, *d])
-    texts += [
-        jacobian.source("jacobian"),
-        f"def linearise(t, y, d, slope, by_time, matrix):\n"
-        f"    ({', '.join(outputs)},) = jacobian({inputs})\n",
-        f"def evaluate(t, y, d, slope):\n    ({', '.join(slope)},) = rhs({inputs})\n",
-    ]
-    functions = [inspect.getsource(function) for function in _IMPLICIT]
-    return texts + [text.replace("attempt_linearly_implicit", "attempt") for text in functions]
 
 
 def explicit_step(tableau: Tableau, size: int, drive: int) -> str:
@@ -200,17 +141,6 @@ def load(
     if module is not None:
         return module
     return _executed(text.replace("cache=True", "cache=False", 1), "sst_ros_compiled")
-
-
-def _joints_of() -> str:
-    outputs = ", ".join(f"joints[{i}]" for i in range(18))
-    inputs = ", ".join(f"y[{i}]" for i in range(7))
-    return f"def joints_of(y, joints):\n    ({outputs},) = angles_and_rates({inputs})\n"
-
-
-def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
-    call = f"step({', '.join(['t', 'h', *y, *d])})"
-    return f"def attempt(t, h, y, near, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
 
 
 def _executed(text: str, name: str) -> ModuleType:

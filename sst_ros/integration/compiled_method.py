@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import LAG, ODE
-from sst_ros.integration import codegen
+from sst_ros.integration import codegen, step_loops
 from sst_ros.integration.methods import Rosenbrock, Tableau
 
 Method = Tableau | Rosenbrock
@@ -25,6 +26,23 @@ StepPoint = tuple[list[float], list[float], tuple[float, ...]]
 
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
+
+
+_EXPLICIT = (
+    step_loops.size_of,
+    step_loops.normalise,
+    step_loops.step_pair,
+    step_loops.step_fixed,
+    step_loops.all_far,
+    step_loops.step_many,
+    step_loops.step_sequence,
+)
+_IMPLICIT = (
+    step_loops.factorise,
+    step_loops.substitute,
+    step_loops.attempt_linearly_implicit,
+    *_EXPLICIT,
+)
 
 
 class CompiledMethod:
@@ -175,19 +193,45 @@ def has_code(system: ODE, method: Method) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _source(system: ODE, method: Method) -> tuple[list[str], dict[str, Any]]:
-    """Functions of the machine's module, and its constants."""
-    implicit, size = isinstance(method, Rosenbrock), len(system.state)
-    jacobian = system.jacobian if implicit else None
-    texts = codegen.source(system.program, jacobian, system.joints, method, size, len(system.drive))
+def _source(system: ODE, method: Tableau | Rosenbrock) -> tuple[list[str], dict[str, Any]]:
+    """Functions of a module, one text each, in the order of their calls, and its constants."""
+    size = len(system.state)
+    y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(len(system.drive))]
     lag = 3 if set(LAG) <= set(system.state) else 0
     constants: dict[str, Any] = {"SIZE": size, "LAG": lag, "SHARE": 0.5**method.error_order}
-    if isinstance(method, Rosenbrock):
-        # numba wants rows of one length.
-        padded = [
-            tuple((*row, *(0.0,) * (5 - len(row))) for row in table)
-            for table in (method.a, method.c)
-        ]
-        constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
-        constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
-    return texts, constants
+    texts = [system.program.source("rhs"), system.joints.source("angles_and_rates"), _joints_of()]
+    if isinstance(method, Tableau):
+        new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
+        texts += [codegen.explicit_step(method, size, len(d)), _attempt(y, d, new)]
+        return texts + [inspect.getsource(function) for function in _EXPLICIT], constants
+    # numba wants rows of one length.
+    padded = [
+        tuple((*row, *(0.0,) * (5 - len(row))) for row in table) for table in (method.a, method.c)
+    ]
+    constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
+    constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
+    slope = [f"slope[{i}]" for i in range(size)]
+    outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
+    outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
+    inputs = ", ".join(["t", *y, *d])
+    texts += [
+        system.jacobian.source("jacobian"),
+        f"def linearise(t, y, d, slope, by_time, matrix):\n"
+        f"    ({', '.join(outputs)},) = jacobian({inputs})\n",
+        f"def evaluate(t, y, d, slope):\n    ({', '.join(slope)},) = rhs({inputs})\n",
+    ]
+    functions = [inspect.getsource(function) for function in _IMPLICIT]
+    return texts + [
+        text.replace("attempt_linearly_implicit", "attempt") for text in functions
+    ], constants
+
+
+def _joints_of() -> str:
+    outputs = ", ".join(f"joints[{i}]" for i in range(18))
+    inputs = ", ".join(f"y[{i}]" for i in range(7))
+    return f"def joints_of(y, joints):\n    ({outputs},) = angles_and_rates({inputs})\n"
+
+
+def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
+    call = f"step({', '.join(['t', 'h', *y, *d])})"
+    return f"def attempt(t, h, y, near, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
-"""Loops around a step, as text: `codegen` puts them behind a scene's functions and runs them.
+"""Loops around a step, as text: `compiled_method` puts them behind the functions of a scene.
 
 They run on lists as plain Python and on arrays under numba. Names that are not defined here come
 from the module that `codegen` writes.
