@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ HASHES = 4_000_000
 
 RUNS = 1e9
 ROUNDS, CHUNKS = 3, 16
-"""Of the cluster: times that one worker and two compute so many chunks, in turn."""
+"""What is compared takes turns, so many times, each with so many chunks."""
 
 
 def study_of(rows: int) -> SweepStudy:
@@ -67,13 +68,10 @@ def main(arguments: list[str] | None = None) -> int:
     sweep("example2_heavy", VARY, n=1000, progress=False)
     found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
     found |= _study(options.rows)
-    found |= _kernel(min(options.rows, 10 * CHUNK), found["steps"])
     began = time.perf_counter()
     _arrays(study_of(100_000), found["steps"])
     found["seconds to prepare 1e5 rows"] = time.perf_counter() - began
-    for clock in ("", ", processor time"):  # the second is what a busy machine leaves comparable
-        both = found[f"us a run{clock}"], found[f"us a run, kernel alone{clock}"]
-        found[f"ratio to the kernel{clock}"] = both[0] / both[1]
+    found |= _ratios(found["steps"])
     if options.mujoco:
         found |= _mujoco(found["us a run"])
     if options.cluster:
@@ -94,8 +92,7 @@ def _study(rows: int) -> dict[str, float]:
         study = study_of(rows)
         ready = prepared(study)
         prepared_s = time.perf_counter() - began
-        task = ChunkTask(study, ready.steps, folder, versions())
-        run_local(task, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
+        _chunks(study, ready.steps, folder)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
         size = sum(path.stat().st_size for path in Path(folder).iterdir())
         table = read_sweep(Path(folder))
@@ -122,21 +119,42 @@ def _arrays(study: SweepStudy, steps: int) -> tuple[Any, list[Any]]:
     return batch, [y, batch.drives((0.0, 0.0, 0.0), study.rows), code]
 
 
-def _kernel(rows: int, steps: int) -> dict[str, float]:
-    """The compiled loop alone, on prepared arrays, on all cores."""
-    study = study_of(rows)
+def _ratios(steps: int) -> dict[str, float]:
+    """Chunks, files included, against the compiled loop alone on prepared arrays, on all cores.
+
+    Also in processor time, which a busy machine changes less.
+    """
+    study = study_of(CHUNKS * CHUNK)
     batch, (y, given, code) = _arrays(study, steps)
-    best, least = np.inf, np.inf
-    for _ in range(3):
-        arrays = y.copy(), given, code.copy(), np.full(rows, np.nan), np.zeros(rows)
-        began, processor = time.perf_counter(), time.process_time()
-        batch.advance(0, steps, study.length / steps, *arrays)
-        best = min(best, time.perf_counter() - began)
-        least = min(least, time.process_time() - processor)
+    times = []
+    for _ in range(ROUNDS):
+        with tempfile.TemporaryDirectory() as folder:
+            whole = _timed(lambda folder=folder: _chunks(study, steps, folder))
+        more = np.full(study.rows, np.nan), np.zeros(study.rows)
+        arrays = y.copy(), given, code.copy(), *more
+        alone = _timed(lambda arrays=arrays: batch.advance(0, steps, study.length / steps, *arrays))
+        times.append((whole, alone))
+    quotients = np.median([np.divide(*both) for both in times], axis=0)
+    least = 1e6 * np.min(times, axis=0) / study.rows
     return {
-        "us a run, kernel alone": 1e6 * best / rows,
-        "us a run, kernel alone, processor time": 1e6 * least / rows,
+        "us a run, kernel alone": least[1, 0],
+        "us a run, kernel alone, processor time": least[1, 1],
+        "ratio to the kernel": quotients[0],
+        "ratio to the kernel, processor time": quotients[1],
     }
+
+
+def _chunks(study: SweepStudy, steps: int, folder: str) -> None:
+    """Compute and write all chunks of a study, on all cores."""
+    task = ChunkTask(study, steps, folder, versions())
+    run_local(task, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds of a call, and of all processors."""
+    began, processor = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - began, time.process_time() - processor
 
 
 def _mujoco(ours_us: float) -> dict[str, float]:
