@@ -30,6 +30,10 @@ _CODES = 4 * NOT_FINITE
 _SCENARIO = ("status", "message", "fault_time", "local_error")
 
 
+def _of_joints(name: str, meaning: str) -> Any:
+    return property(lambda states: states._quantity(name), doc=f"{meaning}, shape (..., N, 3).")
+
+
 class BatchStates:
     """States of N scenarios, at one time or at several. Treat the arrays as read-only.
 
@@ -66,35 +70,12 @@ class BatchStates:
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
 
-    @property
-    def gamma(self) -> Array:
-        """Angles of the actuators [rad], shape (..., N, 3); nan where a scenario has no start."""
-        return self._quantity("gamma")
-
-    @property
-    def mu(self) -> Array:
-        """Angles between base arcs and arcs of the star [rad], shape (..., N, 3)."""
-        return self._quantity("mu")
-
-    @property
-    def beta(self) -> Array:
-        """Angles from the carriages to E [rad], shape (..., N, 3)."""
-        return self._quantity("beta")
-
-    @property
-    def gamma_dot(self) -> Array:
-        """Rates of gamma [rad/s], shape (..., N, 3)."""
-        return self._quantity("gamma_dot")
-
-    @property
-    def mu_dot(self) -> Array:
-        """Rates of mu [rad/s], shape (..., N, 3)."""
-        return self._quantity("mu_dot")
-
-    @property
-    def beta_dot(self) -> Array:
-        """Rates of beta [rad/s], shape (..., N, 3)."""
-        return self._quantity("beta_dot")
+    gamma = _of_joints("gamma", "Angles of the actuators [rad], nan where there is no start")
+    mu = _of_joints("mu", "Angles between base arcs and arcs of the star [rad]")
+    beta = _of_joints("beta", "Angles from the carriages to E [rad]")
+    gamma_dot = _of_joints("gamma_dot", "Rates of gamma [rad/s]")
+    mu_dot = _of_joints("mu_dot", "Rates of mu [rad/s]")
+    beta_dot = _of_joints("beta_dot", "Rates of beta [rad/s]")
 
     @property
     def energy(self) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.scenario_columns import valid_rows, with_columns
+from sst_ros.integration.scenario_constants import Place
 from sst_ros.mechanism.geometry import Array
 from sst_ros.progress import slices
 from sst_ros.scene.bodies import Link, Payload, Star
@@ -46,6 +47,8 @@ _ACTS_ON: dict[type[Section], dict[str, tuple[str, ...]]] = {
 """A number has no effect where all of these are zero or not given."""
 
 _MOST_PROBLEMS = 10
+
+NO_NUMBER = "must name a number, as star.mass does"
 
 Tree = dict[Any, Any]
 """Names and indices down to the keys of the numbers."""
@@ -79,7 +82,7 @@ class Scenarios:
         problems = []
         for key, value in parameters.items():
             try:
-                spec = self._specs[key] = _entered(self._tree, scene, key.split("."), key)
+                spec = self._specs[key] = _entered(self._tree, scene, key)
                 self.rows[key] = rows = _rows(value, spec, self.count)
                 self.count = len(rows)
             except ValueError as error:
@@ -140,32 +143,51 @@ class Scenarios:
             raise InputError(self.document.name, problems[:_MOST_PROBLEMS])
 
 
-def _entered(tree: Tree, section: Section, words: list[str], key: str) -> Spec:
-    """Note in `tree` where in a section a key is; raises ValueError where it is no number."""
+def addressed(
+    section: Section, words: list[str], place: Place = ()
+) -> Iterator[tuple[Place, Any, Spec]]:
+    """Yield the place of each field that the words of a key name, its value, and what it allows.
+
+    A list without an index means all of its entries.
+
+    Raises:
+        ValueError: there is no such field, or it is not in this scene.
+
+    """
     parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
     name, index = parts.groups() if parts else (words[0], None)
     known = specs(type(section))
     if name not in known:
         raise ValueError("unknown key; allowed are " + ", ".join(known))
-    spec, value = known[name], getattr(section, name)
-    if len(words) == 1 and spec.kind == "number" and index is None:
-        if name in tree:
-            raise ValueError("is given twice")
-        tree[name] = key
-        return spec
-    if len(words) > 1 and spec.kind == "section" and index is None:
+    spec, value, here = known[name], getattr(section, name), (*place, name)
+    if len(words) == 1 and index is None:
+        yield here, value, spec
+    elif len(words) > 1 and spec.kind == "section" and index is None:
         if value is None:
             raise ValueError(f"the scene has no {name}")
-        return _entered(tree.setdefault(name, {}), value, words[1:], key)
-    if len(words) > 1 and spec.kind == "sections":
+        yield from addressed(value, words[1:], here)
+    elif len(words) > 1 and spec.kind == "sections":
         chosen = range(len(value)) if index is None else [int(index)]
         if not chosen or max(chosen) >= len(value):
             raise ValueError(f"the scene has {len(value)} {name}")
         for i in chosen:
-            below = tree.setdefault(name, {}).setdefault(i, {})
-            spec = _entered(below, value[i], words[1:], key)
-        return spec
-    raise ValueError("must name a number, as star.mass does")
+            yield from addressed(value[i], words[1:], (*here, i))
+    else:
+        raise ValueError(NO_NUMBER)
+
+
+def _entered(tree: Tree, scene: Scene, key: str) -> Spec:
+    """Note in `tree` where in a scene a key is; raises ValueError where it is no number."""
+    for place, _, spec in addressed(scene, key.split(".")):
+        if spec.kind != "number":
+            raise ValueError(NO_NUMBER)
+        below = tree
+        for part in place[:-1]:
+            below = below.setdefault(part, {})
+        if place[-1] in below:
+            raise ValueError("is given twice")
+        below[place[-1]] = key
+    return spec
 
 
 def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Array:

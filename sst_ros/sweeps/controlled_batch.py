@@ -94,7 +94,7 @@ class ControlledBatch:
         rows: NDArray[np.int64],
         steps: int,
         kept: int = 0,
-    ) -> tuple[BatchResult, dict[str, Array], dict[str, Array]]:
+    ) -> tuple[BatchResult, dict[str, Array]]:
         """Run scenarios.
 
         Args:
@@ -105,7 +105,7 @@ class ControlledBatch:
             kept: keep the states every so many steps; 0 keeps none.
 
         Returns:
-            The result, nothing, and the tracking figures.
+            The result, and the tracking figures.
 
         """
         count, hold = len(rows), steps // self.samples
@@ -133,7 +133,7 @@ class ControlledBatch:
             batch.drives((0.0, 0.0, 0.0), count), advance,
             step=step, count=steps, keep_every=kept,
         )  # fmt: skip
-        return result, {}, self._tracking(result, memory, result.t)
+        return result, self._tracking(result, memory, result.t)
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""

@@ -19,13 +19,12 @@ from sst_ros.integration.parametric_model import OUTPUTS
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
 from sst_ros.sweeps.controlled_batch import ControlledBatch
-from sst_ros.sweeps.range_ends import range_ends
-from sst_ros.sweeps.sampling import Sampler
+from sst_ros.sweeps.range_ends import parameters_of, range_ends
+from sst_ros.sweeps.step_choice import chosen_steps, pilot_rows
 from sst_ros.sweeps.sweep_columns import (
     Columns,
     components,
     extremes_of,
-    largest_angle,
     units_of,
     with_faults,
 )
@@ -35,10 +34,6 @@ from sst_ros.version import VERSION
 if TYPE_CHECKING:
     import pyarrow as pa
 
-PILOT = 256
-"""Rows by which the number of steps is chosen; drawn apart, so that no number of rows matters."""
-
-MOST_STEPS = 1_000_000
 PARTS = 64
 """Extremes are those of the states at the ends of at most so many equal parts of a run."""
 
@@ -61,8 +56,7 @@ class PreparedSweep:
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:
         self.study = study
         scene = study.model_scene
-        parameters = range_ends(self.study)
-        numbers, _ = _split(parameters)
+        numbers, _ = _split(range_ends(self.study))
         ends = Scenarios(scene, numbers)
         faults = ends.faults(most=1)
         if faults:
@@ -79,8 +73,16 @@ class PreparedSweep:
                 self.batch, study.controlled, study.length, study.seed, varied
             )
         self.module = (self.controlled or self.batch).module
-        self.pilot_error = math.nan
-        self.steps = steps or study.steps or self._chosen_steps()
+        self.steps, self.pilot_error = steps or study.steps or 0, math.nan
+        if not self.steps:
+            values = pilot_rows(study)
+            scenarios, starts, _ = self.scenarios(values)
+            rows = np.arange(len(next(iter(values.values()))))
+            self.steps, self.pilot_error = chosen_steps(
+                lambda number: self.run(scenarios, starts, rows, number)[0],
+                1 if self.controlled is None else self.controlled.samples,
+                study.tolerance,
+            )
 
     def chunk(self, index: int) -> tuple[pa.Table, pa.Table | None]:
         """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
@@ -88,8 +90,9 @@ class PreparedSweep:
         first = index * self.study.chunk
         count = min(self.study.chunk, self.study.rows - first)
         values = self.study.sampler.rows(first, count)
-        columns, wanted = self._results(values, np.arange(first, first + count))
-        arrays: dict[str, Any] = {"scenario": np.arange(first, first + count)}
+        rows = np.arange(first, first + count)
+        columns, wanted = self._results(values, rows)
+        arrays: dict[str, Any] = {"scenario": rows}
         for one in self.study.variations:
             for k, name in enumerate(one.columns):
                 arrays[name] = np.ascontiguousarray(values[one.key][:, k])
@@ -98,16 +101,12 @@ class PreparedSweep:
         arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
             reason.astype(np.int32), pyarrow.array(texts.tolist(), pyarrow.string())
         )
-        table = pyarrow.table(arrays)
-        kept = wanted if wanted is None else pyarrow.table(wanted)
-        return table, kept
+        return pyarrow.table(arrays), None if wanted is None else pyarrow.table(wanted)
 
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        parameters: dict[str, Array] = {}
-        for one in self.study.variations:
-            parameters |= one.parameters(values[one.key])
-        Scenarios(self.study.model_scene, _split(parameters)[0]).check()
+        numbers, _ = _split(parameters_of(self.study, values))
+        Scenarios(self.study.model_scene, numbers).check()
 
     @cached_property
     def about(self) -> dict[str, Any]:
@@ -124,7 +123,7 @@ class PreparedSweep:
 
     def _results(self, values: dict[str, Array], rows: NDArray[np.int64]) -> tuple[Columns, Any]:
         scenarios, starts, faults = self.scenarios(values)
-        result, extremes, more = self._run(scenarios, starts, rows, self.steps)
+        result, more = self.run(scenarios, starts, rows, self.steps)
         columns: Columns = {
             "status": result.status.astype(np.int8),
             "t": result.t,
@@ -137,7 +136,7 @@ class PreparedSweep:
                 columns[name] = result.energy
             elif name != "extremes":
                 columns |= components(name, getattr(result, name))
-        columns |= extremes | more
+        columns |= more
         texts, reason = result.reasons
         if faults:
             texts, reason = with_faults(columns, texts, reason, faults)
@@ -148,10 +147,7 @@ class PreparedSweep:
         self, values: dict[str, Array]
     ) -> tuple[Scenarios, dict[str, Array], dict[int, InputError]]:
         """Scenarios of rows, their starts and gains, and the rows that make no scene."""
-        parameters: dict[str, Array] = {}
-        for one in self.study.variations:
-            parameters |= one.parameters(values[one.key])
-        numbers, starts = _split(parameters)
+        numbers, starts = _split(parameters_of(self.study, values))
         scenarios = Scenarios(self.study.model_scene, numbers)
         count = len(next(iter(values.values())))
         faults = scenarios.faults(most=count)
@@ -163,15 +159,15 @@ class PreparedSweep:
             scenarios = Scenarios(self.study.model_scene, numbers)
         return scenarios, starts | {"count": np.array(count)}, faults
 
-    def _run(
+    def run(
         self,
         scenarios: Scenarios,
         starts: dict[str, Array],
         rows: NDArray[np.int64],
         steps: int,
         kept: int = 0,
-    ) -> tuple[BatchResult, Columns, Columns]:
-        """Return results of rows by a number of steps, their extremes, and tracking figures."""
+    ) -> tuple[BatchResult, Columns]:
+        """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch, count = self.batch.with_parameters(scenarios), int(starts["count"])
         initial = self.study.scene.initial
         if self.controlled is not None:
@@ -184,10 +180,10 @@ class PreparedSweep:
         every = kept or (-(-steps // PARTS) if "extremes" in self.study.outputs else 0)
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
         if kept or result.kept is None:
-            return result, {}, {}
+            return result, {}
         extremes = extremes_of(result.kept)
         result.kept = None
-        return result, extremes, {}
+        return result, extremes
 
     def _trajectory(self, values: dict[str, Array], rows: NDArray[np.int64]) -> Columns | None:
         """States of the first rows at equal intervals, in long form."""
@@ -198,7 +194,7 @@ class PreparedSweep:
         some = {key: array[:count] for key, array in values.items()}
         scenarios, starts, _ = self.scenarios(some)
         every = max(1, self.steps // wanted["samples"])
-        result, _, _ = self._run(scenarios, starts, rows[:count], self.steps, every)
+        result, _ = self.run(scenarios, starts, rows[:count], self.steps, every)
         assert result.kept is not None
         samples = len(result.kept.t)
         found: Columns = {
@@ -212,40 +208,6 @@ class PreparedSweep:
             elif array is not None:
                 found |= components(name, array.reshape(samples * count, -1))
         return found
-
-    def _chosen_steps(self) -> int:
-        """Least number of steps, about, whose error in pilot rows is within the tolerance.
-
-        The error of c steps is the difference from 2c steps; it falls with the eighth power of c.
-        """
-        study, tolerance = self.study, self.study.tolerance
-        if study.table is not None:
-            chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
-            parts = [study.sampler.rows(int(row), 1) for row in chosen]
-            values = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-        else:
-            values = Sampler(study.variations, {}, PILOT, study.seed, "random").rows(0, PILOT)
-        scenarios, starts, _ = self.scenarios(values)
-        rows = np.arange(len(next(iter(values.values()))))
-        unit = 1 if self.controlled is None else self.controlled.samples
-        count = max(unit, 16)
-        for _ in range(12):
-            coarse, fine = (
-                self._run(scenarios, starts, rows, times * count)[0] for times in (1, 2)
-            )
-            both = (coarse.status == 0) & (fine.status == 0)
-            error = largest_angle(coarse.quaternion[both], fine.quaternion[both])
-            if not both.any():
-                return count  # no pilot row reaches the end
-            if error <= tolerance:
-                self.pilot_error = error
-                return count
-            factor = (error / (0.7 * tolerance)) ** (1.0 / 8.0) if math.isfinite(error) else 4.0
-            count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
-            if count > MOST_STEPS:
-                break
-        allowed = f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
-        raise InputError("sweep", [Problem("tolerance", tolerance, allowed)])
 
 
 _PREPARED: dict[tuple[str, int | None], PreparedSweep] = {}

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from sst_ros.mechanism.geometry import Array
@@ -24,9 +26,15 @@ def range_ends(study: SweepStudy) -> dict[str, Array]:
     rows = rows or [middle]
     for one in study.variations:
         rows += [rows[0] | {one.key: end} for end in _ends(one)]
+    stacked = {one.key: np.stack([row[one.key] for row in rows]) for one in study.variations}
+    return parameters_of(study, stacked)
+
+
+def parameters_of(study: SweepStudy, values: Mapping[str, Array]) -> dict[str, Array]:
+    """Return arrays by key of the scene for the values of what varies."""
     found: dict[str, Array] = {}
     for one in study.variations:
-        found |= one.parameters(np.stack([row[one.key] for row in rows]))
+        found |= one.parameters(values[one.key])
     return found
 
 

@@ -31,11 +31,6 @@ DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
 CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
-_KEYS = (
-    "scene", "vary", "table", "n", "seed", "sampling", "duration", "tolerance", "steps", "torque",
-    "control", "outputs", "trajectory", "chunk",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class SweepStudy:
@@ -105,11 +100,11 @@ class SweepStudy:
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping."""
+        known = [one.name for one in dataclasses.fields(cls)]
         for key in values:
-            if key not in _KEYS:
-                allowed = (
-                    f"unknown key; allowed are {', '.join(_KEYS)}{suggestion(str(key), _KEYS)}"
-                )
+            if key not in known:
+                hint = suggestion(str(key), known)
+                allowed = f"unknown key; allowed are {', '.join(known)}{hint}"
                 raise InputError("sweep", [Problem(str(key), values[key], allowed)])
         given = dict(values)
         scene, table = given.pop("scene", None), given.pop("table", None)
@@ -160,7 +155,7 @@ class SweepStudy:
         found, problems = [], []
         for key, given in self.vary.items():
             try:
-                found.append(variation(self.model_scene, key, given, self._targets(key)))
+                found.append(variation(key, given, self._targets(key)))
             except (ValueError, TypeError, OverflowError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
         columns = [name for one in found for name in one.columns]
@@ -169,7 +164,7 @@ class SweepStudy:
                 targets = self._targets(key)
                 if key in self.vary or set(names) & set(columns):
                     raise ValueError("is given in vary, too")
-                factor = scales_tensor(self.scene, key)
+                factor = scales_tensor(key, targets)
                 found.append(tabulated(key, names, targets, factor))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -24,17 +22,11 @@ def summary(table: pd.DataFrame) -> str:
     if len(causes):
         lines.append("Rank correlation of inputs with an early end:")
         lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(SHOWN).items()]
-    lines.append(f"{'output':>16} {'mean':>12} {'std':>12} {'1 %':>12} {'99 %':>12}  unit")
-    for name in output_columns(table):
-        values = table[name].to_numpy()[table["status"].to_numpy() == 0]
-        values = values[np.isfinite(values)]
-        if len(values):
-            low, high = np.quantile(values, [0.01, 0.99])
-            unit = table.attrs["units"].get(name, "")
-            lines.append(
-                f"{name:>16} {values.mean():>12.6g} {values.std():>12.4g} "
-                f"{low:>12.6g} {high:>12.6g}  {unit}"
-            )
+    outputs = table.loc[table["status"] == 0, output_columns(table)]
+    if len(outputs):
+        shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
+        shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
+        lines.append(shown.to_string(float_format="{:.6g}".format))
     return "\n".join(lines)
 
 

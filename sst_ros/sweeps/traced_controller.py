@@ -66,11 +66,6 @@ class TracedController(NamedTuple):
         """Whether the scheme needs the orientation at the measured angles."""
         return self.loop.settings.mode in ("gravity_pd", "computed_torque")
 
-    @property
-    def noisy(self) -> bool:
-        """Whether measurements have noise."""
-        return bool(self.loop.channel.angle_noise or self.loop.channel.rate_noise)
-
     def __call__(
         self, model: kernel.Model, state: Sequence[Any], given: Group, memory: Group, gains: Group,
         noise: Sequence[Any],

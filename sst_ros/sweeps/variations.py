@@ -10,13 +10,13 @@ whole ("star.inertia") has one factor, so its principal moments keep their ratio
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from sst_ros.integration.scenarios import NO_NUMBER, addressed
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Section, Spec, specs
@@ -75,11 +75,10 @@ class Variation:
         return found
 
 
-def variation(scene: Section, key: str, given: Any, targets: Sequence[Target]) -> Variation:
+def variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
     """Read one entry of `vary`.
 
     Args:
-        scene: for messages about what it has.
         key: as given.
         given: distribution or values.
         targets: what the key names, see `targets_of`.
@@ -89,7 +88,7 @@ def variation(scene: Section, key: str, given: Any, targets: Sequence[Target]) -
 
     """
     kind, numbers, relative = _read(given)
-    factor = scales_tensor(scene, key)
+    factor = scales_tensor(key, targets)
     if factor and not relative:
         raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
     shape = () if factor else targets[0].nominal.shape
@@ -128,50 +127,28 @@ def targets_of(scene: Section, key: str) -> list[Target]:
         ValueError: it names nothing that can vary.
 
     """
-    return _targets(scene, key.split("."), "")
-
-
-def _targets(section: Section, words: list[str], path: str) -> list[Target]:
-    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
-    name, index = parts.groups() if parts else (words[0], None)
-    known = specs(type(section))
-    if name not in known:
-        raise ValueError("unknown key; allowed are " + ", ".join(known))
-    spec, value, here = known[name], getattr(section, name), f"{path}{name}"
-    if spec.kind == "number" and len(words) == 1 and index is None:
-        if value is None:
+    found = []
+    for place, value, spec in addressed(scene, key.split(".")):
+        here = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place)[1:]
+        if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
-        return [Target(here, np.array(value, dtype=float), spec)]
-    if isinstance(value, Inertia) and len(words) == 1:
-        inside = specs(Inertia)
-        numbers = {part: getattr(value, part) for part in inside}
-        return [
-            Target(f"{here}.{part}", np.array(number), inside[part])
-            for part, number in numbers.items()
-            if number != 0.0
-        ]
-    if spec.kind == "section" and len(words) > 1 and index is None:
-        if value is None:
-            raise ValueError(f"the scene has no {here}")
-        return _targets(value, words[1:], f"{here}.")
-    if spec.kind == "sections" and len(words) > 1:
-        chosen = range(len(value)) if index is None else [int(index)]
-        if not chosen or max(chosen) >= len(value):
-            raise ValueError(f"the scene has {len(value)} {here}")
-        lists = [_targets(value[i], words[1:], f"{here}[{i}].") for i in chosen]
-        return [target for entry in lists for target in entry]
-    raise ValueError("must name a number, as star.mass does, or an inertia, as star.inertia does")
+        if isinstance(value, Inertia):
+            numbers = {part: getattr(value, part) for part in specs(Inertia)}
+            found += [
+                Target(f"{here}.{part}", np.array(number), specs(Inertia)[part])
+                for part, number in numbers.items()
+                if number != 0.0
+            ]
+        elif spec.kind == "number":
+            found.append(Target(here, np.array(value, dtype=float), spec))
+        else:
+            raise ValueError(f"{NO_NUMBER}, or an inertia, as star.inertia does")
+    return found
 
 
-def scales_tensor(section: Any, key: str) -> bool:
+def scales_tensor(key: str, targets: Sequence[Target]) -> bool:
     """Whether a key names an inertia as a whole, which one factor scales."""
-    for word in re.findall(r"\w+", key, re.A):
-        if isinstance(section, tuple) and not word.isdigit():
-            section = section[0]
-        if not word.isdigit() and not hasattr(section, word):
-            return False
-        section = section[int(word)] if word.isdigit() else getattr(section, word)
-    return isinstance(section, Inertia)
+    return targets[0].key.count(".") > key.count(".")
 
 
 def _read(given: Any) -> tuple[str, Any, bool]:
