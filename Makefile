@@ -7,6 +7,8 @@ ROS ?= ros
 EXTRAS = $(ROS),record,plot,fast
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
+# The tests of the nodes wait half of their time.
+PARALLEL_NODES = --numprocesses $$(($$(nproc) + 1)) --dist loadfile
 
 .PHONY: help demo demo-feedforward demo-identify demo-sweep docs view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
 
@@ -37,13 +39,13 @@ view: $(VENV)/.view  ## show a simulation in the browser
 
 test: $(VENV)/.test lint  ## run the tests, without the slow ones
 	$(PYTEST) $(PARALLEL) -m "not slow" --ignore test/ros
-	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
+	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
 
 test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment of their own
 	$(MAKE) test-ros VENV=.venv-jazzy ROS=jazzy
 
 test-ros: $(VENV)/.ros  ## run the tests of the nodes
-	$(PYTEST) $(PARALLEL) -m "not slow" test/ros
+	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
 
 test-slow: $(VENV)/.test  ## run the slow tests: sweeps, long pages, packages, fresh environments
 	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600

@@ -18,6 +18,10 @@ from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.simulation.simulation import Triple
 
+_DEPTH = 1000
+"""As of the other topics that are recorded: with ten, a recorder that is held up for a hundredth
+of a second loses commands."""
+
 
 class TorqueCommands:
     """Publisher of the commands, and the time-out of the joint states that they answer.
@@ -37,7 +41,7 @@ class TorqueCommands:
             topic = f"{given.simulator}/commands"
             self._message = Float64MultiArray(data=array("d", ZERO))
             self._torques = self._message.data
-        self.publisher = node.create_publisher(type(self._message), topic, 10)
+        self.publisher = node.create_publisher(type(self._message), topic, _DEPTH)
         self.received()
 
     def subscribed(self) -> bool:

@@ -22,6 +22,7 @@ from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from ros.forked import ForkedNode  # noqa: E402
 
 from sst_ros import child_process  # noqa: E402
 from sst_ros.__main__ import main  # noqa: E402
@@ -82,6 +83,7 @@ class Nodes:
         self.running = []
 
     def start(self, command, *words, executable=None, env=None):
+        """Start a command in an interpreter of its own."""
         argv = executable or [sys.executable, "-m", "sst_ros", command]
         # Ends with this process, also where that is killed: the next run has the same domains.
         ends_with = {} if executable else {child_process.PARENT: str(os.getpid())}
@@ -99,7 +101,9 @@ class Nodes:
     def run(self, command, **given):
         if command == "simulator":  # by default it would end with the scene's duration
             given.setdefault("duration", 0.0)
-        return self.start(command, "--ros-args", *child_process.words(given))
+        words = [command, "--ros-args", *child_process.words(given)]
+        self.running.append(ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"}))
+        return self.running[-1]
 
     def line(self, process, timeout=40):
         assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"
@@ -111,10 +115,11 @@ class Nodes:
         return process.returncode, out, err
 
     def close(self):
+        """End all that run; what they have printed is shown where the test failed."""
         for process in self.running:
             if process.poll() is None:
                 process.kill()
-            process.communicate()
+            sys.stderr.write("".join(text for text in process.communicate() if text))
 
 
 @pytest.fixture

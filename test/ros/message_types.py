@@ -36,8 +36,8 @@ USED = ("action_msgs", "builtin_interfaces", "geometry_msgs", "service_msgs", "s
 """Packages of the wheels whose types the definitions contain."""
 
 
-def folder():
-    """Return the folder of the packages; they are made once for these definitions and wheels."""
+def folder(package):
+    """Return the folder of a package; it is made once for these definitions and wheels."""
     if importlib.util.find_spec("rosidl_generator_py") is None:
         pytest.skip("no generator of message types: part of a ROS installation")
     if int(version("rclpy").partition(".")[0]) < KILTED:
@@ -46,12 +46,12 @@ def folder():
         pytest.skip("no C++ compiler to make message types with")
     made_of = (DEFINITIONS.read_text(), Path(__file__).read_text(), sys.prefix, sys.version)
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
-    final = Path(tempfile.gettempdir()) / f"sst_ros_message_types_{os.getuid()}_{key}"
+    final = Path(tempfile.gettempdir()) / f"sst_ros_{package}_{os.getuid()}_{key}"
     with final.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not final.exists():
             made = tempfile.mkdtemp(prefix=final.name)
-            command = [sys.executable, __file__, made]
+            command = [sys.executable, __file__, made, package]
             env = {**os.environ, "AMENT_PREFIX_PATH": sys.prefix}
             made_by = subprocess.run(command, env=env, text=True, capture_output=True, check=False)
             assert made_by.returncode == 0, made_by.stdout + made_by.stderr
@@ -59,10 +59,9 @@ def folder():
     return final
 
 
-def make(root):
-    for package, definitions in yaml.safe_load(DEFINITIONS.read_text()).items():
-        _generate(root, package, definitions)
-        _compile(root, package)
+def make(root, package):
+    _generate(root, package, yaml.safe_load(DEFINITIONS.read_text())[package])
+    _compile(root, package)
 
 
 def _generate(root, package, definitions):
@@ -128,4 +127,4 @@ def _compile(root, package):
 
 
 if __name__ == "__main__":
-    make(Path(sys.argv[1]))
+    make(Path(sys.argv[1]), sys.argv[2])

@@ -27,7 +27,7 @@ SUCCEEDED, CANCELED, ABORTED = (
 @pytest.fixture(scope="module")
 def types():
     with pytest.MonkeyPatch.context() as patch:
-        folder = str(message_types.folder())
+        folder = str(message_types.folder("control_msgs"))
         patch.syspath_prepend(folder)
         yield {"PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])}
 
@@ -173,7 +173,8 @@ def test_a_new_goal_and_a_trajectory_of_the_topic_preempt_a_goal(client):
     assert reply.result.error_string == "preempted by a new goal"
     client.moving()
     topic = client.observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
-    topic.publish(trajectory((0.3, HOME)))
+    ended = second.get_result_async()
+    client.observer.publish_until(topic, trajectory((0.3, HOME)), ended.done, "the result")
     status, code, reply = client.result(second)
     assert (status, code) == (ABORTED, ErrorCode.INVALID_GOAL)
     assert "~/joint_trajectory" in reply.result.error_string

@@ -164,3 +164,20 @@ def test_rosbag2_is_given_the_declared_qos():
         latched = own is not None and own.latched
         assert profile["durability"] == ("transient_local" if latched else "volatile"), topic
         assert profile["reliability"] == "reliable"
+
+
+def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path):
+    states = observer.listen(JointState, "/joint_states")
+    recorder = nodes.run("recorder", output=tmp_path / "bag")
+    run = {"sync": "lockstep", "real_time_factor": 0.0, "duration": 1.0}
+    simulator = nodes.run("simulator", **run)
+    assert nodes.line(recorder).startswith("ready")
+    nodes.run("torque_player", stamped=True, min_subscribers=2)
+    observer.until(lambda: observer.stamp(states[-1]) if states else 0, "the run")
+    recorder.send_signal(signal.SIGSTOP)
+    heard = len(states)
+    observer.until(lambda: len(states) > heard + 200, "samples")
+    recorder.send_signal(signal.SIGCONT)
+    assert simulator.wait(timeout=40) == 0
+    status, _, err = nodes.stop(recorder)
+    assert status == 0, err

@@ -19,7 +19,7 @@ from sst_ros.nodes.simulation_interfaces import FEATURES
 from . import message_types
 from .conftest import Nodes, Observer
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 NODE = "/sst_simulator"
 SCENE = "gravity_payload"
 UNSUPPORTED, OK, NOT_FOUND, FAILED, INVALID_POSE = 0, 1, 2, 4, 101
@@ -54,7 +54,7 @@ class Client:
 @pytest.fixture(scope="module")
 def client(domain_of_module):
     with pytest.MonkeyPatch.context() as patch:
-        folder = str(message_types.folder())
+        folder = str(message_types.folder("simulation_interfaces"))
         patch.syspath_prepend(folder)
         env = {"PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])}
         nodes, observer = Nodes(), Observer(domain_of_module)

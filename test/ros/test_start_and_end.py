@@ -64,7 +64,7 @@ def test_an_unknown_parameter_of_a_file_is_refused(run_here, tmp_path):
 
 def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(nodes, observer):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
-    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.02")
+    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.05")
     observer.until(lambda: scene, "the scene")
     assert "name: fast_spin" in scene[0].data
     assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
@@ -134,8 +134,15 @@ def handles_signals(process):
 @pytest.mark.parametrize(
     ("number", "delay"),
     [
-        *((signal.SIGINT, delay) for delay in (0.0, 0.3, 1.0)),
-        *((signal.SIGTERM, delay) for delay in (0.1, 0.6, 1.5)),
+        (signal.SIGINT, 0.3),
+        (signal.SIGTERM, 0.1),
+        *(
+            pytest.param(*varied, marks=pytest.mark.slow)
+            for varied in (
+                *((signal.SIGINT, delay) for delay in (0.0, 1.0)),
+                *((signal.SIGTERM, delay) for delay in (0.6, 1.5)),
+            )
+        ),
     ],
 )
 def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, delay, number):
@@ -146,7 +153,10 @@ def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, delay,
     assert (status, "Traceback" in err) == (0, False), err
 
 
-@pytest.mark.parametrize("delay", [0.005, 0.02, 0.05, 0.1, 0.15])
+@pytest.mark.parametrize(
+    "delay",
+    [0.02, 0.1, *(pytest.param(delay, marks=pytest.mark.slow) for delay in (0.005, 0.05, 0.15))],
+)
 def test_ctrl_c_while_python_starts_a_node_of_ros2_run_ends_it(nodes, delay):
     """Its executable blocks SIGINT until the node handles it: Python would print a traceback."""
     root = Path(sst_ros.__file__).parents[1]

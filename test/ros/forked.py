@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes forked from a process that has imported them: each starts in a third of the time.
+
+The server has one thread, no node and no connection; what it forks differs from
+`python -m sst_ros` in nothing but the time that its imports take.
+"""
+
+import atexit
+import multiprocessing
+import os
+import subprocess
+import sys
+import threading
+from multiprocessing import forkserver, resource_tracker
+
+import pytest
+
+from sst_ros import child_process
+from sst_ros.__main__ import main
+from sst_ros.nodes import inverse_dynamics, recorder, simulator, torque_player  # noqa: F401
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["ros.forked"])
+
+
+class ForkedNode:
+    """As much of `subprocess.Popen` as the tests use."""
+
+    def __init__(self, words, env):
+        with pytest.MonkeyPatch.context() as patch:  # for the server, which this starts if need be
+            patch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+            resource_tracker.ensure_running()
+            forkserver.ensure_running()
+        pipes = [os.pipe(), os.pipe()]
+        self._process = CONTEXT.Process(target=_Call(words, env, [end for _, end in pipes]))
+        self._process.start()
+        for _, end in pipes:
+            os.close(end)
+        self.pid = self._process.pid
+        self.stdout, self.stderr = (os.fdopen(begin, encoding="utf-8") for begin, _ in pipes)
+        self._readers = None
+
+    @property
+    def returncode(self):
+        return self.poll()
+
+    def poll(self):
+        return self._process.exitcode
+
+    def wait(self, timeout=None):
+        self._process.join(timeout)
+        if self.poll() is None:
+            raise subprocess.TimeoutExpired("node", timeout)
+        return self.poll()
+
+    def communicate(self, timeout=None):
+        """Read both pipes to their ends at once, so that none is full."""
+        if self._readers is None:
+            self._readers = [_Reader(pipe) for pipe in (self.stdout, self.stderr)]
+        for reader in self._readers:
+            reader.join(timeout)
+        self.wait(timeout)
+        return tuple(reader.text for reader in self._readers)
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self):
+        self._process.kill()
+
+
+class _Reader(threading.Thread):
+    def __init__(self, pipe):
+        super().__init__(daemon=True)
+        self._pipe, self.text = pipe, ""
+        self.start()
+
+    def run(self):
+        with self._pipe:
+            self.text = self._pipe.read()
+
+
+class _Call:
+    """What the forked process does: a node with these words, environment, stdout and stderr."""
+
+    def __init__(self, words, env, streams):
+        self._words, self._env, self._streams = words, env, streams
+
+    def __getstate__(self):
+        duplicate = multiprocessing.reduction.DupFd
+        return {**vars(self), "_streams": [duplicate(stream) for stream in self._streams]}
+
+    def __call__(self):
+        for number, stream in enumerate(self._streams, start=1):
+            os.dup2(stream.detach(), number)
+        os.environ.clear()
+        os.environ.update(self._env, **{child_process.PARENT: str(os.getppid())})
+        status = main(self._words)
+        atexit._run_exitfuncs()  # multiprocessing leaves without
+        sys.exit(status)
