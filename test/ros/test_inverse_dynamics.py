@@ -36,10 +36,11 @@ def written(folder, name="example2_heavy", **changed):
 def twice(tmp_path_factory, domain_of_module):
     """The same run of `make demo-feedforward`, two times; the folders of the bags."""
     folder = tmp_path_factory.mktemp("companion")
-    path = written(folder)
-    for name in ("first", "second"):
-        assert demo.feedforward(folder / name, str(path), ("feedforward",)) == 0
-    return [folder / name / "feedforward" for name in ("first", "second")]
+    path, first, second = str(written(folder)), folder / "feedforward", folder / "second"
+    assert demo.feedforward(folder, path, ("feedforward",)) == 0
+    second.mkdir()
+    demo.follow(path, second / "bag", "feedforward", MOVE.spiral.duration + demo.HOLD_S)
+    return first, second
 
 
 def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
