@@ -160,7 +160,8 @@ class Recorder:
         for topic, types in self.node.get_topic_names_and_types():
             if topic in self._wanted and topic not in self._recorded.keys() | self._unknown:
                 new = True
-                own = _declared(topic, types)
+                own = _DECLARED.get(_last(topic))
+                own = own if own and own.type_name in types else None
                 if not (silent and own and own.use == topics.SUBSCRIBES):
                     self._subscribe(topic, own.type_name if own else types[0], own)
         if not self._ready:
@@ -189,7 +190,8 @@ class Recorder:
         offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
         if own is None and not offers:
             return
-        qos = _declared_qos(own) if own else _offered_qos(offers)
+        # That of a topic of ours does not depend on the order of discovery.
+        qos = _qos(latched=own.latched, reliable=True) if own else _offered_qos(offers)
         package, _, name = type_name.split("/")
         subscription = self.node.create_subscription(
             getattr(importlib.import_module(f"{package}.msg"), name),
@@ -214,17 +216,6 @@ class Recorder:
         except SstError as error:
             self._failure = error
             self.done.set()
-
-
-def _declared(topic: str, types: Iterable[str]) -> Endpoint | None:
-    """Return our own topic of this name and one of these types."""
-    own = _DECLARED.get(_last(topic))
-    return own if own is not None and own.type_name in types else None
-
-
-def _declared_qos(own: Endpoint) -> QoSProfile:
-    """QoS of a topic of the simulator, independent of the order of discovery."""
-    return _qos(latched=own.latched, reliable=True)
 
 
 def _offered_qos(offers: list[QoSProfile]) -> QoSProfile:

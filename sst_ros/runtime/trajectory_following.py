@@ -194,18 +194,11 @@ class TrajectoryFollower:
     def _log(self, time: float, measured: Measurement, command: Command) -> None:
         desired = command.desired
         error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
-        self._rows.extend(
-            (
-                time,
-                *desired.gamma,
-                *desired.gamma_dot,
-                *error,
-                *axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot),
-                *command.feedforward,
-                *command.feedback,
-                *command.torque,
-            )
-        )
+        error_rate = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
+        torques = command.feedforward, command.feedback, command.torque
+        self._rows.append(time)
+        for triple in (desired.gamma, desired.gamma_dot, error, error_rate, *torques):
+            self._rows.extend(triple)
         if len(self._rows) >= _ROWS * _COLUMNS:
             self._add_rows()
 
