@@ -17,6 +17,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
+from benchmark.campaign.processes import domain
 from sst_ros import child_process
 
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -44,16 +45,16 @@ class Watch:
     @classmethod
     @contextmanager
     def started(cls) -> Iterator[Watch]:
-        """Watch a domain of its own."""
-        os.environ.setdefault("ROS_DOMAIN_ID", str(101 - os.getpid() % 50))
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        rclpy.init()
-        watch = cls()
-        try:
-            yield watch
-        finally:
-            watch.node.destroy_node()
-            rclpy.try_shutdown()
+        """Watch a domain that nothing else on this machine uses."""
+        with domain():
+            del os.environ["SST_ROS_NUMBA"]
+            rclpy.init()
+            watch = cls()
+            try:
+                yield watch
+            finally:
+                watch.node.destroy_node()
+                rclpy.try_shutdown()
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
