@@ -24,6 +24,8 @@ from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen, gauss_source
+from sst_ros.integration.gauss_source import HEAD
+from sst_ros.integration.simd_source import Layout
 from sst_ros.mechanism.geometry import Array
 
 NODES = 8
@@ -45,10 +47,10 @@ class PreparedMotion:
         integrate: Callable[..., float],
         block: Any,
         states: Any,
-        at: gauss_source.Places,
-        nodes: int,
+        at: Layout,
+        inputs: int,
     ) -> None:
-        self._block, self._states, self._at, self._nodes = block, states, at, nodes
+        self._block, self._states, self._at, self._inputs = block, states, at, inputs
         self.run: Callable[[], float] = partial(integrate, block, states)
 
     def begin(self, t: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
@@ -58,19 +60,19 @@ class PreparedMotion:
             InputError: there are more or fewer numbers than in the state and the drive of the ODE.
 
         """
-        place = self._at.begin
-        wanted, found = place.stop - place.start - 1, len(y) + len(d)
+        wanted, found = self._inputs - 1, len(y) + len(d)
         if found != wanted:
             allowed = f"state and drive must have {wanted} numbers"
             raise InputError("collocation", [Problem("y, d", found, allowed)])
-        for number, value in enumerate((t, *y, *d), start=place.start):
+        for number, value in enumerate((t, *y, *d), start=self._at.first("begin")):
             self._block[number] = value
 
     def set_step(self, h: float) -> None:
         """Set the length of a step [s]."""
-        self._block[self._at.counts.stop - 1] = h
-        scaled = (h * tables(self._nodes)).ravel()
-        self._block[self._at.tables] = scaled.tolist() if type(self._block) is list else scaled
+        self._block[HEAD - 1] = h
+        scaled = (h * tables(self._at.lanes)).ravel()
+        place = slice(self._at.first("node"), self._at.first("known"))
+        self._block[place] = scaled.tolist() if type(self._block) is list else scaled
 
     @property
     def states(self) -> Array:
@@ -87,8 +89,8 @@ class PreparedMotion:
     @property
     def least_distances(self) -> Array:
         """Least distance from each limit at all nodes of the last run, shape (limits,)."""
-        least = np.asarray(self._block[self._at.least])
-        return np.asarray(least.reshape(-1, self._nodes).min(axis=1))
+        least = np.asarray(self._block[self._at.first("least") :])
+        return np.asarray(least.reshape(-1, self._at.lanes).min(axis=1))
 
 
 class Collocation:
@@ -115,8 +117,8 @@ class Collocation:
     ) -> None:
         _refuse(nodes=nodes)
         self._compiled = compiled and codegen.numba_version() is not None
-        self._nodes, self._size = nodes, len(ode.state)
-        self._at = gauss_source.places(ode, nodes, limits)
+        self._size, self._inputs = len(ode.state), len(ode.program.inputs)
+        self._at = gauss_source.layout(ode, nodes, limits)
         self._module = codegen.load(
             gauss_source.source(ode, nodes, limits), {}, numba=self._compiled, rounding=False
         )
@@ -141,14 +143,14 @@ class Collocation:
         """
         _refuse(count=count, iterations=iterations)
         at, block = self._at, _aligned(self._at.numbers)
-        block[at.counts] = count, iterations, h
+        block[:HEAD] = count, iterations, h
         states = np.zeros(count * self._size)
         if self._compiled:
             integrate = _machine_code(self._module.integrate)
-            motion = PreparedMotion(integrate, block, states, at, self._nodes)
+            motion = PreparedMotion(integrate, block, states, at, self._inputs)
         else:
             lists = block.tolist(), states.tolist()
-            motion = PreparedMotion(self._module.integrate, *lists, at, self._nodes)
+            motion = PreparedMotion(self._module.integrate, *lists, at, self._inputs)
         motion.set_step(h)
         motion.begin(t, y, d)
         return motion

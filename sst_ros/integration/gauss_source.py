@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import inspect
 import re
-from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE
@@ -21,35 +20,17 @@ HEAD = 3
 """Numbers before all: count of steps, count of iterations, length of a step."""
 
 
-class Places(NamedTuple):
-    """Layout of `block`: counts and step, time with state and drive, tables, limit distances."""
-
-    numbers: int
-    counts: slice
-    begin: slice
-    tables: slice
-    least: slice
-
-
-def places(system: ODE, nodes: int, limits: Program | None) -> Places:
-    """Allocate what `integrate` reads and writes."""
-    at, inputs = _layout(system, nodes, limits), len(system.program.inputs)
-    begin, table, least = (at.first(group) for group in ("begin", "node", "least"))
-    return Places(
-        at.numbers,
-        slice(0, HEAD),
-        slice(begin, begin + inputs),
-        slice(table, table + (2 + nodes) * nodes),
-        slice(least, least + (len(limits.outputs) * nodes if limits else 0)),
-    )
-
-
 def source(system: ODE, nodes: int, limits: Program | None) -> list[str]:
     """Texts of flat_sin and of `integrate(block, states)`, see `gauss.PreparedMotion`."""
     return [inspect.getsource(flat_sin), _integrate(system, nodes, limits)]
 
 
-def _layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
+def layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
+    """Allocate what `integrate` reads and writes.
+
+    `head` and `begin` (time, state, drive) are set before a run, and from `node` to `known` the
+    tables times the length of a step; `least`, the last group, has the distances from limits.
+    """
     size, inputs = len(system.state), len(system.program.inputs)
 
     def rows(numbers: int) -> int:
@@ -74,7 +55,7 @@ def _time_only(system: ODE) -> list[bool]:
 
 
 def _integrate(system: ODE, nodes: int, limits: Program | None) -> str:
-    at, size, inputs = _layout(system, nodes, limits), len(system.state), len(system.program.inputs)
+    at, size, inputs = layout(system, nodes, limits), len(system.state), len(system.program.inputs)
     everything, quaternion, rates = range(size), range(4), range(4, size)
     known = _known(system)
     _, after, results = split(system.program, _time_only(system))

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import ROUNDING, cross, turned
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, frozen
 
 SAFE = 0.18
 """Largest step in gamma [rad] over sigma^2 that cannot leave the branch."""
@@ -173,6 +173,4 @@ def _described(geometry: Geometry, gamma: Array, rotation: Array) -> Branch:
     mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
     slope = cross(geometry.e @ rotation.transpose(0, 2, 1), r)
     sigma = np.asarray(np.linalg.svd(slope, compute_uv=False)[:, 2], dtype=float)
-    for array in (gamma, rotation, mu, beta, sigma, det_j2):
-        array.setflags(write=False)
-    return Branch(gamma, rotation, mu, beta, sigma, det_j2)
+    return Branch(*frozen(gamma, rotation, mu, beta, sigma, det_j2))

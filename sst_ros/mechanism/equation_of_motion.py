@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, frozen
 from sst_ros.mechanism.virtual_work import Mechanism, Posture
 
 
@@ -40,10 +40,7 @@ class EquationOfMotion:
         rate = np.array(gamma_dot, dtype=float)
         t1, t2 = virtual_work.equation_of_motion(mechanism, at, rate)
         # Rounding leaves T1 symmetric to 1e-16 only; M is symmetric.
-        m, h, j = -0.5 * (t1 + t1.T), -t2, at.j.copy()
-        for array in (m, h, j, rate):
-            array.setflags(write=False)
-        return cls(m, h, j, rate)
+        return cls(*frozen(-0.5 * (t1 + t1.T), -t2, at.j.copy(), rate))
 
     @property
     def momentum(self) -> Array:

@@ -14,6 +14,13 @@ from sst_ros.scene.scene import Scene
 Array = NDArray[np.float64]
 
 
+def frozen(*arrays: Any) -> tuple[Any, ...]:
+    """Make arrays read-only, and return them."""
+    for array in arrays:
+        array.setflags(write=False)
+    return arrays
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Base triangle and star; rows belong to legs. All arrays are read-only.
@@ -63,10 +70,10 @@ class Geometry:
         first, second = angles[..., 0], angles[..., 1]
         f = np.stack([np.zeros_like(first), first, first + second], axis=-1)
         e = np.stack([-np.sin(f), np.cos(f), np.zeros_like(f)], axis=-1)
+        most = beta_max if np.ndim(beta_max) else float(beta_max)
         arrays = (directions, normals / sines[..., None], e, angles, np.arctan2(sines, cosines))
-        for array in arrays:
-            array.setflags(write=False)
-        return cls(*arrays, beta_max if np.ndim(beta_max) else float(beta_max))
+        frozen(*arrays)
+        return cls(*arrays, most)
 
     def of_rows(self, rows: Any) -> Geometry:
         """Return the geometries of rows, or of a row; this one where it is a single one."""

@@ -16,12 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
 from sst_ros.mechanism.direct_kinematics import cross, dot, rotations
 from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.state import Assembly
-
-RESIDUAL = 1e-14
-"""Largest abs(r_k . t_k) of a root that is accepted as an assembly mode."""
-
 
 NEAR = 0.1
 """How near an assembly must be to the rotation that names it [rad]."""
@@ -125,8 +121,8 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     mu, beta, det_j2, admissible = described(
         geometry.of_rows(configuration), r[configuration], rotation
     )
-    _freeze(configuration, rotation, mu, beta, det_j2, admissible, isolated)
-    return Assemblies(configuration, rotation, mu, beta, det_j2, admissible, isolated)
+    arrays = frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated)
+    return Assemblies(*arrays)
 
 
 def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None) -> Assembly:
@@ -183,8 +179,3 @@ def described(
     most = np.asarray(geometry.beta_max)[..., None]
     valid = np.all(edge & (beta > 0.0) & (beta <= most), axis=-1)
     return mu, beta, -volume, valid
-
-
-def _freeze(*arrays: NDArray[np.generic]) -> None:
-    for array in arrays:
-        array.setflags(write=False)

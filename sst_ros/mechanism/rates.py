@@ -23,7 +23,7 @@ from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.direct_kinematics import cross
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 
 
@@ -150,7 +150,6 @@ def _motion(
     omega_ipl_dot = (
         gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * push
     )
-    arrays = (omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
-    for array in arrays:
-        array.setflags(write=False)
-    return BodyRates(*arrays)
+    return BodyRates(
+        *frozen(omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
+    )

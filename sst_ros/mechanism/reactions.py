@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.direct_kinematics import cross
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, frozen
 from sst_ros.mechanism.virtual_work import Mechanism, Posture
 
 
@@ -98,10 +98,7 @@ def _reactions(
     local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(frames, moments, strict=True)]
     for array, axis in zip(local, axes, strict=True):
         array[:, axis] = 0.0  # by the equations above; what rounding left goes
-    arrays = (*moments, *local, np.array(torque))
-    for array in arrays:
-        array.setflags(write=False)
-    return Reactions(*arrays)
+    return Reactions(*frozen(*moments, *local, np.array(torque)))
 
 
 def _momentum_rate(inertia: Array, omega: Array, omega_dot: Array) -> Array:

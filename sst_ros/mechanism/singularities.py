@@ -15,7 +15,7 @@ import numpy as np
 
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import columns, cross
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.mechanism.workspace import OrientationMap, measures, orientations
 
 _BISECTIONS = 55
@@ -70,7 +70,8 @@ def parallel(chart: OrientationMap) -> SingularPoses:
     rotation = orientations(s, low)
     gamma, _, beta = kinematics.inverse(geometry, rotation)
     leg = np.full(len(rows), -1)
-    return _frozen("parallel", rotation, gamma, beta, leg, _det_j2(geometry, s, low))
+    determinant = _det_j2(geometry, s, low)
+    return SingularPoses("parallel", *frozen(rotation, gamma, beta, leg, determinant))
 
 
 def serial(geometry: Geometry, points: int = 90) -> SingularPoses:
@@ -98,7 +99,8 @@ def serial(geometry: Geometry, points: int = 90) -> SingularPoses:
     rotations = np.array([row[0] for row in found]).reshape(-1, 3, 3)
     gammas, betas = (np.array([row[i] for row in found]).reshape(-1, 3) for i in (1, 2))
     legs = np.array([row[3] for row in found], dtype=int)
-    return _frozen("serial", rotations, gammas, betas, legs, np.array([row[4] for row in found]))
+    c_k = np.array([row[4] for row in found])
+    return SingularPoses("serial", *frozen(rotations, gammas, betas, legs, c_k))
 
 
 def report(geometry: Geometry, chart: OrientationMap) -> str:
@@ -122,9 +124,3 @@ def report(geometry: Geometry, chart: OrientationMap) -> str:
 def _det_j2(geometry: Geometry, s: Array, psi: Array) -> Array:
     rotation = orientations(s, psi)
     return measures(geometry, kinematics.inverse(geometry, rotation)[0], rotation).det_j2
-
-
-def _frozen(kind: str, *arrays: Array) -> SingularPoses:
-    for array in arrays:
-        array.setflags(write=False)
-    return SingularPoses(kind, *arrays)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import columns, cross
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.progress import slices
 
 _BLOCK = 20_000
@@ -136,7 +136,7 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
         angles, mu, beta, admissible & (stroke >= 0.0), stroke, beta.min(axis=-1),
         geometry.beta_max - beta.max(axis=-1), np.prod(c, axis=-1), det_j2, cond_j,
     )  # fmt: skip
-    return _measures(found)
+    return Measures(*frozen(*found))
 
 
 def workspace(
@@ -176,8 +176,7 @@ def over_orientations(
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         parts.append(measures(geometry, gamma, rotation))
-    directions.setflags(write=False)
-    psi.setflags(write=False)
+    frozen(directions, psi)
     return OrientationMap(geometry, directions, psi, _joined(parts))
 
 
@@ -202,9 +201,8 @@ def over_gamma(geometry: Geometry, points: int = 24, progress: bool = False) -> 
     values = [getattr(measured, name) for name in Measures.__dataclass_fields__]
     values = [v if v.dtype == bool or v.ndim > 1 else v + blank for v in values]
     cube = (points, points, points)
-    shaped = _measures(tuple(v.reshape(cube + v.shape[1:]) for v in values))
-    for array in (grid, count, rotation):
-        array.setflags(write=False)
+    shaped = Measures(*frozen(*(v.reshape(cube + v.shape[1:]) for v in values)))
+    frozen(grid, count, rotation)
     return GammaMap(geometry, grid, count.reshape(cube), rotation.reshape(*cube, 3, 3), shaped)
 
 
@@ -242,12 +240,6 @@ def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array,
     return s / np.linalg.norm(s, axis=1)[:, None], np.array(faces, dtype=np.intp)
 
 
-def _measures(arrays: tuple[Array, ...]) -> Measures:
-    for array in arrays:
-        array.setflags(write=False)
-    return Measures(*arrays)  # type: ignore[arg-type]
-
-
 def _joined(parts: list[Measures]) -> Measures:
     names = Measures.__dataclass_fields__
-    return _measures(tuple(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    return Measures(*frozen(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)))

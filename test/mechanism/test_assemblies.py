@@ -31,7 +31,7 @@ def solve(geometry, gammas):
     found = kinematics.direct_many(geometry, gammas)
     r = kinematics.carriage_directions(geometry, gammas)[found.configuration]
     t = geometry.e @ found.rotation.transpose(0, 2, 1)
-    assert np.abs(np.sum(r * t, axis=2)).max(initial=0.0) <= kinematics.RESIDUAL
+    assert np.abs(np.sum(r * t, axis=2)).max(initial=0.0) <= 1e-14
     assert np.all(found.isolated)
     return found.configuration, found.rotation, found.admissible
 
