@@ -180,7 +180,9 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
         processes = start(stack, folder, 0.0, control=False)
         for process in processes.values():
             until(lambda pid=process.pid: len(shared([pid])) >= 3, "shared memory")
-        time.sleep(5.0)  # until they have found each other
+        time.sleep(
+            shared_memory.AGE_S + 1.0
+        )  # they have found each other, and a start may remove their files
         names = shared(process.pid for process in processes.values()) - before
         for process in processes.values():
             process.kill()

@@ -14,6 +14,7 @@ import contextlib
 import fcntl
 import os
 import re
+import time
 from pathlib import Path
 
 FOLDER = Path("/dev/shm")
@@ -21,13 +22,16 @@ FOLDER = Path("/dev/shm")
 
 _LOCK = re.compile(r"(fast(?:dds|rtps)_(?:[0-9a-f]{16}|port\d{1,5}))_[es]l")
 """Lock files of Fast DDS 3 and 2: of a segment, and of a port, which has a mutex as well."""
+AGE_S = 10.0
+"""A process creates a lock file some microseconds before it locks it, longer on a loaded machine:
+until then its file looks dead, and without it the process would not be heard."""
 
 
 def remove_dead(folder: Path = FOLDER) -> list[str]:
     """Remove segments and ports of processes of this user that are dead.
 
-    What has no lock file, or belongs to another user, stays: it cannot be proven to be dead, or is
-    not ours. Other processes may start and end meanwhile.
+    What has no lock file, one of the last ten seconds, or belongs to another user, stays: it cannot
+    be proven to be dead, or is not ours. Other processes may start and end meanwhile.
 
     Returns:
         The names of the segments and ports that were removed.
@@ -45,6 +49,8 @@ def remove_dead(folder: Path = FOLDER) -> list[str]:
 def _remove(lock: Path, name: str) -> bool:
     """Remove a segment or port, the lock file last, while its lock is held."""
     try:
+        if time.time() - lock.lstat().st_mtime < AGE_S:
+            return False
         descriptor = os.open(lock, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:
         return False  # another process was faster

@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,12 @@ def files(names):
     return present & wanted
 
 
+def aged(*paths):
+    """Make lock files a minute old."""
+    for path in paths:
+        os.utime(path, (time.time() - 60.0,) * 2)
+
+
 def test_the_next_start_removes_what_a_killed_node_left(nodes, observer):
     states = observer.listen(JointState, "/joint_states")
     killed = nodes.run("simulator")
@@ -43,6 +50,7 @@ def test_the_next_start_removes_what_a_killed_node_left(nodes, observer):
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     assert len(files(left)) >= 5
+    aged(*(shared_memory.FOLDER / f"{name}_el" for name in left))
     mine = locks("self")
     nodes.run("simulator")
 
@@ -62,6 +70,7 @@ def test_what_is_locked_or_has_no_lock_or_is_no_file_of_fast_dds_stays(tmp_path)
              "fastdds_fedcba9876543210", "other_el", f"{NAME}_elx", "lttng-ust-wait-8"}  # fmt: skip
     for name in dead | stays:
         (tmp_path / name).touch()
+        aged(tmp_path / name)
     with (tmp_path / "fastdds_fedcba9876543210_el").open() as alive:
         fcntl.flock(alive, fcntl.LOCK_EX)
         assert set(shared_memory.remove_dead(tmp_path)) == {NAME, PORT, "fastrtps_port7"}
@@ -69,8 +78,19 @@ def test_what_is_locked_or_has_no_lock_or_is_no_file_of_fast_dds_stays(tmp_path)
     assert shared_memory.remove_dead(tmp_path / "none") == []
 
 
+def test_a_lock_file_that_is_not_yet_locked_stays(tmp_path):
+    """Its process may be about to lock it."""
+    lock = tmp_path / f"{NAME}_el"
+    lock.touch()
+    assert shared_memory.remove_dead(tmp_path) == []
+    aged(lock)
+    assert shared_memory.remove_dead(tmp_path) == [NAME]
+
+
 def test_files_of_another_user_stay(tmp_path, monkeypatch):
-    (tmp_path / f"{NAME}_el").touch()
+    lock = tmp_path / f"{NAME}_el"
+    lock.touch()
+    aged(lock)
     monkeypatch.setattr(os, "geteuid", lambda: 4321)
     assert shared_memory.remove_dead(tmp_path) == []
-    assert (tmp_path / f"{NAME}_el").exists()
+    assert lock.exists()
