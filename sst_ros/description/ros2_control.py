@@ -27,6 +27,9 @@ def urdf_with_ros2_control(
 ) -> str:
     """Write a scene as URDF with the ros2_control tag of its actuators.
 
+    Until the first joint states arrive, the hardware has the initial state of the scene: without it
+    joint_trajectory_controller, activated before, holds nan, and no command starts the run.
+
     Args:
         scene: the scene.
         commands: topic on which the simulator takes commands by name.
@@ -43,10 +46,12 @@ def urdf_with_ros2_control(
         ("trigger_joint_command_threshold", EVERY_CYCLE),
     ):
         ET.SubElement(hardware, "param", name=name).text = value
-    for name in JOINTS[:3]:
+    initial = scene.initial
+    for name, *start in zip(JOINTS[:3], initial.gamma, initial.gamma_dot, strict=True):
         joint = ET.SubElement(tag, "joint", name=name)
         ET.SubElement(joint, "command_interface", name="effort")
-        for state in STATES:
-            ET.SubElement(joint, "state_interface", name=state)
+        for state, start_value in zip(STATES, (*start, 0.0), strict=True):
+            interface = ET.SubElement(joint, "state_interface", name=state)
+            ET.SubElement(interface, "param", name="initial_value").text = repr(float(start_value))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"

@@ -38,6 +38,21 @@ def test_the_tag_has_the_actuators_and_the_topics_of_the_simulator():
         assert states == ["position", "velocity", "effort"]
 
 
+def test_the_states_before_the_first_message_are_the_initial_ones():
+    """Without them a controller that is activated first holds nan, and no run starts."""
+    scene = load("swing")
+    tag = ET.fromstring(urdf_with_ros2_control(scene)).find("ros2_control")
+    given = [
+        [
+            float(state.findtext("param[@name='initial_value']"))
+            for state in joint.iter("state_interface")
+        ]
+        for joint in tag.findall("joint")
+    ]
+    initial = scene.initial
+    assert given == [[*state, 0.0] for state in zip(initial.gamma, initial.gamma_dot, strict=True)]
+
+
 @pytest.mark.parametrize("option", [[], ["--ros2-control"]])
 def test_the_rest_is_the_urdf_of_the_scene(option, capsys):
     assert main(["describe", "--scene", "swing", *option]) == 0
