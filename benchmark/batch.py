@@ -62,18 +62,18 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         work = _Work(scene, options.scenarios, Path(folder) if with_c else None)
         seconds = interleaved(work.calls, options.rounds, shortest=5e-3)
-    told = machine.described("numpy", "numba", "llvmlite")
+    host = machine.described("numpy", "numba", "llvmlite")
     if with_c:
-        told["gcc"] = c_floor.version()
+        host["gcc"] = c_floor.version()
     rows = _rows(seconds, options.scenarios)
     print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {SIMD_WIDTH} lanes.")
     print("Time per evaluation and scenario: a step with limits and error, over its stages.")
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
-    print("\n".join(work.said), "\n")
+    print("\n".join(work.notes), "\n")
     _print(rows, seconds)
-    print("\n" + machine.line(told))
+    print("\n" + machine.line(host))
     if options.json:
-        document = {"machine": told, "scene": options.scene, "rows": rows, "said": work.said}
+        document = {"machine": host, "scene": options.scene, "rows": rows, "notes": work.notes}
         options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return 0
 
@@ -83,7 +83,7 @@ class _Work:
 
     def __init__(self, scene: Scene, number: int, folder: Path | None) -> None:
         self.calls: dict[tuple[str, str], Callable[[], Any]] = {}
-        self.said: list[str] = []
+        self.notes: list[str] = []
         self._scene, self._number = scene, number
         centre = np.array(scene.initial.gamma)
         self._gamma = centre + np.random.default_rng(1).uniform(-SPREAD, SPREAD, (number, 3))
@@ -132,7 +132,7 @@ class _Work:
         each = (time.perf_counter() - began) / variants.COUNT
         given = batch.drives((0.0, 0.0, 0.0), variants.COUNT)
         given = given[:, np.arange(self._number) % variants.COUNT].copy()
-        self.said.append(
+        self.notes.append(
             f"{name}, {who}: {len(given)} numbers, {1e3 * each:.1f} ms to prepare a scenario."
         )
 
@@ -162,7 +162,7 @@ class _Work:
             if not apart < 1e-12:
                 raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
             same = "the bits of numba" if apart == 0.0 else f"{apart:.0e} from numba"
-            self.said.append(
+            self.notes.append(
                 f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc vectorised {done} of {loops}"
                 f" loops over lanes; {same}."
             )

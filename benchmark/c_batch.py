@@ -75,7 +75,7 @@ def built(text: str, folder: Path, name: str, *flags: str) -> tuple[ctypes.CDLL,
     """Compile with gcc and load; also say how many loops gcc reports as vectorised."""
     file, library = folder / f"{name}.c", folder / f"{name}.so"
     file.write_text(text, encoding="utf-8")
-    told = subprocess.run(
+    done = subprocess.run(
         ["gcc", *flags, "-fopenmp-simd", "-fopt-info-vec-optimized", "-shared", "-fPIC",
          "-o", str(library), str(file), "-lm"],
         check=True, capture_output=True, text=True,
@@ -85,5 +85,5 @@ def built(text: str, folder: Path, name: str, *flags: str) -> tuple[ctypes.CDLL,
         ctypes.c_double, *(ctypes.c_long,) * 5, *(ctypes.c_void_p,) * 5,
     ]  # fmt: skip
     loaded.batch.restype = None
-    lines = {line.split(": optimized")[0] for line in told.stderr.splitlines() if "loop" in line}
+    lines = {line.split(": optimized")[0] for line in done.stderr.splitlines() if "loop" in line}
     return loaded, len(lines)

@@ -52,8 +52,8 @@ def compiler() -> str | None:
 
 def version() -> str:
     """First line of gcc --version."""
-    told = subprocess.run(["gcc", "--version"], capture_output=True, text=True, check=True)
-    return told.stdout.splitlines()[0].removeprefix("gcc ")
+    done = subprocess.run(["gcc", "--version"], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[0].removeprefix("gcc ")
 
 
 def source(program: Program, tableau: Tableau) -> str:

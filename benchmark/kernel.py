@@ -62,13 +62,13 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
         seconds = interleaved(calls, options.rounds, shortest=5e-3)
-    told = machine.described("numpy", "numba", "llvmlite")
+    host = machine.described("numpy", "numba", "llvmlite")
     if with_c:
-        told["gcc"] = c_floor.version()
+        host["gcc"] = c_floor.version()
     rows = _rows(seconds)
-    _print(rows, told, options, sum(system.program.operations.values()))
+    _print(rows, host, options, sum(system.program.operations.values()))
     if options.json:
-        document = {"machine": told, "scene": options.scene, "rows": rows}
+        document = {"machine": host, "scene": options.scene, "rows": rows}
         options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return 0
 
@@ -78,10 +78,10 @@ def _calls(
 ) -> dict[tuple[str, str], Callable[[], Any]]:
     """What is timed, by (work, who): STEPS evaluations or steps each."""
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
-    slopes = _numba_slopes(system.program)
+    slopes = _chain(system.program, numba.njit(error_model="numpy"))
     start = np.array(y)
     calls["evaluation", NUMBA] = lambda: slopes(STEPS, start.copy())
-    plain_slopes = _plain_slopes(system.program)
+    plain_slopes = _chain(system.program, lambda function: function)
     calls["evaluation", PLAIN] = lambda: plain_slopes(STEPS, list(y))
     for name, method in METHODS.items():
         fast = CompiledMethod(system, method, compiled=True)
@@ -117,16 +117,8 @@ def _add_c(
         calls.setdefault(("evaluation", who), slopes)
 
 
-def _numba_slopes(program: Program) -> Callable[..., float]:
-    """A compiled loop of evaluations, each at what the last one gives."""
-    return _chain(program, numba.njit(error_model="numpy"))
-
-
-def _plain_slopes(program: Program) -> Callable[..., float]:
-    return _chain(program, lambda function: function)
-
-
 def _chain(program: Program, compiled: Callable[[Any], Any]) -> Callable[..., float]:
+    """A loop of evaluations, each at what the last one gives."""
     size = len(program.outputs)
     text = _SLOPES.format(
         names=", ".join(f"k{j}" for j in range(size)),
@@ -154,14 +146,14 @@ def _rows(seconds: dict[tuple[str, str], list[float]]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (order.index(row["work"]), row["ns"]))
 
 
-def _print(rows: list[dict[str, Any]], told: dict[str, str], options: Any, size: int) -> None:
+def _print(rows: list[dict[str, Any]], host: dict[str, str], options: Any, size: int) -> None:
     print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
     print(f"{'work':16}{'who':24}{'time':>12}{'over C -O3':>12}")
     for row in rows:
-        ratio_told = f"{row['over_c']:.2f}" if "over_c" in row else ""
-        time_told = f"{row['ns']:.0f} ns" if row["ns"] < 1e4 else f"{row['ns'] / 1e3:.1f} us"
-        print(f"{row['work']:16}{row['who']:24}{time_told:>12}{ratio_told:>12}")
+        over = f"{row['over_c']:.2f}" if "over_c" in row else ""
+        took = f"{row['ns']:.0f} ns" if row["ns"] < 1e4 else f"{row['ns'] / 1e3:.1f} us"
+        print(f"{row['work']:16}{row['who']:24}{took:>12}{over:>12}")
     print()
     for row in rows:
         if row["who"] == NUMBA and "over_c" in row:
@@ -170,7 +162,7 @@ def _print(rows: list[dict[str, Any]], told: dict[str, str], options: Any, size:
         if row["who"] == PLAIN and row["work"] == "rk4 step":
             met = "met" if row["ns"] <= 1e9 * AT_MOST_PLAIN else "MISSED"
             print(f"plain rk4 step {row['ns'] / 1e3:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
-    print("\n" + machine.line(told))
+    print("\n" + machine.line(host))
 
 
 if __name__ == "__main__":

@@ -77,8 +77,10 @@ def write(path: Path, seconds: float, *, sqlite: bool = False, shown: bool = Fal
         }
         raw = {t: bytes(STORE.serialize_cdr(m, m.__msgtype__)) for t, m in kinds.items()}
         text = _make("std_msgs/String", data=yaml_document.dump(scene))
-        told = writer.add_connection("/sst_simulator/scene", text.__msgtype__, typestore=STORE)
-        writer.write(told, START_NS, STORE.serialize_cdr(text, text.__msgtype__))
+        connection = writer.add_connection(
+            "/sst_simulator/scene", text.__msgtype__, typestore=STORE
+        )
+        writer.write(connection, START_NS, STORE.serialize_cdr(text, text.__msgtype__))
         for rows, run in _run(scene, samples, shown):
             stamps = START_NS + np.arange(rows.start, rows.stop) * TICK_NS * TICKS_A_SAMPLE
             before = stamps - TICK_NS * TICKS_A_SAMPLE
@@ -218,26 +220,26 @@ def main(arguments: list[str] | None = None) -> int:
             write(bag, options.seconds, sqlite=options.sqlite, shown=True)
         size = sum(file.stat().st_size for file in bag.iterdir()) / 1e9
         wall, busy, memory = reported(bag, Path(folder) / "report")
-        told = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
     found = {
-        "samples": told["samples_recorded"],
-        "ticks": told["ticks_recorded"],
-        "samples_compared": told["samples_compared"],
+        "samples": summary["samples_recorded"],
+        "ticks": summary["ticks_recorded"],
+        "samples_compared": summary["samples_compared"],
         "bag_GB": size,
         "wall_s": wall,
         "processor_s": busy,
         "peak_GB": memory,
-        "integration_error_gamma_rad": told["integration_error_gamma_rad"],
-        "integration_reference_error_gamma_rad": told["integration_reference_error_gamma_rad"],
+        "integration_error_gamma_rad": summary["integration_error_gamma_rad"],
+        "integration_reference_error_gamma_rad": summary["integration_reference_error_gamma_rad"],
     }
     for name, value in found.items():
         print(f"{name:40} {value:.4g}" if isinstance(value, float) else f"{name:40} {value}")
     good = wall < AT_MOST_S and memory < AT_MOST_GB
     print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
-    told_machine = machine.described("numpy", "numba", "rosbags", "matplotlib")
-    print(machine.line(told_machine))
+    host = machine.described("numpy", "numba", "rosbags", "matplotlib")
+    print(machine.line(host))
     if options.json:
-        text = json.dumps({"found": found, "machine": told_machine}, indent=2)
+        text = json.dumps({"found": found, "machine": host}, indent=2)
         options.json.write_text(text + "\n", encoding="utf-8")
     return 0
 

@@ -13,7 +13,7 @@ from sst_ros.report.summary import processor
 
 def described(*packages: str) -> dict[str, str]:
     """Date, processor, load and versions; packages that are not installed are left out."""
-    told = {
+    host = {
         "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": processor(),
         "cores": str(len(os.sched_getaffinity(0))),
@@ -23,12 +23,12 @@ def described(*packages: str) -> dict[str, str]:
     }
     for package in packages:
         try:
-            told[package] = metadata.version(package)
+            host[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return told
+    return host
 
 
-def line(told: dict[str, str]) -> str:
+def line(host: dict[str, str]) -> str:
     """One line of text."""
-    return ", ".join(f"{key} {value}" for key, value in told.items())
+    return ", ".join(f"{key} {value}" for key, value in host.items())

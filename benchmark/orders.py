@@ -57,7 +57,7 @@ def _orders() -> None:
     system = ODE(Dynamics.of(scene), scene.torque)
     print(f"Orders on example2_heavy, {SPAN} s: error with n steps and with 2 n")
 
-    def told(name: str, order: int, n: int, errors: list[float]) -> None:
+    def show(name: str, order: int, n: int, errors: list[float]) -> None:
         found = math.log(errors[0] / errors[1]) / math.log(2.0)
         met = "met" if abs(found - order) <= WITHIN else "MISSED"
         print(f"{name:8}{n:6} steps {errors[0]:9.1e} {errors[1]:9.1e}  order {found:.3f} of {order}"
@@ -66,14 +66,14 @@ def _orders() -> None:
     for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4):
         runner, n = CompiledMethod(system, method, compiled=False), STEPS[method.name]
         ends = [runner.step_fixed(0.0, SPAN / k, k, start, []) for k in (n, 2 * n)]
-        told(method.name, method.order, n, [math.dist(end, truth) for end in ends])
+        show(method.name, method.order, n, [math.dist(end, truth) for end in ends])
     for nodes, n in ((2, 64), (4, 12)):
         gauss = Collocation(system, nodes, compiled=False)
         motions = [gauss.prepare(0.0, SPAN / k, k, start, iterations=20) for k in (n, 2 * n)]
         for motion in motions:
             motion.run()
         ends = [motion.end for motion in motions]
-        told(f"gauss {nodes}", 2 * nodes, n, [math.dist(end, truth) for end in ends])
+        show(f"gauss {nodes}", 2 * nodes, n, [math.dist(end, truth) for end in ends])
 
 
 def _energy(seconds: int) -> None:

@@ -16,7 +16,7 @@ def interleaved(
     calls: dict[Key, Callable[[], Any]],
     rounds: int = 9,
     shortest: float = 2e-3,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Key, list[float]]:
     """Seconds of each call, one number a round.
@@ -35,7 +35,7 @@ def interleaved(
             for key, call in calls.items():
                 seconds[key].append(_timed(call, repeats[key], clock))
             gc.collect()
-            told(done + 1, rounds)
+            progress(done + 1, rounds)
     finally:
         if collecting:
             gc.enable()

@@ -66,7 +66,7 @@ NODES = (
 def tables() -> dict[str, str]:
     """Give the text of every generated part of docs/nodes.md, by its name."""
     parts = {
-        name: _table(("key", "what"), ((f"`{key}`", said) for key, said in keys.items()))
+        name: _table(("key", "what"), ((f"`{key}`", text) for key, text in keys.items()))
         for name, keys in (
             ("diagnostics", diagnostics.KEYS),
             ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
@@ -173,10 +173,10 @@ def _allowed(spec: Spec) -> str:
 
 def _endpoint_rows(listed: Iterable[Endpoint]) -> Iterator[tuple[str, ...]]:
     for endpoint in listed:
-        said = endpoint.doc + ("; kept for late joiners" if endpoint.latched else "")
+        text = endpoint.doc + ("; kept for late joiners" if endpoint.latched else "")
         if endpoint.when:
-            said += f"; only where {endpoint.when}"
-        yield endpoint.use, f"`{endpoint.name}`", endpoint.type_name, said
+            text += f"; only where {endpoint.when}"
+        yield endpoint.use, f"`{endpoint.name}`", endpoint.type_name, text
 
 
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pandas import DataFrame
+
 from benchmark import machine
 from benchmark.peers import results as tables
 from benchmark.peers.results import Results
+from sst_ros.studies.results import markdown
 
 TEXT = """\
 # Speed and accuracy compared with MuJoCo, Pinocchio, Drake, Exudyn and SciPy
@@ -144,6 +147,4 @@ def _settings(results: Results) -> str:
 
 
 def _markdown(cells: list[list[str]]) -> str:
-    lines = ["| " + " | ".join(row) + " |" for row in cells]
-    lines.insert(1, "|" + "---|" * len(cells[0]))
-    return "\n".join(lines)
+    return markdown(DataFrame(cells[1:], columns=cells[0]))

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+from pandas import DataFrame
 
 from benchmark import machine
 from benchmark.peers.floor import Floor
@@ -129,29 +130,22 @@ def floor_rows(results: Results) -> list[list[str]]:
     return found
 
 
-def reference_line(results: Results) -> str:
-    """How well the reference is known."""
-    return (
-        f"Reference: extrapolation in mpmath, two step sizes {results.reference_error:.0e} rad"
-        " apart, kept as doubles (2e-16)"
-    )
-
-
 def table(results: Results) -> str:
     """Text for the terminal."""
     parts = [
         "One second of Example 2. Processor time [ms] to an error of the orientation at the end,",
         "and how many times that is ours. '-': not reached by any setting tried.",
         "",
-        _aligned(rows(results)),
+        _text(rows(results)),
         "",
-        _aligned(best_rows(results)),
+        _text(best_rows(results)),
         "",
         *verdicts(results),
         "",
-        _aligned(floor_rows(results)),
+        _text(floor_rows(results)),
         "",
-        reference_line(results) + ".",
+        f"Reference: extrapolation in mpmath, two step sizes {results.reference_error:.0e} rad"
+        " apart, kept as doubles (2e-16).",
         f"{machine.line(results.machine)}; medians of {results.rounds} interleaved rounds;"
         f" {results.seconds:.0f} s in all.",
         *(f"{engine}: {why}." for engine, why in results.missing.items()),
@@ -162,10 +156,7 @@ def table(results: Results) -> str:
 def write(results: Results, folder: Path) -> None:
     """Write peers.csv, one row a setting that was timed or failed, and peers.json."""
     points = [point for curve in results.curves for point in _points(curve)]
-    with (folder / "peers.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(points[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(points)
+    DataFrame(points).to_csv(folder / "peers.csv", index=False, lineterminator="\n")
     document = {
         "machine": results.machine,
         "rounds": results.rounds,
@@ -249,10 +240,5 @@ def _number(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else ""
 
 
-def _aligned(cells: list[list[str]]) -> str:
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in cells
-    ]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+def _text(cells: list[list[str]]) -> str:
+    return str(DataFrame(cells[1:], columns=cells[0]).to_string(index=False))

@@ -77,7 +77,7 @@ class _Paper:
                 self.joint_slope(at.time, np.array([*gamma, *rate]))[3:]]  # fmt: skip
         kernel = self.task.kernel_answer(at.y, at.torque)
         worst = max(both, key=lambda found: float(np.linalg.norm(found - kernel)))
-        # The paper's form is the judge of all others; it is itself judged by the kernel.
+        # The paper's form is the truth of all others; the kernel checks it.
         return worst - kernel + at.answer
 
 

@@ -70,7 +70,7 @@ class Curve:
 
 
 def studied(
-    task: Task, reference: Reference, series: list[Series], rounds: int, told: Progress
+    task: Task, reference: Reference, series: list[Series], rounds: int, progress: Progress
 ) -> list[Curve]:
     """Gate all, run all settings for their errors, then time the worthwhile ones in rounds."""
     curves = [Curve(one, _gate(one, task)) for one in series]
@@ -80,13 +80,16 @@ def studied(
     for curve in curves:
         for setting in curve.series.settings if curve.passed else ():
             done += 1
-            told(f"errors: {curve.series.engine}", done, total)
+            progress(f"errors: {curve.series.engine}", done, total)
             curve.points.append(_scouted(setting, reference, runs))
         _drop(curve, runs)
     points = {id(p): p for curve in curves for p in curve.points if id(p.setting) in runs}
     calls = {key: runs[id(point.setting)].whole for key, point in points.items()}
     seconds = interleaved(
-        calls, rounds, told=lambda a, b: told("rounds of times", a, b), clock=time.process_time
+        calls,
+        rounds,
+        progress=lambda a, b: progress("rounds of times", a, b),
+        clock=time.process_time,
     )
     for key, point in points.items():
         point.seconds = seconds[key]

@@ -71,7 +71,7 @@ def parser(only: str | None = None) -> Parser:
         description="Simulator of the 3-RRP spherical star-triangle parallel manipulator.",
         epilog=f"`{PROGRAM} COMMAND --help` describes a command or a node.",
     )
-    result.add_argument("--version", action="version", version=_version())
+    result.add_argument("--version", action="version", version=f"{PROGRAM} {VERSION}")
     result.add_argument("--debug", action="store_true", help="print the traceback of an error")
     commands = result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     for name, module in COMMANDS.items():
@@ -105,10 +105,6 @@ def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
     end = words.index("--ros-args") if "--ros-args" in words else len(words)
     kept = [word for word in words[:end] if word != "--debug"]
     return len(kept) < end, [*kept, *words[end:]]
-
-
-def _version() -> str:
-    return f"{PROGRAM} {VERSION}"
 
 
 def _abandon_stdout() -> None:

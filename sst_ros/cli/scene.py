@@ -132,11 +132,11 @@ def _workspace(options: argparse.Namespace) -> None:
     free_out(options, out)
     require("matplotlib")
     from sst_ros.plot.style import save_figure
-    from sst_ros.plot.workspace import draw
+    from sst_ros.plot.workspace import plot_workspace
 
     geometry = Geometry.of(scene)
-    directions, faces = workspace.triangle_directions(geometry, divisions=60)
+    directions, _ = workspace.triangle_directions(geometry, divisions=60)
     chart = workspace.over_orientations(geometry, directions, turns=180, progress=True)
     print(singularities.report(geometry, chart))
-    save_figure(draw([chart], [faces], [scene.name]), out)
+    save_figure(plot_workspace(chart, titles=[scene.name]), out)
     print(out)

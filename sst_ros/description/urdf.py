@@ -95,15 +95,10 @@ def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, floa
     bounds = {"lower": _exact(ends[:1]), "upper": _exact(ends[1:])} if limited else {}
     bounds |= {"effort": _exact([effort or LARGEST]), "velocity": _exact([velocity or LARGEST])}
     ET.SubElement(element, "limit", bounds)
-    friction = _friction(scene, joint.name)
+    friction: Friction | None = getattr(scene.friction, joint.name.split("_")[0], None)
     if friction is not None:
         values = {"damping": friction.viscous, "friction": friction.coulomb}
         ET.SubElement(element, "dynamics", {key: _exact([x]) for key, x in values.items()})
-
-
-def _friction(scene: Scene, joint: str) -> Friction | None:
-    found: Friction | None = getattr(scene.friction, joint.split("_")[0], None)
-    return found
 
 
 def _draw(link: ET.Element, shape: Shape) -> None:

@@ -40,23 +40,12 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
         titles: a name for each; by default none.
 
     """
-    meshes = []
-    for chart in charts:
-        divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
-        meshes.append(triangle_directions(chart.geometry, divisions)[1])
-    return draw(charts, meshes, titles or ["E on the base triangle"] * len(charts))
-
-
-def draw(
-    charts: Sequence[OrientationMap],
-    faces: Sequence[NDArray[np.intp]],
-    titles: Sequence[str],
-) -> Figure:
-    """Draw turn, condition and margin of each map over its triangles; the caller saves it."""
     figure = Figure(figsize=(13.5, 4.3 * len(charts)), layout="constrained")
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
-    for row, chart, mesh, title in zip(rows, charts, faces, titles, strict=True):
-        _row(row, chart, mesh, title)
+    names = titles or ["E on the base triangle"] * len(charts)
+    for row, chart, title in zip(rows, charts, names, strict=True):
+        divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
+        _row(row, chart, triangle_directions(chart.geometry, divisions)[1], title)
     return figure
 
 

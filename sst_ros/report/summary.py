@@ -65,22 +65,16 @@ def summarise(
 
 def _run(recording: Recording) -> dict[str, Any]:
     reported = recording.diagnostics
+    texts = ("phase", "fault", "integrator")
+    counts = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
+    numbers = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
     return {
-        "phase": reported.get("phase"),
-        "fault": reported.get("fault"),
-        "integrator": reported.get("integrator"),
-        "ticks": _count(reported, "ticks"),
-        "ticks_missed": _count(reported, "ticks_missed"),
-        "simulated_time_s": _number(reported, "simulated_time_s"),
-        "wall_time_s": _number(reported, "wall_time_s"),
-        "real_time_factor": _number(reported, "real_time_factor"),
-        "step_mean_us": _number(reported, "step_mean_us"),
-        "step_max_us": _number(reported, "step_max_us"),
+        **{key: reported.get(key) for key in texts},
+        **{key: _count(reported, key) for key in counts},
+        **{key: _number(reported, key) for key in numbers},
         "simulator_error_estimate": _number(reported, "error_estimate"),
         "error_limit_rad": _number(reported, "tolerance") or ERROR_LIMIT_RAD,
         "duration_s": float(recording.seconds[-1]),
-        "commands_received": _count(reported, "commands_received"),
-        "commands_dropped": _count(reported, "commands_dropped"),
         "commands_recorded": len(recording.commands.torque),
     }
 

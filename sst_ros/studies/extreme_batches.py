@@ -22,6 +22,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, specs
 from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.studies.extreme_cases import Case, CaseRun, run
@@ -57,7 +58,7 @@ def batch_groups(cases: Sequence[Case]) -> list[tuple[int, ...]]:
 
 def run_batch(cases: Sequence[Case]) -> list[tuple[str, bool]]:
     """Run cases of the same terms as one batch; what was compared, and whether it agrees."""
-    numbers = [dict(_numbers(case.scene())) for case in cases]
+    numbers = [_numbers(case.scene()) for case in cases]
     varied = {
         key: [row[key] for row in numbers]
         for key, value in numbers[0].items()
@@ -124,33 +125,29 @@ def _agrees(direct: CaseRun, y: list[float], reason: str, stop: float, h: float)
     )
 
 
-def _numbers(section: Section, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the numbers of a scene that act on its motion, by their keys in the document."""
+def _flat(section: Section, path: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Yield key, kind and value of all fields of a scene that act on its motion."""
     for name, spec in specs(type(section)).items():
         value, key = getattr(section, name), f"{path}{name}"
-        if name in _GIVEN or value is None:
-            continue
-        if spec.kind == "number":
-            yield key, value
-        elif spec.kind == "section":
-            yield from _numbers(value, f"{key}.")
-        elif spec.kind == "sections":
-            for i, entry in enumerate(value):
-                yield from _numbers(entry, f"{key}[{i}].")
-
-
-def _terms(section: Section) -> Any:
-    """Return a section without its numbers: which terms it has, and its choices."""
-    found: list[Any] = []
-    for name, spec in specs(type(section)).items():
-        value = getattr(section, name)
         if name in _GIVEN:
             continue
-        if spec.kind == "number":
-            value = value is not None
-        elif spec.kind == "section":
-            value = None if value is None else _terms(value)
+        if spec.kind == "section" and value is not None:
+            yield from _flat(value, f"{key}.")
         elif spec.kind == "sections":
-            value = tuple(map(_terms, value))
-        found.append((name, value))
-    return tuple(found)
+            for i, entry in enumerate(value):
+                yield from _flat(entry, f"{key}[{i}].")
+        else:
+            yield key, spec.kind, value
+
+
+def _numbers(scene: Scene) -> dict[str, Any]:
+    """Return the numbers of a scene by their keys in the document."""
+    return {key: value for key, kind, value in _flat(scene)
+            if kind == "number" and value is not None}  # fmt: skip
+
+
+def _terms(scene: Scene) -> Any:
+    """Return what is left of a scene without its numbers: which terms it has, and its choices."""
+    return tuple(
+        (key, value is not None if kind == "number" else value) for key, kind, value in _flat(scene)
+    )

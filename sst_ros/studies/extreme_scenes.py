@@ -86,6 +86,11 @@ def apart(one: Simulation, other: Simulation) -> float:
     return 2.0 * min(math.dist(p, q), math.dist(p, [-x for x in q]))
 
 
+def from_reference(simulation: Simulation) -> float:
+    """Angle from the end of the reference motion [rad]."""
+    return apart(simulation, reference())
+
+
 def energy_drift(simulation: Simulation) -> float:
     """Energy residual relative to the energy."""
     state, dynamics = simulation.state, simulation.dynamics

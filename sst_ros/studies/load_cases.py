@@ -47,15 +47,11 @@ def friction() -> Iterator[Case]:
             f"at some {5.0 / smoothing:.0e} 1/s",
         )  # fmt: skip
     for lag in (1e-3, 1e-6, 1e-9):
-
-        def unlagged(simulation: Simulation) -> float:
-            return extremes.apart(simulation, extremes.reference())
-
         yield Case(
             f"actuator lag of {lag:g} s",
             "the motion without lag, its torque late by the lag",
             partial(replace, extremes.spun(2.0), actuators=Actuators(time_constant=lag)),
-            extremes.PUSH, 20, 10_000_000, unlagged, max(lag, 1e-8),
+            extremes.PUSH, 20, 10_000_000, extremes.from_reference, max(lag, 1e-8),
             difficulty=f"a decay of {1.0 / lag:.0e} 1/s in the state",
         )  # fmt: skip
 

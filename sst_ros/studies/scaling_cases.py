@@ -31,11 +31,6 @@ def pushed(scale: float) -> Triple:
     return (a * scale, b * scale, c * scale)
 
 
-def from_reference(simulation: Simulation) -> float:
-    """Angle from the end of the reference motion [rad]."""
-    return extremes.apart(simulation, extremes.reference())
-
-
 def scaled_times() -> Iterator[Case]:
     """Yield motions at another speed."""
     for scale in (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4):
@@ -43,7 +38,7 @@ def scaled_times() -> Iterator[Case]:
             f"time x {scale:g}",
             "the end of the same motion at its own speed, by the scaling law",
             partial(extremes.spun, 2.0 / scale), pushed(scale**-2), 20, round(10 * MS * scale),
-            from_reference, 1e-9,
+            extremes.from_reference, 1e-9,
         )  # fmt: skip
 
 
@@ -53,7 +48,7 @@ def scaled_inertias() -> Iterator[Case]:
         yield Case(
             f"inertia x {scale:g}", "the same motion, under torques scaled alike",
             partial(extremes.with_inertias, scale, scale), pushed(scale), 20, 10 * MS,
-            from_reference, 1e-12,
+            extremes.from_reference, 1e-12,
         )  # fmt: skip
     for scale in (1e-9, 1e9):
         yield Case(

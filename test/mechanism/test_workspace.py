@@ -147,10 +147,9 @@ def test_the_bar_is_for_terminals_only(terminal, monkeypatch):
 
 def test_the_picture(tmp_path, isotropic, folding):
     pytest.importorskip("matplotlib")
-    from sst_ros.plot.workspace import draw
+    from sst_ros.plot.workspace import plot_workspace
 
-    _, faces = workspace.triangle_directions(ISOTROPIC, 16)
-    figure = draw([isotropic, folding], [faces, faces], ["isotropic", "general"])
+    figure = plot_workspace(isotropic, folding, titles=["isotropic", "general"])
     assert len(figure.axes) == 12  # six pictures, six colour bars
     figure.savefig(tmp_path / "workspace.png", dpi=40)
     assert (tmp_path / "workspace.png").stat().st_size > 10_000
