@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.quintic import minimum_jerk
+from sst_ros.control.quintic import minimum_jerk, timed
 from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
-from sst_ros.control.star_motions import PIECES, timed
+from sst_ros.control.star_motions import PIECES
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control import orientation_error
+from sst_ros.control import quaternions
 from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.orientation_observer import OrientationObserver
@@ -211,14 +211,14 @@ class Controller:
 
     def _on_so3(self, desired: Reference, now: Reference) -> tuple[Triple, Triple]:
         """W_dot in {E}, and the rotation vector of the error, which is integrated."""
-        between = orientation_error.between(now.quaternion, desired.quaternion)
+        between = quaternions.between(now.quaternion, desired.quaternion)
         turn = rotation_rows(between)
         rate, forward = (
             _three(dot(row, vector) for row in turn)
             for vector in (desired.body_rate, desired.body_acceleration)
         )
         moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
-        phi = orientation_error.rotation_vector(between)
+        phi = quaternions.rotation_vector(between)
         acceleration, summed = self._feedback(phi, axpy(1.0, rate, -1.0, now.body_rate))
         return added(moving, acceleration), summed
 

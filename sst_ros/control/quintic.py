@@ -40,6 +40,12 @@ def minimum_jerk(u: float) -> tuple[float, float, float]:
     )
 
 
+def timed(time: float, duration: float) -> tuple[float, float, float]:
+    """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
+    s, rate, acceleration = minimum_jerk(time / duration)
+    return s, rate / duration, acceleration / (duration * duration)
+
+
 class Quintic:
     """A path of one or more numbers, quintic between points.
 

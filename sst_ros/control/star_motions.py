@@ -9,7 +9,8 @@ from abc import abstractmethod
 from scipy.spatial.transform import Rotation
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.quintic import minimum_jerk
+from sst_ros.control.quaternions import about_z, product, unit
+from sst_ros.control.quintic import timed
 from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism.generic_math import axpy, scaled
@@ -105,32 +106,3 @@ class SpiralMotion(StarMotion):
         dz = -self._theta * self._phi * sb
         turning = axpy(acceleration, (x, y, z), rate * rate, (dx, dy, dz))
         return product(self._start, q), scaled(rate, (x, y, z)), turning
-
-
-def timed(time: float, duration: float) -> tuple[float, float, float]:
-    """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
-    s, rate, acceleration = minimum_jerk(time / duration)
-    return s, rate / duration, acceleration / (duration * duration)
-
-
-def product(a: Quadruple, b: Quadruple) -> Quadruple:
-    """Product of quaternions (x, y, z, w): first b, then a."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by + ay * bw + az * bx - ax * bz,
-        aw * bz + az * bw + ax * by - ay * bx,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def about_z(angle: float) -> Quadruple:
-    """Quaternion of a turn about z."""
-    return (0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle))
-
-
-def unit(q: Quadruple) -> Quadruple:
-    """Quaternion of length 1."""
-    length = math.hypot(*q)
-    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

@@ -8,13 +8,13 @@ it does not accept is built as a `Scene`, which accepts it or names the fault.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.integration.scenario_constants import leaves
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import RELATIVE_ROUNDING, SMALLEST_MOMENT
 from sst_ros.scene.scene import LARGEST, SMALLEST, Scene
@@ -70,7 +70,7 @@ def valid_rows(
     mass: Any = 0.0
     for body in (columns.star, *columns.actuated_links, *columns.intermediate_links):
         mass = mass + body.mass
-        if any(isinstance(value, np.ndarray) for value in _numbers(body)):
+        if any(isinstance(value, np.ndarray) for _, value in leaves(body)):
             valid &= _is_body(body, reach)
     if columns.payload is not None:
         mass = mass + columns.payload.mass
@@ -107,14 +107,6 @@ def _components(values: Array) -> Any:
     if values.ndim == 1:
         return values
     return tuple(_components(np.ascontiguousarray(values[:, i])) for i in range(values.shape[1]))
-
-
-def _numbers(value: Any) -> Iterator[Any]:
-    if isinstance(value, (float, np.ndarray)):
-        yield value
-    elif value is not None and not isinstance(value, str):
-        for entry in value if isinstance(value, tuple) else vars(value).values():
-            yield from _numbers(entry)
 
 
 def _is_base(v: Array) -> Mask:

@@ -65,7 +65,7 @@ def leaves(value: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     """Yield the place of each number or column of a tree, and what is there."""
     if isinstance(value, (float, np.ndarray)):
         yield place, value
-    elif value is not None:
+    elif value is not None and not isinstance(value, str):
         for name, entry in _entries(value):
             yield from leaves(entry, (*place, name))
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.quaternions import product
 from sst_ros.control.reference import REST
-from sst_ros.control.star_motions import product
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression
 from sst_ros.mechanism.generic_math import (

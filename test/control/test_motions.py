@@ -11,8 +11,8 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
+from sst_ros.control.quaternions import product
 from sst_ros.control.reference_motions import MotionSamples, recorded, reference_motion, waypoints
-from sst_ros.control.star_motions import product
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import (
