@@ -175,7 +175,7 @@ class TrajectoryFollower:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Root of the mean square and largest of all errors of the motion so far [rad]."""
+        """Root of the mean square and largest of all errors of the motion up to now [rad]."""
         self._add_rows()
         return self._sums.rms, self._sums.largest
 
