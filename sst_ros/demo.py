@@ -19,7 +19,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.report import tracking
 from sst_ros.report.run import report
-from sst_ros.report.verdict import text
+from sst_ros.report.text import text
 from sst_ros.scene import scene
 
 EXAMPLES = ("example1", "example2")

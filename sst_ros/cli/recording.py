@@ -76,8 +76,7 @@ def add_recover(commands: Commands) -> None:
 def _report(options: argparse.Namespace) -> None:
     out = free_out(options, results_folder(options.bag, "report"))
     from sst_ros.report.run import report
-    from sst_ros.report.table import table
-    from sst_ros.report.verdict import text
+    from sst_ros.report.text import table, text
 
     summary = report(options.bag, out, damaged=options.damaged)
     if options.verbose:

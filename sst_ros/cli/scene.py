@@ -90,8 +90,7 @@ def _schema(_: argparse.Namespace) -> None:
 
 
 def _describe(options: argparse.Namespace) -> None:
-    from sst_ros.description.ros2_control import urdf_with_ros2_control
-    from sst_ros.description.urdf import urdf
+    from sst_ros.description.urdf import urdf, urdf_with_ros2_control
     from sst_ros.scene.scene import load
 
     write = urdf_with_ros2_control if options.ros2_control else urdf

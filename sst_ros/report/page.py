@@ -31,7 +31,7 @@ from sst_ros.plot.run_figures import (
 from sst_ros.plot.style import positive
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
-from sst_ros.report.table import made_line, table
+from sst_ros.report.text import made_line, table
 from sst_ros.report.timing import Timing
 
 ESTIMATES = (

@@ -14,7 +14,7 @@ from sst_ros.plot.run_figures import draw_errors
 from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import formulation, page, reference, summary, timing, verdict
+from sst_ros.report import formulation, page, reference, summary, text, timing
 from sst_ros.report.reference import Comparison
 from sst_ros.report.timing import Timing
 
@@ -47,7 +47,7 @@ def evaluate(run: Recording) -> RunEvaluation:
         integration, ideal = reference.integration(run), beside.result()
     result = summary.summarise(run, integration, ideal, formulation.check(run))
     result |= timing.numbers(measured)
-    found = verdict.reasons(result)
+    found = text.reasons(result)
     result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
     return RunEvaluation(measured, integration, ideal, result)
 
@@ -61,7 +61,7 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
         damaged: evaluate what is intact of a damaged recording.
 
     Returns:
-        The summary, as written; `verdict.text` makes the short text of it, `table.table` the whole.
+        The summary, as written; `text.text` makes the short text of it, `text.table` the whole.
 
     Raises:
         InputError: the bag is no whole recording of a run, or `out` cannot be written.
@@ -76,8 +76,8 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
         result["pictures"] = [path.name for path in drawn]
         result["page"] = [PAGE, HTML]
         page.write(result, out / PAGE, drawn, out / HTML)
-        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
-        (out / SUMMARY).write_text(text, encoding="utf-8")
+        document = json.dumps(result, indent=2, allow_nan=False) + "\n"
+        (out / SUMMARY).write_text(document, encoding="utf-8")
     return result
 
 

@@ -23,9 +23,7 @@ from sst_ros.recording.time_series import NANOSECONDS
 from sst_ros.report import tracking
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.states import begins, lags
-from sst_ros.report.verdict import ERROR_LIMIT_RAD
-
-QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
+from sst_ros.report.text import ERROR_LIMIT_RAD, QUANTITIES
 
 
 def summarise(

@@ -8,8 +8,7 @@ import pytest
 import yaml
 
 from sst_ros.__main__ import main
-from sst_ros.description.ros2_control import urdf_with_ros2_control
-from sst_ros.description.urdf import urdf
+from sst_ros.description.urdf import urdf, urdf_with_ros2_control
 from sst_ros.scene.scene import load
 
 ACTUATORS = ["gamma_1", "gamma_2", "gamma_3"]

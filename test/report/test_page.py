@@ -12,7 +12,7 @@ from matplotlib import image
 from sst_ros.recording import recording
 from sst_ros.report import page, reference, timing
 from sst_ros.report.run import evaluate, report
-from sst_ros.report.table import table
+from sst_ros.report.text import table
 from sst_ros.scene import scene
 
 LATENCY_NS = 400_000

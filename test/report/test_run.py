@@ -12,7 +12,7 @@ from matplotlib import image
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
 from sst_ros.report.run import evaluate, report
-from sst_ros.report.table import table
+from sst_ros.report.text import table
 from sst_ros.scene import scene
 
 

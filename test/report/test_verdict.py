@@ -9,7 +9,7 @@ import pytest
 from sst_ros import __main__ as cli
 from sst_ros.recording import recording
 from sst_ros.report.run import evaluate
-from sst_ros.report.verdict import text
+from sst_ros.report.text import text
 from sst_ros.scene import scene
 
 
