@@ -7,6 +7,7 @@ temporary folder, compiled by gcc, and forgotten.
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import re
 import shutil
@@ -112,12 +113,6 @@ def _assignment(line: str) -> list[str]:
 
 
 def _split(text: str) -> list[str]:
-    """Split at commas that are not inside parentheses."""
-    parts, depth = [""], 0
-    for letter in text:
-        depth += (letter == "(") - (letter == ")")
-        if letter == "," and depth == 0:
-            parts.append("")
-        else:
-            parts[-1] += letter
-    return [part.strip() for part in parts]
+    """Split the entries of a tuple."""
+    entries = ast.parse(f"({text},)", mode="eval").body
+    return [ast.unparse(entry) for entry in ast.iter_child_nodes(entries) if entry._fields]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from models import FAST
 from trees import changed
 
-from sst_ros.cli.scene_check import check
+from sst_ros.cli.scene import check
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import Scene, names
 from sst_ros.scene.yaml_document import dump, read

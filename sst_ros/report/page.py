@@ -122,7 +122,7 @@ def overview(
         ],
         seconds[-1],
         f"Run of {recording.scene.name}: {seconds[-1]:g} s, {count} samples",
-        made_line(summary),
+        made_line(summary["report"]),
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def write(summary: dict[str, Any], page: Path, pictures: Sequence[Path], out: Pa
         f"<h2>Numbers</h2><pre>{html.escape(table(summary))}</pre>",
         "<h2>Motion</h2><div class='some'>",
         *(_picture(path, path.stem.replace("_", " ")) for path in pictures),
-        f"</div><footer>{html.escape(made_line(summary))}</footer></body></html>\n",
+        f"</div><footer>{html.escape(made_line(summary['report']))}</footer></body></html>\n",
     ]
     out.write_text("\n".join(parts), encoding="utf-8")
 

@@ -169,15 +169,22 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
         yield from (f"Note: {note}." for note in summary["notes"])
     yield from (f"Not known: {words}." for words in summary["unknown"])
     yield ""
-    yield made_line(summary)
+    yield made_line(summary["report"])
 
 
-def made_line(summary: dict[str, Any]) -> str:
-    """Return versions, machine and date in one line."""
-    made = summary["report"]
+def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:
+    """Return versions, machine and date of a report in one line.
+
+    Args:
+        made: as in `summary.made_on`.
+        compiled: whether numba was used; None for wherever it is installed.
+
+    """
+    used = bool(made["numba"]) if compiled is None else compiled
+    numba = f", numba {made['numba']}" if used else ", plain Python"
     return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}, NumPy {made['numpy']}, "
-        f"{made['platform']}, {made['processors']} processors, {made['date']}"
+        f"sst_ros {made['sst_ros']}, Python {made['python']}{numba}, NumPy {made['numpy']}, "
+        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
     )
 
 

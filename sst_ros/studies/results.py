@@ -12,6 +12,7 @@ from sst_ros.extras import require
 from sst_ros.output_folder import writing
 from sst_ros.plot.style import save_figure
 from sst_ros.report.summary import made_on
+from sst_ros.report.text import made_line
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,13 +56,7 @@ def provenance(*, compiled: bool | None = None) -> str:
         compiled: whether numba was used; None for wherever it is installed.
 
     """
-    on = made_on()
-    compiled = bool(on["numba"]) if compiled is None else compiled
-    numba = f", numba {on['numba']}" if compiled else ", plain Python"
-    return (
-        f"sst_ros {on['sst_ros']}, Python {on['python']}{numba}, NumPy {on['numpy']}, "
-        f"{on['processor']}, {on['processors']} cores, {on['platform']}, {on['date']}"
-    )
+    return made_line(made_on(), compiled=compiled)
 
 
 def write(
