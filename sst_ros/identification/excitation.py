@@ -11,7 +11,6 @@ stroke, workspace, singularities, torque, rate and acceleration of the actuators
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -31,7 +30,6 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import cross, turned
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.motions import DesiredMotion, Waypoint
 from sst_ros.scene.scene import Scene
 
 SHARE = 0.9
@@ -213,20 +211,18 @@ class _Cost:
 
 def _scene(scene: Scene, series: FourierSeries, free: Array) -> Scene:
     """Return the scene with the motion as waypoints, quintic between them."""
-    rows = zip(series.times.tolist(), *(x.tolist() for x in series.at(free, series.times)),
-               strict=True)  # fmt: skip
+    names = ("gamma", "gamma_dot", "gamma_ddot")
     points = [
-        Waypoint(time=t, gamma=tuple(a), gamma_dot=tuple(b), gamma_ddot=tuple(c))
-        for t, a, b, c in rows
+        {"time": time, **dict(zip(names, row, strict=True))}
+        for time, *row in zip(series.times, *series.at(free, series.times), strict=True)
     ]
-    rest = (0.0, 0.0, 0.0)
-    points[-1] = dataclasses.replace(points[-1], gamma_dot=rest, gamma_ddot=rest)
-    notes = dict(scene.provenance) | {"motion": "designed to identify parameters: Fourier series"}
-    return dataclasses.replace(
-        scene,
-        initial=dataclasses.replace(scene.initial, gamma_dot=rest),
-        torque=None,
-        motion=DesiredMotion(waypoints=tuple(points)),
-        duration=series.duration,
-        provenance=tuple(notes.items()),
+    points[-1] |= dict.fromkeys(names[1:], (0.0, 0.0, 0.0))
+    return scene.with_values(
+        {
+            "initial.gamma_dot": 0.0,
+            "torque": None,
+            "motion": {"waypoints": points},
+            "duration": series.duration,
+            "provenance.motion": "designed to identify parameters: Fourier series",
+        }
     )

@@ -36,7 +36,7 @@ class TorqueProfile:
 
     def record(self) -> dict[str, Any] | None:
         """Numbers from which `profile_from` builds the same profile; None for a function."""
-        raise NotImplementedError
+        return None
 
     def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -152,10 +152,6 @@ class FunctionTorque(TorqueProfile):
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
-
-    def record(self) -> None:
-        """See `TorqueProfile`."""
-        return None
 
 
 def three(value: Any, name: str) -> Vector3:

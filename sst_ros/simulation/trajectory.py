@@ -23,6 +23,10 @@ __all__ = ["JOINTS", "Array", "Law", "Trajectory"]
 
 JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 
+_OF_THE_RUN = (
+    "scene", "status", "message", "method", "error_estimate", "_residual", "evaluations", "law",
+    "dense",
+)  # fmt: skip
 _FEW = 300
 """Samples below which a picture asks for more."""
 
@@ -72,22 +76,8 @@ class Trajectory(SampledMotion):
         if times.ndim != 1 or not np.all(inside):
             allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
             raise InputError("at", [Problem("t", t, allowed)])
-        y = integrated(self, times)
-        return Trajectory(
-            self.scene,
-            times,
-            y[:, :4],
-            y[:, 4:7],
-            y[:, 7:10],
-            status=self.status,
-            message=self.message,
-            method=self.method,
-            error_estimate=self.error_estimate,
-            energy_residual=self._residual,
-            evaluations=self.evaluations,
-            law=self.law,
-            dense=self.dense,
-        )
+        kept = {name: getattr(self, name) for name in _OF_THE_RUN}
+        return self._shared(kept | {"t": times}, integrated(self, times))
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with a row an instant and a column a number, units in its `attrs`."""
