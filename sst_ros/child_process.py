@@ -3,13 +3,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import itertools
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+from sst_ros.errors import SstError
 
 PARENT = "SST_ROS_PARENT"
 """Variable with the number of the process without which a node is to end."""
+
+_DOMAINS = 100
+_next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
 
 
 def start(command: str, given: dict[str, object], **more: Any) -> subprocess.Popen[str]:
@@ -21,15 +33,63 @@ def start(command: str, given: dict[str, object], **more: Any) -> subprocess.Pop
         more: for Popen.
 
     """
-    # A domain that the environment names is used as it is.
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    keep_domain()
     return subprocess.Popen(
         [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)],
         env={**os.environ, PARENT: str(os.getpid())},
         text=True,
         **more,
     )
+
+
+def keep_domain() -> None:
+    """Use the ROS domain that the environment names, or else one that this process then keeps.
+
+    Raises:
+        SstError: all domains from 1 to 100 are in use.
+
+    """
+    if "ROS_DOMAIN_ID" not in os.environ:
+        os.environ["ROS_DOMAIN_ID"] = str(_lock_domain()[0])
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Have nodes use a ROS domain that nothing else on this machine has, without the network.
+
+    Raises:
+        SstError: all domains from 1 to 100 are in use.
+
+    """
+    number, lock = _lock_domain()
+    ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
+    try:
+        yield number
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+        os.close(lock)
+
+
+def _lock_domain() -> tuple[int, int]:
+    """Return the number of a domain, and the descriptor that keeps it until it is closed."""
+    for _ in range(_DOMAINS):
+        number = 1 + next(_next) % _DOMAINS
+        path = Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}"
+        with contextlib.suppress(OSError):  # of another user
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(lock)
+                continue
+            return number, lock
+    raise SstError(f"all ROS domains from 1 to {_DOMAINS} are in use: set ROS_DOMAIN_ID")
 
 
 def words(given: dict[str, object]) -> list[str]:

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchmark.campaign.ledger import Budget, Ledger
+from benchmark.campaign.processes import domain
 
 COMMAND_BOUND_S = 30.0
 """A refusal takes a second; a command that does its work takes longer beside other work."""
@@ -106,8 +107,7 @@ WRONG = (
 def command_lines(budget: Budget, seed: int) -> Ledger:
     """Give wrong words to every verb: one line and a status other than 0, or usage."""
     ledger, rng = budget.ledger("command lines"), random.Random(seed)
-    env = {"ROS_DOMAIN_ID": "97", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with tempfile.TemporaryDirectory() as name:
+    with domain(), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
         (folder / "empty.yaml").write_text("")
@@ -115,13 +115,13 @@ def command_lines(budget: Budget, seed: int) -> Ledger:
         wrong = list(WRONG)
         count = budget.cases(150, least=8)
         for words in wrong if budget.share >= 1 else rng.sample(wrong, min(len(wrong), len(count))):
-            sst_ros(ledger, words, folder=folder, env=env, fails=True)
+            sst_ros(ledger, words, folder=folder, fails=True)
         words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]
         words_of += ["--out", "--force", "--scene", "\x1b[31m", "a" * 300, "../..", "~", "'"]
         for _ in range(len(count) - ledger.tried):
             verb = rng.choice(VERBS[:11])
             words = [verb, "--nosuchoption", *rng.choices(words_of, k=rng.randint(0, 3))]
-            sst_ros(ledger, words, folder=folder, env=env, fails=True)
+            sst_ros(ledger, words, folder=folder, fails=True)
     return ledger
 
 

@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import math
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,31 +30,15 @@ EXECUTABLES = Path(__file__).parents[2] / "executables"
 @contextmanager
 def domain() -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on localhost."""
-    before = dict(os.environ)
-    with contextlib.ExitStack() as stack:
-        number = _lock(stack)
-        os.environ.update(
-            ROS_DOMAIN_ID=str(number), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", SST_ROS_NUMBA="0"
-        )
+    before = os.environ.get("SST_ROS_NUMBA")
+    with child_process.own_domain() as number:
+        os.environ["SST_ROS_NUMBA"] = "0"
         try:
             yield number
         finally:
-            os.environ.clear()
-            os.environ.update(before)
-
-
-def _lock(stack: contextlib.ExitStack) -> int:
-    """Take a domain that no other part and no test on this machine has."""
-    for number in range(1, 101):
-        lock = (Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}").open("w")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
-        stack.callback(lock.close)
-        return number
-    raise RuntimeError("no ROS domain is free")
+            os.environ.pop("SST_ROS_NUMBA")
+            if before is not None:
+                os.environ["SST_ROS_NUMBA"] = before
 
 
 def start(command: str, patch: str = "", **given: object) -> subprocess.Popen[str]:

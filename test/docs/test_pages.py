@@ -2,7 +2,6 @@
 """Every block of every page runs, or is checked where it needs a ROS installation."""
 
 import contextlib
-import importlib.util
 import re
 import shlex
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
 
+from sst_ros import child_process
 from sst_ros.cli.main import NODES, parser
 
 PAGES = pages()
@@ -40,17 +40,6 @@ WITH_BLOCKS = [
 ]
 
 
-@contextlib.contextmanager
-def own_domain():
-    """A ROS domain of ours, as the tests of nodes take one."""
-    path = Path(__file__).parents[1] / "ros" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("sst_ros_test_nodes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    with module.own_domain() as number:
-        yield number
-
-
 @pytest.mark.ros
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("page", WITH_BLOCKS)
@@ -60,7 +49,10 @@ def test_every_block_of_a_page_runs(page, tmp_path):
         pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
     from docs.session import Session
 
-    with own_domain() as domain, contextlib.closing(Session(tmp_path, domain)) as session:
+    with (
+        child_process.own_domain() as domain,
+        contextlib.closing(Session(tmp_path, domain)) as session,
+    ):
         for block in blocks(page):
             session.run(block)
         session.settle()

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real nodes in real processes, each test in a ROS domain of its own on localhost."""
 
-import fcntl
-import itertools
 import os
 import select
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -29,8 +25,6 @@ from sst_ros.__main__ import main  # noqa: E402
 from sst_ros.description.headers import IDLE_FRAME_ID  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
 
-DOMAINS = itertools.cycle(range(1, 101))
-
 # A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -40,31 +34,14 @@ middleware.configure()
 
 @pytest.fixture
 def domain():
-    with own_domain() as number:
+    with child_process.own_domain() as number:
         yield number
 
 
 @pytest.fixture(scope="module")
 def domain_of_module():
-    with own_domain() as number:
+    with child_process.own_domain() as number:
         yield number
-
-
-@contextmanager
-def own_domain():
-    """In a domain that no other test run on this machine has: locked as long as it is used."""
-    for number in itertools.islice(DOMAINS, 100):
-        with (Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setenv("ROS_DOMAIN_ID", str(number))
-                patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-                yield number
-            return
-    raise AssertionError("no ROS domain is free")
 
 
 def children(process):

@@ -23,6 +23,8 @@ from launch import LaunchDescription  # noqa: E402
 from launch.actions import IncludeLaunchDescription  # noqa: E402
 from launch.launch_description_sources import PythonLaunchDescriptionSource  # noqa: E402
 
+from sst_ros import child_process  # noqa: E402
+
 LAUNCHES = {
     "simulate.launch.py": ({"scene": "swing", "duration": "0.0"}, "running", "stderr"),
     "view.launch.py": ({"browser": "false"}, "running", "stderr"),
@@ -75,7 +77,7 @@ def stand_in_for_ros2_control(prefix):
 @pytest.mark.launch_test
 @launch_testing.parametrize("name", LAUNCHES)
 def generate_test_description(name):
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    child_process.keep_domain()
     os.chdir(tempfile.mkdtemp())
     if name == "ros2_control.launch.py":
         stand_in_for_ros2_control(Path(tempfile.mkdtemp()))

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS domains of processes that start nodes."""
+
+import itertools
+import os
+import subprocess
+import sys
+
+import pytest
+
+from sst_ros import child_process
+from sst_ros.errors import SstError
+
+KEEP = """
+import os, sys
+from sst_ros import child_process
+child_process.keep_domain()
+print(os.environ["ROS_DOMAIN_ID"], os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"], flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_domain(monkeypatch):
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_two_at_the_same_time_differ_and_the_environment_comes_back():
+    with child_process.own_domain() as first:
+        assert os.environ["ROS_DOMAIN_ID"] == str(first)
+        with child_process.own_domain() as second:
+            assert os.environ["ROS_DOMAIN_ID"] == str(second) != str(first)
+        child_process.keep_domain()  # the environment names one
+        assert os.environ["ROS_DOMAIN_ID"] == str(first)
+    assert "ROS_DOMAIN_ID" not in os.environ
+
+
+def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", KEEP], **pipes) as process:
+        number, network = process.stdout.readline().split()
+        assert network == "LOCALHOST"
+        monkeypatch.setattr(child_process, "_next", itertools.repeat(int(number) - 1))
+        with pytest.raises(SstError, match="in use: set ROS_DOMAIN_ID"), child_process.own_domain():
+            pass
+        process.communicate()
+    with child_process.own_domain() as same:
+        assert str(same) == number
