@@ -14,7 +14,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -204,11 +204,11 @@ def control_study(
         for rate, method, hold in itertools.product(rates, methods, HOLDS)
         if problem.interval_ns % (NANOSECONDS // rate) == 0
     ]
-    rows = []
-    for part in slices(len(points), 1, f"{scene.name:<16}", shown):
-        rate, method, hold = points[part.start]
-        run = run_controlled(scene, rate, method, hold, problem.seconds, compiled=compiled)
-        rows.append(row_of(problem, reference, run))
+    run = partial(run_controlled, scene, seconds=problem.seconds, compiled=compiled)
+    rows = [
+        row_of(problem, reference, run(*points[part.start]))
+        for part in slices(len(points), 1, f"{scene.name:<16}", shown)
+    ]
     if recorded is not None:
         pairs = itertools.product(NODE_RATES, (START, MIDDLE))
         rows += [row_of(problem, reference, recorded(*pair), NODES) for pair in pairs]
@@ -232,17 +232,15 @@ def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
     late = "; ".join(f"{name}, below {rate:g} Hz,"
                      for name, rate in study.least_rates.items() if rate > min(RATES))  # fmt: skip
-    largest = max((study.spread(hold) for hold in (START, MIDDLE)), default=math.nan)
+    largest = max(map(study.spread, (START, MIDDLE)))
     if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
         return (
             f"the methods differ by up to {largest:.2g} times at the same rate: choose a finer "
             "method or tolerance first"
         )
-    least = study.resolved(START).rate_Hz.min()
-    start, middle = (
-        rows[rows.rate_Hz == least].largest_rad.max()
-        for rows in map(study.resolved, (START, MIDDLE))
-    )
+    held = [study.resolved(hold) for hold in (START, MIDDLE)]
+    least = held[0].rate_Hz.min()
+    start, middle = (rows[rows.rate_Hz == least].largest_rad.max() for rows in held)
     other, own_errors = ("other ", f"; {late} has errors of its own") if late else ("", "")
     return (
         "raise the rate or command the torque of the middle of the hold; do not change the method: "

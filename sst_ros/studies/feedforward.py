@@ -50,8 +50,7 @@ if TYPE_CHECKING:
 REST_S = 0.3
 """Time for which a loop goes on after the motion, to see whether it settles [s]."""
 
-OPEN_LOOP = "feedforward"
-"""The mode that has no bandwidth."""
+OPEN_LOOP = "feedforward"  # the mode that has no bandwidth
 
 COLUMNS = (
     "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s", "seed",
