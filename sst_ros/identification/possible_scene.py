@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,20 +32,20 @@ def possible_scene(
 
     """
     wanted = dict(zip(names, numbers.tolist(), strict=True))
-    noted = {re.split(r"[.\[]", name)[0] for name in names}
+    sections = sorted({re.split(r"[.\[]", name)[0] for name in names})
+    notes = {f"provenance.{section}": note for section in sections}
     try:
-        changed = scene.with_values(wanted)
-        return _with_notes(changed, noted, note), numbers, ()
+        return scene.with_values({**wanted, **notes}), numbers, ()
     except InputError:
         inertias = {name: wanted.pop(name) for name in names if ".inertia." in name}
         if not inertias:
             raise
     changed = scene.with_values(wanted)
     found = _nearest_inertias(changed, list(inertias), np.array(list(inertias.values())))
-    adjusted = changed.with_values(found)
+    adjusted = changed.with_values({**found, **notes})
     values = np.array([value_of(adjusted, name) for name in names], dtype=float)
     warning = "no bodies have the inertias that fit best: the scene has the nearest"
-    return _with_notes(adjusted, noted, note), values, (warning,)
+    return adjusted, values, (warning,)
 
 
 def _nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dict[str, float]:
@@ -68,8 +67,3 @@ def _nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dic
     fit = LinearFit(numbers, covariance, root, np.ones(3), np.zeros((0, 3)), 1.0)
     values, _ = consistent_values(entries, given, base, fit, 1.0)
     return dict(zip(entries, values.tolist(), strict=True))
-
-
-def _with_notes(scene: Scene, sections: Iterable[str], note: str) -> Scene:
-    notes = dict(scene.provenance) | dict.fromkeys(sorted(sections), note)
-    return replace(scene, provenance=tuple(notes.items()))
