@@ -14,7 +14,7 @@ from bags import bags, example2, written
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.integration import batch, batch_source, codegen
 
-pytest_plugins = ["unexpected_skips"]
+pytest_plugins = ["pytester", "unexpected_skips"]
 __all__ = ["bags", "browser", "example2", "written", "wrong_kernel"]
 
 
@@ -50,6 +50,14 @@ def interpreted(monkeypatch):
         monkeypatch.setattr(module, "codegen", plain)
     for module in (batch, batch_source, controlled_batch):
         monkeypatch.setattr(module, "SIMD_WIDTH", 4)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are made, but not rendered: their files are empty."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
 
 
 @pytest.fixture

@@ -22,7 +22,14 @@ class Blocker:
 
 sys.meta_path.insert(0, Blocker())
 from sst_ros.__main__ import main
-sys.exit(main({words!r}))
+
+def status(words):
+    try:
+        return main(words)
+    except SystemExit as end:
+        return end.code
+
+sys.exit(max(map(status, {commands!r})))
 """
 OPTIONAL = (
     "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba", "mpmath",
@@ -200,7 +207,7 @@ def test_a_reader_that_leaves_is_no_error():
 def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
     """After a plain installation, every path ends in the line that says what to install."""
     done = subprocess.run(
-        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, words=words)],
+        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, commands=[words])],
         capture_output=True, text=True, timeout=60, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
@@ -214,13 +221,11 @@ def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "words", [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
-              ["describe"], ["--version"], []], ids=" ".join,
-)  # fmt: skip
-def test_what_needs_no_extra_runs_without_any(words):
+def test_what_needs_no_extra_runs_without_any():
+    commands = [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
+                ["describe"], [], ["--version"]]  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, words=words)],
+        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, commands=commands)],
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

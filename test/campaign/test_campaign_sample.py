@@ -7,9 +7,16 @@ from benchmark.campaign.ledger import Ledger
 from benchmark.campaign.parts import PARTS, run
 
 ROS = {"damages", "recorder_kills", *(part for part, room in PARTS.items() if room == "nodes")}
+QUICK = {"messages", *(PARTS.keys() - ROS)}
 
 
-@pytest.mark.parametrize("part", sorted(PARTS))
+@pytest.mark.parametrize(
+    "part",
+    [
+        part if part in QUICK else pytest.param(part, marks=pytest.mark.slow)
+        for part in sorted(PARTS)
+    ],
+)
 def test_nothing_is_found_in_a_share_of(part):
     if part in ROS:
         pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")

@@ -29,7 +29,9 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("actuators", [None, Actuators(time_constant=0.02)])
+@pytest.mark.parametrize(
+    "actuators", [pytest.param(None, marks=pytest.mark.slow), Actuators(time_constant=0.02)]
+)
 def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuators):
     recorded = replace(load_scene("example2"), actuators=actuators)
     guess = tmp_path / "guess.yaml"

@@ -84,6 +84,7 @@ def test_200_recordings_are_covered_by_their_95_percent_intervals():
     assert np.abs(z.mean(axis=0)).max() < 0.3
 
 
+@pytest.mark.slow
 def test_a_short_recording_is_biased_by_less_than_the_standard_deviation():
     """In 1.2 s of `reach` the star hardly turns about its axis; torques have little noise."""
     plant = load_scene("reach")

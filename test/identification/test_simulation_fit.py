@@ -164,7 +164,7 @@ def test_sensitivities_across_a_bounce_are_those_of_50_digit_differences(name, m
     assert np.abs(slopes[0, :, 0] - expected).max() < 1e-10 * max(map(abs, expected))
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ["bodies", pytest.param("loads", marks=pytest.mark.slow)])
 def test_sensitivities_are_those_of_50_digit_differences(case):
     build, names = CASES[case]
     scene = build()

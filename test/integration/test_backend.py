@@ -59,6 +59,7 @@ def cache(tmp_path_factory, truth):
 
 
 @needs_numba
+@pytest.mark.slow
 def test_two_processes_that_start_at_once_share_one_cache(cache):
     assert len(list(cache.glob("sst_*.py"))) == 1
     assert {path.suffix for path in cache.iterdir()} == {".py", ""}
@@ -66,6 +67,7 @@ def test_two_processes_that_start_at_once_share_one_cache(cache):
 
 
 @needs_numba
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing(cache, truth):
     before = {path: path.stat().st_mtime_ns for path in (cache / "__pycache__").glob("*.nb[ic]")}
     assert ended(started(cache))[0] == f"{truth} True"

@@ -71,7 +71,7 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
     assert differences([pair[0], other]).iloc[0].tolist()[:2] == [1, 151]
 
 
-def test_the_command_draws_and_tells(pair, tmp_path, capsys):
+def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
     words = ["plot", "--compare", *(str(run.path) for run in pair), "--out", str(tmp_path)]
     assert cli.main(words) == 0
     said = capsys.readouterr().out

@@ -140,7 +140,7 @@ def whole(bag):
     return run, run.scene
 
 
-def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2, capsys):
+def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2, capsys, undrawn):
     kept = bags.without(example2, bags.ORIENTATION, bags.EULER, bags.APPLIED, bags.COMMANDS)
     bag, out = bags.write(tmp_path / "bag", kept), tmp_path / "out"
     assert cli.main(["plot", str(bag), "--out", str(out)]) == 0
@@ -152,7 +152,7 @@ def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2,
     assert "energy: the bag has no orientation, no applied_torques\n" in said
 
 
-def test_one_picture_may_be_asked_for(run, tmp_path, capsys):
+def test_one_picture_may_be_asked_for(run, tmp_path, capsys, undrawn):
     words = ["plot", str(run.path), "--out", str(tmp_path), "--only", "phase"]
     assert cli.main(words) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["phase.pdf", "phase.png"]

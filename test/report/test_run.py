@@ -81,7 +81,7 @@ def test_the_pictures_are_pictures(whole):
 def test_loss_is_counted_and_survived(tmp_path, bags, example2):
     lost = {20, 21, 60, 150}  # the last one can only be missed by what was published
     kept = [e for e in bags.without(example2, bags.COMMANDS) if e.sample not in lost]
-    summary = report(bags.write(tmp_path / "bag", kept), tmp_path / "out")
+    summary = evaluate(recording.read(bags.write(tmp_path / "bag", kept))).summary
     assert summary["samples_published"] == 151 and summary["samples_recorded"] == 147
     assert (summary["samples_lost"], summary["stamp_gaps"]) == (4, 2)
     assert summary["samples_missing_between_stamps"] == 3
@@ -104,7 +104,7 @@ def test_what_is_not_recorded_is_unknown(tmp_path, bags, example2):
     assert line.split()[-1] == "-"
 
 
-def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags):
+def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
     start = scene.Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
     near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
     entries = bags.simulated(near, 0.3)

@@ -79,7 +79,9 @@ def test_tracking_figures_are_there_where_there_is_a_reference(tmp_path, bags, e
     assert any(line.strip().startswith("settling time") for line in lines)
 
 
-def test_the_command_prints_verdict_and_files_and_all_when_asked(tmp_path, bags, example2, capsys):
+def test_the_command_prints_verdict_and_files_and_all_when_asked(
+    tmp_path, bags, example2, capsys, undrawn
+):
     bag = bags.record(tmp_path / "bag", example2)
     assert cli.main(["report", "run", str(bag)]) == 0
     short = capsys.readouterr().out

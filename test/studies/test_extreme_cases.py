@@ -48,7 +48,13 @@ def finite(state):
     return all(map(math.isfinite, (*state.quaternion, *state.body_rate, *joints)))
 
 
-@pytest.mark.parametrize("case", CASES, ids=[case.name.replace(" ", "-") for case in CASES])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.slow if number % 3 else (), id=case.name)
+        for number, case in enumerate(CASES)
+    ],
+)
 def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     began = time.perf_counter()
     done = extreme_cases.run(case)

@@ -26,7 +26,7 @@ from sst_ros.studies.step_advice import step_advice
 from sst_ros.studies.term_costs import TERMS, costs, has, operations, operations_by_term, without
 
 EXAMPLE2 = load("example2_heavy")
-QUICK = ("example2", "elastic_stops", "friction", "general", "gravity_payload", "stiff", "swing")
+QUICK = ("elastic_stops", "friction", "general")
 every_scene = pytest.mark.parametrize(
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names()],

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import itertools
 import json
-from functools import cache
 
 import numpy as np
 import pytest
@@ -112,6 +111,7 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
 
 
+@pytest.mark.slow
 def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
     found = summary_of([short])
     assert found.target.tolist() == [1e-6, 1e-9, 1e-12]
@@ -122,11 +122,7 @@ def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
     assert "| example2_heavy | intermediate links | 51 |" in page([short], terms)
 
 
-@cache
-def brief():
-    return work_precision(BRIEF, compiled=False, longest_s=0.0)
-
-
+@pytest.mark.slow
 def test_a_scene_that_rests_has_no_fastest_setting():
     """A controller drives it; without torques every setting is right to rounding."""
     spiral = work_precision(dataclasses.replace(scene.load("spiral"), duration=0.2), compiled=False)
@@ -135,13 +131,13 @@ def test_a_scene_that_rests_has_no_fastest_setting():
     assert "| spiral | at rest |" in shown and "accuracy_spiral.png" not in shown
 
 
-def graded(*errors):
+def graded(study, *errors):
     """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
     rows = [
         {"method": "dop853", "kind": FIXED, "setting": 0.5**k, "wall_min_s": 1e-3 * (k + 1),
          ERROR: error} for k, error in enumerate(errors)
     ]  # fmt: skip
-    return dataclasses.replace(brief(), rows=table(rows, COLUMNS))
+    return dataclasses.replace(study, rows=table(rows, COLUMNS))
 
 
 @pytest.mark.parametrize(
@@ -154,8 +150,8 @@ def graded(*errors):
         ((1e-3, 1e-4), None),
     ],
 )
-def test_a_setting_counts_only_if_every_finer_one_is_as_good(errors, chosen):
-    best = graded(*errors).best(1e-6)
+def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chosen):
+    best = graded(short, *errors).best(1e-6)
     assert (None if best is None else best.setting) == (None if chosen is None else 0.5**chosen)
 
 
@@ -186,6 +182,7 @@ def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
     assert any("paper's equations" in words for words in found.warnings)
 
 
+@pytest.mark.slow
 def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
     found = work_precision(stiff, compiled=False, longest_s=0.005)
@@ -197,6 +194,7 @@ def test_failures_stay_in_sight(tmp_path):
     save_figure(figure(found), tmp_path / "picture.png")
 
 
+@pytest.mark.slow
 def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
     """No method errs there, and a logarithm of that does not exist."""
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)

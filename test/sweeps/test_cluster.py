@@ -124,6 +124,7 @@ def until(condition):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
     processes.environment |= {"SST_ROS_CACHE": str(tmp_path / "empty")}
     processes.add_worker()

@@ -47,7 +47,7 @@ def test_correlations_are_spearmans(folder):
     assert list(found.abs()) == sorted(found.abs(), reverse=True)
 
 
-def test_plot_draws_the_pictures(folder, tmp_path, capsys):
+def test_plot_draws_the_pictures(folder, tmp_path, capsys, undrawn):
     assert run(["sweep", "plot", str(folder / "out"), "--out", str(tmp_path)]) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["distributions.png", "early_ends.png", "worst.png"]

@@ -61,6 +61,7 @@ def test_hold_seek_and_speed(bag, monkeypatch):
 
 
 @pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_page_of_a_bag(bag, browser):
     command = [sys.executable, "-m", "sst_ros", "view", str(bag), "--port", "18180"]
