@@ -128,6 +128,7 @@ def _feedback_rows(feedback: SampledFeedback | None) -> dict[str, int]:
 
 
 def _loaded(feedback: SampledFeedback | None, at: Layout) -> list[str]:
+    # In a loop of its own: one over the arrays of the state, too, compiles for minutes.
     if feedback is None:
         return []
     kinds = {"memory": feedback.memory, "gains": feedback.gains}

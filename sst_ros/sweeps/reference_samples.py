@@ -17,7 +17,8 @@ REFERENCES = (
     ("first", 1), ("gamma", 3), ("gamma_dot", 3), ("gamma_ddot", 3), ("feedforward", 3),
     ("held_feedforward", 3), ("quaternion", 4), ("body_rate", 3), ("body_acceleration", 3),
 )  # fmt: skip
-Group = dict[str, tuple[Any, ...]]
+Group = dict[str, Any]
+"""Tuples of numbers by name."""
 
 
 def reference_table(loop: ControlledRun, samples: int) -> Array:

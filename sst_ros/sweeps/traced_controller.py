@@ -9,7 +9,7 @@ What the scheme does not use has no operation.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,19 @@ GAINS = (
 )  # fmt: skip
 
 
+class _Sample(NamedTuple):
+    """What the controller has at a sample: references, measurement, errors, memory, gains."""
+
+    given: Group
+    gamma: Any
+    gamma_dot: Any
+    error: Any
+    rates: Any
+    observed: Any
+    memory: Group
+    gains: Group
+
+
 class TracedController(NamedTuple):
     """A control loop's controller and channel, as a function of expressions.
 
@@ -60,11 +73,6 @@ class TracedController(NamedTuple):
     loop: ControlledRun
     limited: bool
     memory: tuple[tuple[str, int], ...]
-
-    @property
-    def observes(self) -> bool:
-        """Whether the scheme needs the orientation at the measured angles."""
-        return self.loop.settings.mode in ("gravity_pd", "computed_torque")
 
     def __call__(
         self, model: kernel.Model, state: Sequence[Any], given: Group, memory: Group, gains: Group,
@@ -82,15 +90,15 @@ class TracedController(NamedTuple):
 
         """
         joints = kernel.joints(model, tuple(state))
-        true = _three(joints.gamma)
+        true = _tuple(joints.gamma)
         gamma, gamma_dot, before = self._measured(
-            true, _three(joints.gamma_dot), memory, gains, noise
+            true, _tuple(joints.gamma_dot), memory, gains, noise
         )
-        error = axpy(1.0, _three(given["gamma"]), -1.0, gamma)
-        rates = axpy(1.0, _three(given["gamma_dot"]), -1.0, gamma_dot)
+        error = axpy(1.0, given["gamma"], -1.0, gamma)
+        rates = axpy(1.0, given["gamma_dot"], -1.0, gamma_dot)
         observed = self._observed(gamma, memory)
         command, limited, integral = self._command(
-            observed, gamma, gamma_dot, error, rates, given, memory, gains
+            _Sample(given, gamma, gamma_dot, error, rates, observed, memory, gains)
         )
         queue = memory.get("queue", ())
         first = given["first"][0]
@@ -98,12 +106,12 @@ class TracedController(NamedTuple):
             commands = command * (len(queue) // 3)
             pairs = zip(queue, commands, strict=True)
             filled = [first * c + (1.0 - first) * q for q, c in pairs]
-            torque, queue = _three(filled[:3]), (*filled[3:], *command)
+            torque, queue = _tuple(filled[:3]), (*filled[3:], *command)
         else:
             torque = command
         if self.limited:
-            torque = _three(_clamped(tau, gains["plant_limit"][0]) for tau in torque)
-        off = axpy(1.0, _three(given["gamma"]), -1.0, true)
+            torque = _tuple(_clamped(tau, gains["plant_limit"][0]) for tau in torque)
+        off = axpy(1.0, given["gamma"], -1.0, true)
         new: Group = {
             "integral": integral,
             "queue": tuple(queue),
@@ -124,25 +132,25 @@ class TracedController(NamedTuple):
         channel, before = self.loop.channel, ()
         if channel.counts:
             step = 2.0 * math.pi / channel.counts
-            gamma = before = _three(step * ((angle / step + _ROUND) - _ROUND) for angle in gamma)
+            gamma = before = _tuple(step * ((angle / step + _ROUND) - _ROUND) for angle in gamma)
             pairs = zip(gamma, memory["before"], strict=True)
-            gamma_dot = _three((x - y) / channel.period for x, y in pairs)
+            gamma_dot = _tuple((x - y) / channel.period for x, y in pairs)
         if noise:
             angle, rate = gains["angle_noise"][0], gains["rate_noise"][0]
-            gamma = _three(x + n * angle for x, n in zip(gamma, noise[:3], strict=True))
-            gamma_dot = _three(x + n * rate for x, n in zip(gamma_dot, noise[3:], strict=True))
+            gamma = _tuple(x + n * angle for x, n in zip(gamma, noise[:3], strict=True))
+            gamma_dot = _tuple(x + n * rate for x, n in zip(gamma_dot, noise[3:], strict=True))
         return gamma, gamma_dot, before
 
     def _observed(self, gamma: Any, memory: Group) -> tuple[Any, ...]:
-        """Quaternion at the measured angles, in the assembly mode of the last one."""
-        if not self.observes:
+        """Quaternion at the measured angles in the last assembly mode; none if not needed."""
+        if not memory["observed"]:
             return ()
         geometry = Geometry.of(self.loop.model)
         space = ActuatorSpaceMap(geometry)
         across = np.cross(geometry.w, geometry.v)
         carriages: list[Any] = []
         for k, angle in enumerate(gamma):
-            c, s = _cos(angle), sin(angle)
+            c, s = angle.traced("cos"), sin(angle)
             pairs = zip(geometry.v[k].tolist(), across[k].tolist(), strict=True)
             carriages += [c * x + s * y for x, y in pairs]
         q: tuple[Any, ...] = memory["observed"]
@@ -150,75 +158,68 @@ class TracedController(NamedTuple):
             q = space.newton_step(*q, *carriages)[:4]
         return q
 
-    def _command(
-        self, q: tuple[Any, ...], gamma: Any, gamma_dot: Any, error: Any, rates: Any, given: Group,
-        memory: Group, gains: Group,
-    ) -> tuple[Any, Any, Any]:  # fmt: skip
+    def _command(self, at: _Sample) -> tuple[Any, Any, Any]:
         """Return the limited command, whether it was limited, and the new integral."""
         settings, mode = self.loop.settings, self.loop.settings.mode
         feedforward, feedback, summed = ZERO, ZERO, ZERO
         model = kernel.model_of(self.loop.model)
         if mode == "gravity_pd":
-            feedforward, _ = kernel.actuator_torque(model, _four(q), REST, REST)
+            feedforward, _ = kernel.actuator_torque(model, at.observed, REST, REST)
         elif mode != "pd":
-            feedforward = _three(given["feedforward"])
+            feedforward = at.given["feedforward"]
         if mode == "computed_torque":
-            total, summed = self._computed(
-                model, q, gamma, gamma_dot, error, rates, given, memory, gains
-            )
+            total, summed = self._computed(model, at)
             feedback = axpy(1.0, total, -1.0, feedforward)
         elif mode != "feedforward":
-            acceleration, summed = self._feedback(error, rates, memory, gains)
-            feedback = _three(m * a for m, a in zip(gains["inertia"], acceleration, strict=True))
+            acceleration, summed = _feedback(at.error, at.rates, at)
+            feedback = _tuple(m * a for m, a in zip(at.gains["inertia"], acceleration, strict=True))
         if settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
-            feedforward = _three(given["held_feedforward"])
+            feedforward = at.given["held_feedforward"]
         total = added(feedforward, feedback)
         torque, limited, free = total, 0.0, 1.0
         if self.limited:
-            torque = _three(_clamped(tau, gains["limit"][0]) for tau in total)
+            torque = _tuple(_clamped(tau, at.gains["limit"][0]) for tau in total)
             cut = axpy(1.0, total, -1.0, torque)
-            free = 1.0 - _above(dot(cut, error))
+            free = 1.0 - _above(dot(cut, at.error))
             limited = _above(dot(cut, cut))
         rate = free * self.loop.channel.period
-        integral = memory.get("integral", ())
+        integral = at.memory.get("integral", ())
         if integral:
             integral = tuple(s + rate * x for s, x in zip(integral, summed, strict=True))
         return torque, limited, integral
 
-    def _computed(
-        self, model: kernel.Model, q: tuple[Any, ...], gamma: Any, gamma_dot: Any, error: Any,
-        rates: Any, given: Group, memory: Group, gains: Group,
-    ) -> tuple[Any, Any]:  # fmt: skip
+    def _computed(self, model: kernel.Model, at: _Sample) -> tuple[Any, Any]:
         """Torque of computed_torque, and the error to integrate."""
-        acceleration, summed = self._feedback(error, rates, memory, gains)
-        wanted = added(_three(given["gamma_ddot"]), acceleration)
+        acceleration, summed = _feedback(at.error, at.rates, at)
+        wanted = added(at.given["gamma_ddot"], acceleration)
         space = ActuatorSpaceMap(Geometry.of(self.loop.model))
-        now = space.star_accelerations(*q, *gamma_dot, *wanted)
-        body_rate, body_acceleration = _three(now[:3]), _three(now[3:])
+        now = space.star_accelerations(*at.observed, *at.gamma_dot, *wanted)
+        body_rate, body_acceleration = _tuple(now[:3]), _tuple(now[3:])
         if self.loop.settings.space == "so3":
-            x, y, z, w = q
-            between = product((-x, -y, -z, w), _four(given["quaternion"]))
-            turn = rotation_rows(_four(between))
+            x, y, z, w = at.observed
+            between = product((-x, -y, -z, w), at.given["quaternion"])
+            turn = rotation_rows(between)
             rate, forward = (
-                _three(dot(row, _three(given[name])) for row in turn)
+                _tuple(dot(row, at.given[name]) for row in turn)
                 for name in ("body_rate", "body_acceleration")
             )
             moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
             summed = _rotation_vector(between)
             slope = axpy(1.0, rate, -1.0, body_rate)
-            acceleration, summed = self._feedback(summed, slope, memory, gains)
+            acceleration, summed = _feedback(summed, slope, at)
             body_acceleration = added(moving, acceleration)
-        torque, _ = kernel.actuator_torque(model, _four(q), body_rate, body_acceleration)
+        torque, _ = kernel.actuator_torque(model, at.observed, body_rate, body_acceleration)
         return torque, summed
 
-    def _feedback(self, error: Any, rates: Any, memory: Group, gains: Group) -> tuple[Any, Any]:
-        """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
-        leaning = error
-        if memory.get("integral"):
-            leaning = axpy(1.0, error, gains["integral_rate"][0], _three(memory["integral"]))
-        proportional = _three(k * e for k, e in zip(gains["kp"], leaning, strict=True))
-        derivative = _three(k * e for k, e in zip(gains["kd"], rates, strict=True))
-        return added(proportional, derivative), error
+
+def _feedback(error: Any, rates: Any, at: _Sample) -> tuple[Any, Any]:
+    """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
+    leaning, gains = error, at.gains
+    if at.memory.get("integral"):
+        leaning = axpy(1.0, error, gains["integral_rate"][0], at.memory["integral"])
+    proportional = _tuple(k * e for k, e in zip(gains["kp"], leaning, strict=True))
+    derivative = _tuple(k * e for k, e in zip(gains["kd"], rates, strict=True))
+    return added(proportional, derivative), error
 
 
 def _rotation_vector(q: tuple[Any, ...]) -> Any:
@@ -243,15 +244,5 @@ def _above(value: Any) -> Any:
     return value.traced("step") if isinstance(value, Expression) else float(value > 0.0)
 
 
-def _cos(angle: Any) -> Any:
-    return angle.traced("cos")
-
-
-def _three(values: Any) -> Any:
-    first, second, third = values
-    return first, second, third
-
-
-def _four(values: Any) -> Any:
-    x, y, z, w = values
-    return x, y, z, w
+def _tuple(values: Iterable[Any]) -> Any:
+    return tuple(values)
