@@ -8,11 +8,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from types import SimpleNamespace
 
+import hypothesis
 import pytest
 from bags import bags, example2, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.integration import batch, batch_source, codegen
+
+# By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 pytest_plugins = ["pytester", "unexpected_skips"]
 __all__ = ["bags", "browser", "example2", "written", "wrong_kernel"]

@@ -25,7 +25,6 @@ from sst_ros.state import Assembly
 COUNT = 64
 FAST = settings(
     max_examples=60,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )

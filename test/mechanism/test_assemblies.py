@@ -146,7 +146,7 @@ def test_none_of_the_arrays_can_be_written_to():
             array[0] = 1.0
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(SEEDS)
 def test_direct_of_inverse_is_the_orientation_again(seed):
     rng = np.random.default_rng(seed)
@@ -162,7 +162,7 @@ def test_direct_of_inverse_is_the_orientation_again(seed):
     np.testing.assert_allclose(best.beta, beta, rtol=1e-12, atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(SEEDS)
 def test_inverse_of_direct_is_gamma_again(seed):
     rng = np.random.default_rng(seed)

@@ -11,7 +11,7 @@ from sst_ros.mechanism import continuation, rates, virtual_work
 from sst_ros.mechanism.equation_of_motion import EquationOfMotion
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 2**32 - 1))
 def test_energy_momentum_and_both_dynamics_agree(seed):
     rng = np.random.default_rng(seed)

@@ -74,7 +74,7 @@ def case(seed):
     return (mechanism, gamma, rotation, *rng.normal(size=(3, 3)) * [[2.0], [1.0], [1.0]])
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.integers(0, 2**32 - 1))
 def test_constraint_moments_are_the_multipliers(seed):
     mechanism, gamma, rotation, rate, torque, moment = case(seed)
@@ -94,7 +94,7 @@ def test_constraint_moments_are_the_multipliers(seed):
     assert not found.actuated.flags.writeable
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_accelerations_are_those_of_the_model(seed):
     mechanism, gamma, rotation, rate, torque, moment = case(seed)

@@ -3,7 +3,7 @@
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
@@ -119,13 +119,11 @@ def test_help_has_every_parameter_with_default_and_bounds(command):
         assert spec.allowed() in text
 
 
-@settings(deadline=None)
 @given(st.text(st.characters(categories=["L", "N", "P", "S"]), min_size=1))
 def test_any_text_reaches_the_parameter_as_it_is(text):
     assert values("simulator", f"--scene={text}") == {"scene": text}
 
 
-@settings(deadline=None)
 @given(st.lists(st.text(max_size=12), max_size=4))
 def test_any_words_are_accepted_or_refused_in_words(words):
     try:

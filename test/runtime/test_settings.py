@@ -5,7 +5,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
@@ -28,7 +28,6 @@ class Clock:
 
 
 @pytest.mark.parametrize("name", CHANGEABLE)
-@settings(deadline=None)
 @given(value=st.floats())
 @example(value=5e-324)
 @example(value=1e-3)
@@ -45,7 +44,6 @@ def test_what_is_accepted_is_in_bounds(name, value):
     assert math.isfinite(getattr(changed, name))
 
 
-@settings(deadline=None)
 @given(st.floats(1e-3, 1000.0), st.sampled_from([1, 1000, 100_000]))
 def test_every_real_time_factor_has_deadlines(factor, rate):
     clock = Clock()
