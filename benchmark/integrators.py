@@ -17,13 +17,12 @@ import time
 from dataclasses import replace
 from statistics import median
 
-import numpy as np
-
 from benchmark import machine as described
 from benchmark.timing import interleaved
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 
@@ -51,12 +50,6 @@ def scenes():
     yield "example2_heavy, 1 s", replace(load("example2_heavy"), **free), 1.0
 
 
-def away(one, other):
-    p, q = np.array(one[:4]), np.array(other[:4])
-    distance = 2.0 * min(np.linalg.norm(p - q), np.linalg.norm(p + q))
-    return distance if math.isfinite(distance) else math.inf
-
-
 def counts_for(machine, arguments, truth, wanted, most):
     """Smallest power of two of steps that reaches the error; None where none does."""
     y, drive, span = arguments
@@ -66,7 +59,7 @@ def counts_for(machine, arguments, truth, wanted, most):
             end = machine.step_fixed(0.0, span / count, count, y, drive)
         except (ArithmeticError, ValueError):
             end = [math.nan] * 4
-        if away(end, truth) <= wanted:
+        if angle_between(end[:4], truth[:4]) <= wanted:  # nan is not
             return count
         count *= 2
     return None

@@ -16,6 +16,7 @@ import yaml
 from benchmark.campaign.ledger import Budget, Ledger
 from sst_ros import Simulation
 from sst_ros.errors import InputError, SstError
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import Scene, names, text_of
 from sst_ros.scene.yaml_document import read
 
@@ -227,7 +228,7 @@ def invariants(budget: Budget, seed: int) -> Ledger:
                 ledger.found("silent", f"{name}: closure {plain.closure_residual:.1e}")
             if not abs(plain.energy_residual) < 1e-7 * (1 + _energy(fine)):
                 ledger.found("silent", f"{name}: energy residual {plain.energy_residual:.1e} J")
-            error = _apart(plain, fine)
+            error = float(angle_between(plain.state.quaternion, fine.state.quaternion))
             if error > 1e-12 and error > 30 * plain.error_estimate + 30 * fine.error_estimate:
                 ledger.found(
                     "silent", f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
@@ -237,11 +238,6 @@ def invariants(budget: Budget, seed: int) -> Ledger:
 
 def _energy(simulation: Simulation) -> float:
     return sum(abs(x) for x in simulation.state.body_rate) ** 2
-
-
-def _apart(one: Simulation, other: Simulation) -> float:
-    a, b = one.state.quaternion, other.state.quaternion
-    return 2 * min(math.dist(a, b), math.dist(a, [-x for x in b]))
 
 
 def bits(budget: Budget, seed: int) -> Ledger:

@@ -98,11 +98,11 @@ class FeedforwardStudy:
         seconds: length of the motion [s].
         left_out: errors that the plant cannot have.
         loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
-        holds: feedforward alone with an exact model: instant `at` of the torque that is held,
-            period_s, largest error of gamma [rad].
+        holds: feedforward alone, exact model: instant `at` of the torque that is held, period_s,
+            largest error of gamma [rad].
         unheld: the same with torques as a function of time: error, and its estimate [rad].
-        limits: largest stable bandwidths of computed torque [rad/s] by delay in samples: theory;
-            ideal, the plant of the theory (`ideal_plant`); real, the plant as it is.
+        limits: largest stable bandwidths of computed torque [rad/s] by delay in samples: theory,
+            ideal (the plant of the theory), real (the plant as it is).
 
     """
 
