@@ -94,6 +94,8 @@ class _Call:
     def __call__(self):
         for number, stream in enumerate(self._streams, start=1):
             os.dup2(stream.detach(), number)
+        # The server ends with the tests, however they end, and this node then ends without it.
+        os.close(forkserver._forkserver._forkserver_alive_fd)
         os.environ.clear()
         os.environ.update(self._env, **{child_process.PARENT: str(os.getppid())})
         status = main(self._words)
