@@ -5,8 +5,8 @@ python -m benchmark.soak --minutes 10
 
 A simulator and a controller at 1 kHz, a recorder, the viewer and a subscriber with the queues of
 robot_state_publisher and RViz run side by side in a ROS domain of their own. Then the memory of
-each process must be flat, the recording complete, and no shared memory of theirs left; neither
-after all have been killed by SIGKILL and a simulator has been started again. Else the status is 1.
+each process must be flat, the recording complete, and no shared memory of theirs left; and no
+segment after all were killed by SIGKILL and a simulator was started again. Else the status is 1.
 """
 
 from __future__ import annotations
@@ -170,9 +170,8 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
     """Kill all by SIGKILL, start and end a simulator.
 
     Returns:
-        How many files the killed processes left; which of these are left after a simulator was
-        started and ended; and which of them are ports without a lock file, which nothing proves
-        unused.
+        How many files the killed processes left; which segments and which ports of these are left
+        after a simulator was started and ended.
 
     """
     before = existing()
@@ -180,9 +179,7 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
         processes = start(stack, folder, 0.0, control=False)
         for process in processes.values():
             until(lambda pid=process.pid: len(shared([pid])) >= 3, "shared memory")
-        time.sleep(
-            shared_memory.AGE_S + 1.0
-        )  # they have found each other, and a start may remove their files
+        time.sleep(shared_memory.AGE_S + 1.0)  # a start removes what is older
         names = shared(process.pid for process in processes.values()) - before
         for process in processes.values():
             process.kill()
@@ -193,8 +190,8 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
         until(lambda: shared([again.pid]), "shared memory")
         names |= shared([again.pid]) - before
     after = left(names, 2.0)
-    unproven = [name for name in after if "port" in name and f"{name}_el" not in after]
-    return count, after, [name for name in unproven if not name.endswith("_el")]
+    ports = [name for name in after if "port" in name]
+    return count, sorted(set(after) - set(ports)), ports
 
 
 def main() -> int:
@@ -211,14 +208,14 @@ def main() -> int:
         samples, missing = lost(Path(folder) / "bag")
         if missing:
             wrong.append(f"{missing} samples are not in the recording")
-        count, dead, unproven = killed(Path(folder))
-        if set(dead) - set(unproven):
-            wrong.append(f"left in /dev/shm after SIGKILL and a new start: {dead}")
+        count, segments, ports = killed(Path(folder))
+        if segments:
+            wrong.append(f"left in /dev/shm after SIGKILL and a new start: {segments}")
     print(table(columns))
     print(
         f"\nsamples recorded {samples}, missing {missing}; after SIGKILL {count} files in /dev/shm,"
     )
-    print(f"after a new start {len(dead)}, and {len(unproven)} ports that have no lock file")
+    print(f"after a new start {len(segments)} of segments and {len(ports)} of ports, which stay")
     print(machine.line(machine.described("rclpy", "ros-rmw-fastrtps-cpp", "viser")))
     for line in wrong:
         print(f"WRONG: {line}")

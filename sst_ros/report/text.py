@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
@@ -169,7 +170,7 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
         yield from (f"Note: {note}." for note in summary["notes"])
     yield from (f"Not known: {words}." for words in summary["unknown"])
     yield ""
-    yield made_line(summary["report"])
+    yield from textwrap.wrap(made_line(summary["report"]), 110, break_on_hyphens=False)
 
 
 def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:

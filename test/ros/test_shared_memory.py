@@ -16,6 +16,7 @@ from sst_ros.nodes import shared_memory
 
 pytestmark = pytest.mark.ros
 NAME = "fastdds_0123456789abcdef"
+OLDER = "fastrtps_0123456789abcdef"
 PORT = "fastdds_port7413"
 
 
@@ -55,7 +56,7 @@ def test_the_next_start_removes_what_a_killed_node_left(nodes, observer):
     nodes.run("simulator")
 
     def segments():
-        """Ports are left out: the new simulator may have taken one."""
+        """Not ports: they stay, and the new simulator may have taken one."""
         return {name for name in files(left) if "port" not in name}
 
     # Not until its states arrive: what the killed one had sent may still come.
@@ -64,16 +65,16 @@ def test_the_next_start_removes_what_a_killed_node_left(nodes, observer):
     assert {f"{name}_el" for name in mine} <= files(mine)
 
 
-def test_what_is_locked_or_has_no_lock_or_is_no_file_of_fast_dds_stays(tmp_path):
-    dead = {NAME, f"{NAME}_el", PORT, f"{PORT}_el", f"sem.{PORT}_mutex", "fastrtps_port7_sl"}
-    stays = {"fastdds_port7415", "sem.fastdds_port7415_mutex", "fastdds_fedcba9876543210_el",
+def test_ports_and_what_is_locked_or_is_no_file_of_fast_dds_stay(tmp_path):
+    dead = {NAME, f"{NAME}_el", OLDER, f"{OLDER}_sl"}
+    stays = {PORT, f"{PORT}_el", f"sem.{PORT}_mutex", "fastdds_fedcba9876543210_el",
              "fastdds_fedcba9876543210", "other_el", f"{NAME}_elx", "lttng-ust-wait-8"}  # fmt: skip
     for name in dead | stays:
         (tmp_path / name).touch()
         aged(tmp_path / name)
     with (tmp_path / "fastdds_fedcba9876543210_el").open() as alive:
         fcntl.flock(alive, fcntl.LOCK_EX)
-        assert set(shared_memory.remove_dead(tmp_path)) == {NAME, PORT, "fastrtps_port7"}
+        assert set(shared_memory.remove_dead(tmp_path)) == {NAME, OLDER}
         assert {path.name for path in tmp_path.iterdir()} == stays
     assert shared_memory.remove_dead(tmp_path / "none") == []
 
