@@ -218,7 +218,9 @@ def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
     fresh = launch("simulate.launch.py", "duration:=5.0", *words, "output:=again")
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
-    player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, "--delay", "10")
+    # The queue of a simulator that is held up keeps ten commands: slower than they were recorded.
+    slower = ["--rate", "0.25", "--delay", "10"]
+    player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *slower)
     assert player.ended() == 0, player.text
     assert fresh.ended() == 0, fresh.text
     received = recording.read(tmp_path / "again").diagnostics["commands_received"]

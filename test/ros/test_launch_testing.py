@@ -35,6 +35,7 @@ LAUNCHES = {
 """Arguments, and what is printed when the nodes work: the run of ros2_control by its commands."""
 
 FOLDER = Path(get_package_share_directory("sst_ros")) / "launch"
+PREFIXES, BEGAN_IN = os.environ["AMENT_PREFIX_PATH"], Path.cwd()
 CONTROLLER_MANAGER = """#!/usr/bin/env python3
 import rclpy
 from sensor_msgs.msg import JointState
@@ -112,3 +113,9 @@ class Started(unittest.TestCase):
 class Ended(unittest.TestCase):
     def test_exit_codes(self, proc_info, name):
         launch_testing.asserts.assertExitCodes(proc_info)
+
+    @classmethod
+    def tearDownClass(cls):
+        """Later tests of this process have the packages and the folder that it began with."""
+        os.environ["AMENT_PREFIX_PATH"] = PREFIXES
+        os.chdir(BEGAN_IN)
