@@ -4,10 +4,24 @@
 from __future__ import annotations
 
 import signal
-import threading
 
-stop = threading.Event()
-"""Set by SIGINT or SIGTERM."""
+
+class StopRequest:
+    """Whether SIGINT or SIGTERM came; no lock, on which the handler of a second would wait."""
+
+    def __init__(self) -> None:
+        self._came = False
+
+    def set(self) -> None:
+        """Ask the node to end."""
+        self._came = True
+
+    def is_set(self) -> bool:
+        """Return whether the node is to end."""
+        return self._came
+
+
+stop = StopRequest()
 
 
 def handle() -> None:
