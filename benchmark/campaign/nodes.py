@@ -30,12 +30,12 @@ from benchmark.campaign.scenes import needle
 
 ENDLESS = """
 from sst_ros.simulation.simulation import Simulation
-steps = Simulation.steps
+advance = Simulation.advance
 def endless(self, *given):
     while self.time_ns:
         pass
-    steps(self, *given)
-Simulation.steps = endless
+    advance(self, *given)
+Simulation.advance = endless
 """
 """All steps but the first never end."""
 
