@@ -70,7 +70,7 @@ def own_domain() -> Iterator[int]:
         yield number
     finally:
         for name, value in before.items():
-            os.environ.pop(name)
+            os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
         os.close(lock)

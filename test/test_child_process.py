@@ -36,6 +36,12 @@ def test_two_at_the_same_time_differ_and_the_environment_comes_back():
     assert "ROS_DOMAIN_ID" not in os.environ
 
 
+def test_a_variable_that_the_block_removes_is_no_error():
+    with child_process.own_domain():
+        del os.environ["ROS_DOMAIN_ID"]
+    assert "ROS_DOMAIN_ID" not in os.environ
+
+
 def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", KEEP], **pipes) as process:

@@ -36,7 +36,7 @@ def domain() -> Iterator[int]:
         try:
             yield number
         finally:
-            os.environ.pop("SST_ROS_NUMBA")
+            os.environ.pop("SST_ROS_NUMBA", None)
             if before is not None:
                 os.environ["SST_ROS_NUMBA"] = before
 
