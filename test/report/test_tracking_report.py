@@ -52,7 +52,7 @@ def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entr
     assert followed.orientation_error == pytest.approx(angle_between(q, q[0]), abs=1e-12)
 
 
-def test_the_companions_last_word_says_how_often_a_torque_was_limited(entries, tmp_path):
+def test_the_last_report_of_the_controller_says_how_often_a_torque_was_limited(entries, tmp_path):
     said = bags.diagnostics_entry(entries[-1].received_ns + 1, samples_limited=7)
     said.content.status[0].name = "/sst_inverse_dynamics: control"
     bag = bags.write(tmp_path / "bag", [*entries, said])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The companion node against the simulator, in lockstep and running free, and against bad input."""
+"""The controller against the simulator, in lockstep and running free, and against bad input."""
 
 import dataclasses
 import signal
@@ -35,7 +35,7 @@ def written(folder, name="example2_heavy", **changed):
 @pytest.fixture(scope="module")
 def twice(tmp_path_factory, domain_of_module):
     """The same run of `make demo-feedforward`, two times; the folders of the bags."""
-    folder = tmp_path_factory.mktemp("companion")
+    folder = tmp_path_factory.mktemp("controller")
     path, first, second = str(written(folder)), folder / "feedforward", folder / "second"
     assert demo.feedforward(folder, path, ("feedforward",)) == 0
     second.mkdir()
@@ -110,7 +110,7 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def deaf(tmp_path_factory, domain_of_module):
-    """A companion that waits for trajectories, and all that it has published."""
+    """A controller that waits for trajectories, and all that it has published."""
     from .conftest import Nodes, Observer
 
     nodes, observer = Nodes(), Observer(domain_of_module)

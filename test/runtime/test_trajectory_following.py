@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The companion's work without its node: when it begins, goes on, ends, and what it refuses."""
+"""The controller without its node: when it begins, goes on, ends, and what it refuses."""
 
 import dataclasses
 import tracemalloc
