@@ -19,8 +19,10 @@ from sst_ros.child_process import orphaned
 from sst_ros.errors import InputError, SstError
 from sst_ros.nodes import arguments, middleware, shared_memory, signals
 
-_SPIN_PERIOD_S = 0.1
-"""Longest delay of a signal; to spin once takes half a millisecond, asked for or not."""
+_POLL_S = 0.1
+"""Longest delay of a signal. The executor would take half a millisecond for each look."""
+_CALLBACK_S = 1.0
+"""Wait for a callback in progress: a service that waits for the run ends once that is closed."""
 
 
 class Worker(Protocol):
@@ -77,16 +79,51 @@ def run(words: Sequence[str]) -> int:
     return 0
 
 
+class _Spinner(threading.Thread):
+    """Thread of the executor: it sleeps until there is work, where signals would not wake it."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(name="executor", daemon=True)
+        self.error: BaseException | None = None
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._wake = node.create_guard_condition(lambda: None)
+        self._ends = False
+
+    def run(self) -> None:
+        """Run callbacks until `end`, or until one fails."""
+        try:
+            while not self._ends:
+                self._executor.spin_once()
+        except BaseException as error:
+            self.error = error
+
+    def end(self) -> None:
+        """Begin no other callback; wait for the one in progress."""
+        self._ends = True
+        self._wake.trigger()
+        self.join(_CALLBACK_S)
+
+    def shut_down(self) -> None:
+        """Give up the executor, after `end`."""
+        self.join(_CALLBACK_S)
+        self._executor.shutdown()
+
+
 def _spin(worker: Worker) -> None:
-    executor = SingleThreadedExecutor()
-    executor.add_node(worker.node)
+    spinner = _Spinner(worker.node)
+    spinner.start()
     try:
-        while not (signals.stop.is_set() or worker.done.is_set() or orphaned()):
-            executor.spin_once(timeout_sec=_SPIN_PERIOD_S)
+        while spinner.is_alive() and not (signals.stop.is_set() or orphaned()):
+            if worker.done.wait(_POLL_S):
+                break
+        spinner.end()
+        if spinner.error is not None:
+            raise spinner.error
     finally:
         try:
             worker.close()
         finally:
             middleware.finish(worker.node.publishers)
-            executor.shutdown()
+            spinner.shut_down()
             worker.node.destroy_node()
