@@ -29,7 +29,11 @@ plt.savefig("ends.png")
 
 
 @pytest.mark.parametrize(
-    ("text", "most", "picture"), [(OWN, 8, "motion.png"), (MONTE_CARLO, 10, "ends.png")]
+    ("text", "most", "picture"),
+    [
+        (OWN, 8, "motion.png"),
+        pytest.param(MONTE_CARLO, 10, "ends.png", marks=pytest.mark.slow),
+    ],
 )
 def test_it_takes_few_lines_and_draws(text, most, picture, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib")

@@ -88,6 +88,7 @@ def test_extrapolation_reference_has_its_order(peers, task):
         assert max(abs(a - b) for a, b in zip(one, two, strict=True)) < mp.mpf(10) ** -24
 
 
+@pytest.mark.slow
 def test_our_headline_is_the_public_call(peers, task):
     """Every setting ends within its tolerance of the finest one, and no other series counts."""
     pytest.importorskip("numba")

@@ -7,7 +7,7 @@ from benchmark.campaign.ledger import Ledger
 from benchmark.campaign.parts import PARTS, run
 
 ROS = {"damages", "recorder_kills", *(part for part, room in PARTS.items() if room == "nodes")}
-QUICK = {"messages", *(PARTS.keys() - ROS)}
+QUICK = {"messages", *(PARTS.keys() - ROS - {"bits"})}  # which compiles a scene of its own
 
 
 @pytest.mark.parametrize(

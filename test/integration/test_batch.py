@@ -76,7 +76,7 @@ def test_threads_change_no_bit(batch, gamma, result):
     assert again.message == result.message
 
 
-@pytest.mark.parametrize("method", [DORMAND_PRINCE, DOP853])
+@pytest.mark.parametrize("method", [pytest.param(DORMAND_PRINCE, marks=pytest.mark.slow), DOP853])
 def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
     """SIMD, blocks and slices of time change none: the same operations in the same order."""
     if method is not DOP853:
@@ -92,6 +92,7 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(batch, gamma, method):
         assert alone == [*found.quaternion[n], *found.body_rate[n]]
 
 
+@pytest.mark.slow
 def test_rest_at_an_end_of_the_stroke_is_no_fault():
     """Rounding puts gamma_3 below 0 by 5e-16 rad; `Simulation` stays at rest there."""
     found = Batch(EXAMPLE2).run([(0.0,) * 3, (0.7, 0.7, 0.0)], (0.0,) * 3, step=1e-3, count=10)

@@ -131,6 +131,7 @@ def test_threads_change_no_bit(manipulators, samples, result):
     assert again.message == result.message
 
 
+@pytest.mark.slow
 def test_springs_swing_with_the_root_of_stiffness_over_inertia():
     """At home of the isotropic design gamma_dot_k = omega / sqrt(3): k / I is that of the star."""
     stiffness, inertia = np.meshgrid([50.0, 120.0, 300.0], [0.15, 0.2, 0.3, 0.4])

@@ -101,6 +101,7 @@ def test_energy_is_conserved_under_gravity_for_10_s():
     assert drift(10.0) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not NUMBA, reason="numba is not installed")
 def test_energy_is_conserved_under_gravity_for_100_s():
     assert drift(100.0, compiled=True) <= 1e-10

@@ -170,6 +170,7 @@ def test_cases_as_scenarios_of_a_batch(group):
     assert [words for words, agrees in found if not agrees] == []
 
 
+@pytest.mark.slow
 def test_a_batch_of_another_motion_is_seen():
     pytest.importorskip("numba")
     case = named("actuator lag of 0.001 s")

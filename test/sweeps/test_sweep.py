@@ -19,8 +19,6 @@ from test.sweeps.tables import same
 for module in ("numba", "dask", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
 
-pytestmark = pytest.mark.usefixtures("cache")
-
 SCENE = load_scene("example2_heavy")
 VARY = {
     "star.inertia": ("uniform", 0.7, 1.2, "relative"),
