@@ -69,7 +69,7 @@ def run(words: Sequence[str]) -> int:
     try:
         if not signals.stop.is_set():
             module = importlib.import_module(f"sst_ros.nodes.{command}")
-            _spin(getattr(module, arguments.COMMANDS[command][0])())
+            spin(getattr(module, arguments.COMMANDS[command][0])())
     except (SstError, ParameterException) as error:
         print(f"{command}: {error}", file=sys.stderr)
         return 1
@@ -79,13 +79,13 @@ def run(words: Sequence[str]) -> int:
     return 0
 
 
-class _Spinner(threading.Thread):
+class _Callbacks(threading.Thread):
     """Thread of the executor: it sleeps until there is work, where signals would not wake it."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(name="executor", daemon=True)
         self.error: BaseException | None = None
-        self._executor = SingleThreadedExecutor()
+        self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._wake = node.create_guard_condition(lambda: None)
         self._ends = False
@@ -110,20 +110,26 @@ class _Spinner(threading.Thread):
         self._executor.shutdown()
 
 
-def _spin(worker: Worker) -> None:
-    spinner = _Spinner(worker.node)
-    spinner.start()
+def spin(worker: Worker) -> None:
+    """Run a worker until it is done or asked to end, then close it.
+
+    Raises:
+        Exception: that of a callback, or of closing the worker.
+
+    """
+    callbacks = _Callbacks(worker.node)
+    callbacks.start()
     try:
-        while spinner.is_alive() and not (signals.stop.is_set() or orphaned()):
+        while callbacks.is_alive() and not (signals.stop.is_set() or orphaned()):
             if worker.done.wait(_POLL_S):
                 break
-        spinner.end()
-        if spinner.error is not None:
-            raise spinner.error
+        callbacks.end()
+        if callbacks.error is not None:
+            raise callbacks.error
     finally:
         try:
             worker.close()
         finally:
             middleware.finish(worker.node.publishers)
-            spinner.shut_down()
+            callbacks.shut_down()
             worker.node.destroy_node()
