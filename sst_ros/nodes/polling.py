@@ -53,7 +53,6 @@ class Reader:
         self._subscription = node.create_subscription(
             topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
         )
-        self._handle: Any = self._subscription.handle
         self._next: tuple[Any, int] | None = None
         self.waiting = False
 
@@ -61,9 +60,7 @@ class Reader:
         """Return the next message if it arrived until this monotonic time [ns], or None."""
         if self._next is None:
             # As bytes: otherwise an empty message is made each time that there is none.
-            with self._handle:
-                taken = self._handle.take_message(self._subscription.msg_type, True)
-            if taken is None:
+            if (taken := take(self._subscription, raw=True)) is None:
                 return None
             data, information = taken
             message = deserialize_message(data, self._subscription.msg_type)

@@ -60,7 +60,7 @@ class SimulatorTopics:
             )
         )
         self._read: list[Publisher[Any]] = []
-        self._states: list[tuple[Any, CdrMessage]] = []
+        self._states: list[tuple[Publisher[Any], CdrMessage]] = []
         self._counted_ns = 0
         self._phase = topics.PHASE.publisher(node)
         self._scene = topics.SCENE.publisher(node)
@@ -117,9 +117,8 @@ class SimulatorTopics:
         else:
             self._log.clear()
         at = stamp(stamp_ns)
-        for handle, message in self._states:
-            with handle:  # as Publisher.publish, without its look at the type
-                handle.publish_raw(message.stamped(at))
+        for publisher, message in self._states:
+            publisher.publish(message.stamped(at))
 
     def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts.
@@ -159,7 +158,7 @@ class SimulatorTopics:
             self._counted_ns = now
             every = (self._joints, self._orientation, self._euler, self._torques)
             self._read = [topic for topic in every if topic.get_subscription_count()]
-            self._states = [(one.handle, data) for one, data in self._messages(self._samples)]
+            self._states = self._messages(self._samples)
 
     def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], CdrMessage]]:
         """Messages of a state whose topics have subscribers."""
