@@ -22,6 +22,8 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from sst_ros.runtime.torque_input import MOST_WAITING
+
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 EXECUTES = "executes"
 
@@ -138,19 +140,25 @@ ROBOT_DESCRIPTION = Endpoint(
     when="publish_description is true, the default",
 )
 COMMANDS = Endpoint(
-    SUBSCRIBES, "~/commands", Float64MultiArray, "torques of gamma_1..3 [N m], held until the next"
+    SUBSCRIBES,
+    "~/commands",
+    Float64MultiArray,
+    "torques of gamma_1..3 [N m], held until the next",
+    MOST_WAITING,
 )
 COMMANDS_STAMPED = Endpoint(
     SUBSCRIBES,
     "~/commands_stamped",
     JointState,
     "the same by name, in effort [N m]; the stamp is that of the joint_states it answers",
+    MOST_WAITING,
 )
 EXTERNAL_MOMENT = Endpoint(
     SUBSCRIBES,
     "~/external_moment",
     WrenchStamped,
     "moment on the star, torque in {B} [N m]; the force is not used",
+    MOST_WAITING,
     when="the scene has moment: {topic: true}",
 )
 SET_STATE = Endpoint(

@@ -22,7 +22,7 @@ _STEP_ANSWER_S = 0.4
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.advance`, after which requests are served."""
 _LONGEST_SLEEP_NS = 2_000_000
-"""Bounds the ticks that one sleep ends in: the queue of commands keeps ten messages."""
+"""Bounds the ticks that one sleep ends in, so that few commands wait."""
 _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
