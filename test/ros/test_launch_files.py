@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files by `ros2 launch`: each ends when its work has, with the right status."""
 
+import json
 import os
 import re
 import shutil
@@ -218,9 +219,12 @@ def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
     fresh = launch("simulate.launch.py", "duration:=5.0", *words, "output:=again")
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
-    # The queue of a simulator that is held up keeps ten commands: slower than they were recorded.
-    slower = ["--rate", "0.25", "--delay", "10"]
-    player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *slower)
+    # A player that keeps ten messages, as it does by itself, cannot repeat those that a busy
+    # machine has lost; the simulator keeps 50: slower than they were recorded.
+    kept = {topic: {"reliability": "reliable", "history": "keep_last", "depth": 1000}}
+    (tmp_path / "qos.yaml").write_text(json.dumps(kept))
+    options = ["--rate", "0.25", "--delay", "10", "--qos-profile-overrides-path", "qos.yaml"]
+    player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *options)
     assert player.ended() == 0, player.text
     assert fresh.ended() == 0, fresh.text
     received = recording.read(tmp_path / "again").diagnostics["commands_received"]
