@@ -22,7 +22,8 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated; longer ones are dropped time."""
 
-_DISCOVERY_S = 3.0
+_DISCOVERY_S = 5.0
+"""A participant of DDS whose first announcements were lost announces itself again within 3 s."""
 _LONGEST_WAIT_S = 0.05
 
 
