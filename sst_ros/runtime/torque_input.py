@@ -20,7 +20,7 @@ ACTUATORS = JOINTS[:3]
 
 MOST_WAITING = 50
 """Commands that wait for the next tick, which takes them all and uses the last: a process that is
-held up for 50 ms loses none at 1 kHz, and a flood costs a tick half a millisecond."""
+held up for 50 ms loses none at 1 kHz, and what a flood costs a tick is bounded."""
 
 
 class Arrivals(Protocol):
