@@ -177,16 +177,6 @@ def _wrapped(angle: float) -> float:
     return angle if angle > -math.pi else angle + 2.0 * math.pi
 
 
-class _Point:
-    """Place of one row in applied_torques, and the row that was written there last."""
-
-    __slots__ = ("row", "write")
-
-    def __init__(self, write: Write) -> None:
-        self.write = write
-        self.row: tuple[float, ...] = ()
-
-
 class TorqueLog:
     """applied_torques: torque and moment of every tick since the last publication.
 
@@ -217,25 +207,23 @@ class TorqueLog:
         count = len(self._rows)
         if count not in self._layouts:
             self._layouts[count] = self._layout(count)
-        message, points = self._layouts[count]
-        for point, row in zip(points, self._rows, strict=True):
-            if row is not point.row:  # otherwise its numbers are there already
-                point.row = row
-                point.write(*row)
+        message, writes = self._layouts[count]
+        for write, row in zip(writes, self._rows, strict=True):
+            write(*row)
         self._rows.clear()
         return message.stamped(stamp(stamp_ns))
 
-    def _layout(self, count: int) -> tuple[CdrMessage, list[_Point]]:
-        message, points = CdrMessage(), []
+    def _layout(self, count: int) -> tuple[CdrMessage, list[Write]]:
+        message, writes = CdrMessage(), []
         message.header(BASE_FRAME)
         message.strings(self._names)
         message.length(count)
-        for number in range(count):
+        for point in range(count):
             for _ in ("positions", "velocities", "accelerations"):
                 message.length(0)
-            points.append(_Point(message.double_sequence(len(self._names))))
-            message.time((number + 1) * self._period_ns)
-        return message, points
+            writes.append(message.double_sequence(len(self._names)))
+            message.time((point + 1) * self._period_ns)
+        return message, writes
 
 
 def clock_message() -> CdrMessage:
