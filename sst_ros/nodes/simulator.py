@@ -97,7 +97,7 @@ class Simulator:
         return Reply(True, "")
 
     def _watch(self) -> None:
-        """Look after the run, in a thread of its own: a timer of the node costs ten times more."""
+        """Look after the run, in a thread of its own: a timer would go through the executor."""
         while not self.done.wait(_WATCH_S):
             self._loop.watch()
             if self._loop.failed:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from sst_ros.runtime.trajectory_goal import ErrorCode
 
 from . import message_types
-from .test_inverse_dynamics import AWAY, HOME, NAMES, companion_told, trajectory, written
+from .test_inverse_dynamics import AWAY, HOME, NAMES, controller_told, trajectory, written
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 NODE = "/sst_inverse_dynamics"
@@ -54,7 +54,7 @@ class Client:
         )
         observer.until(self.client.server_is_ready, "the action server")
         stage = "waiting for a trajectory"
-        observer.until(lambda: stage in companion_told(observer, "stage"), "joint_states")
+        observer.until(lambda: stage in controller_told(observer, "stage"), "joint_states")
         self.feedback = []
 
     def send(self, *points, **given):
@@ -116,10 +116,10 @@ def test_a_goal_is_followed_with_feedback_and_succeeds(client):
 
 
 def test_what_cannot_be_followed_is_refused_with_a_reason(client):
-    before = len(companion_told(client.observer, "last_refusal"))
+    before = len(controller_told(client.observer, "last_refusal"))
 
     def reason():
-        refusals = companion_told(client.observer, "last_refusal")[before:]
+        refusals = controller_told(client.observer, "last_refusal")[before:]
         return refusals[-1] if refusals else ""
 
     assert not client.send((1.0, np.add(HOME, (0.9, 0.0, 0.0)))).accepted

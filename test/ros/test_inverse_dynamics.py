@@ -117,7 +117,7 @@ def deaf(tmp_path_factory, domain_of_module):
     path = written(tmp_path_factory.mktemp("deaf"), actuators=Actuators(torque_limit=8.0))
     commands = observer.listen(Float64MultiArray, "/sst_simulator/commands")
     observer.listen(DiagnosticArray, "/diagnostics")
-    companion = nodes.run("inverse_dynamics", scene=path, motion="topic")
+    controller = nodes.run("inverse_dynamics", scene=path, motion="topic")
     states = observer.publisher(JointState, "/joint_states")
     publisher = observer.publisher(JointTrajectory, "/sst_inverse_dynamics/joint_trajectory")
     refusals, reason = 0, ""
@@ -126,7 +126,7 @@ def deaf(tmp_path_factory, domain_of_module):
         states.publish(idle())
         publisher.publish(trajectory())
         reason = observer.told("trajectories_refused", refusals)["last_refusal"]
-    yield observer, companion, states, publisher, commands
+    yield observer, controller, states, publisher, commands
     observer.close()
     nodes.close()
 
@@ -139,7 +139,7 @@ def idle(stamp_ns=0):
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_trajectory_is_refused_before_any_torque(deaf, case):
-    observer, companion, states, publisher, commands = deaf
+    observer, controller, states, publisher, commands = deaf
     message, reason = BAD[case]
     before = int(observer.told("trajectories_refused", lambda _: True)["trajectories_refused"])
     states.publish(idle())
@@ -149,7 +149,7 @@ def test_a_bad_trajectory_is_refused_before_any_torque(deaf, case):
     assert said["stage"] == "waiting for a trajectory"
     states.publish(idle())
     observer.told("samples", 0)
-    assert commands == [] and companion.poll() is None
+    assert commands == [] and controller.poll() is None
 
 
 def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, observer, tmp_path):
@@ -157,7 +157,7 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     reference = observer.listen(JointState, "/sst_inverse_dynamics/reference")
     nodes.run("simulator", scene=path, sync="lockstep")
     given = {"mode": "computed_torque", "feedforward_at": "middle"}
-    companion = nodes.run("inverse_dynamics", scene=path, motion="topic", stamped="true", **given)
+    controller = nodes.run("inverse_dynamics", scene=path, motion="topic", stamped="true", **given)
     publisher = observer.publisher(JointTrajectory, "/sst_inverse_dynamics/joint_trajectory")
     first, second = trajectory((2.0, AWAY[::-1])), trajectory((0.2, HOME))
     first.joint_names = NAMES[::-1]
@@ -170,7 +170,7 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     observer.until(lambda: off() > 2e-3, "motion away")
     publisher.publish(second)  # while it moves: goes on from there
     observer.until(lambda: off() < 1e-12 and not any(reference[-1].velocity), "the end")
-    status, out, err = nodes.stop(companion)
+    status, out, err = nodes.stop(controller)
     assert status == 0 and "Traceback" not in err
     gamma = np.array([message.position for message in reference])
     rate = np.array([message.velocity for message in reference])
@@ -182,7 +182,7 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     assert len(errors) >= 2 and np.array(errors, dtype=float).max() < 1e-4
 
 
-def companion_told(observer, key):
+def controller_told(observer, key):
     statuses = [message.status[0] for message in observer.heard["/diagnostics"]]
     return [
         {pair.key: pair.value for pair in status.values}[key]
@@ -203,9 +203,9 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     assert nodes.line(recorder).startswith("ready")
     # The recorder reads the commands and the reference before the run begins.
     waits = {"min_subscribers": 2, "wait_for_recorder": "true"}
-    companion = nodes.run("inverse_dynamics", scene=path, mode="feedforward_pd", **waits)
+    controller = nodes.run("inverse_dynamics", scene=path, mode="feedforward_pd", **waits)
     observer.until(lambda: len(reference) > 100, "the motion")
-    companion.send_signal(signal.SIGKILL)
+    controller.send_signal(signal.SIGKILL)
     # Ten times the timeout: a busy machine may have let go before, with commands on their way.
     said = observer.told("command_age_s", lambda age: age != "none" and float(age) > 1.0)
     observer.until(lambda: not np.any([s.effort[:3] for s in states[-100:]]), "100 x zero torque")
@@ -225,9 +225,9 @@ def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_p
     model = written(tmp_path, motion=out, **ignorant).rename(tmp_path / "model.yaml")
     plant = written(tmp_path, motion=None)
     simulator = nodes.run("simulator", scene=plant, sync="lockstep", real_time_factor=0.0)
-    companion = nodes.run("inverse_dynamics", scene=model, stamped="true")
-    out, err = companion.communicate(timeout=60)
-    assert companion.returncode == 1 and "the simulator stopped: fault: " in err
+    controller = nodes.run("inverse_dynamics", scene=model, stamped="true")
+    out, err = controller.communicate(timeout=60)
+    assert controller.returncode == 1 and "the simulator stopped: fault: " in err
     assert "Traceback" not in err and "error, largest" in out
     nodes.stop(simulator)
 
@@ -249,13 +249,13 @@ def test_what_cannot_be_followed_is_refused_at_the_start(run_here, tmp_path, giv
 
 def test_it_refuses_to_begin_where_the_manipulator_is_not(nodes, observer, tmp_path):
     commands = observer.listen(Float64MultiArray, "/sst_simulator/commands")
-    companion = nodes.run("inverse_dynamics", scene=written(tmp_path))
+    controller = nodes.run("inverse_dynamics", scene=written(tmp_path))
     states = observer.publisher(JointState, "/joint_states")
     message = idle()
     message.position[1] += 0.06
-    observer.publish_until(states, message, lambda: companion.poll() is not None, "the end")
-    assert companion.returncode == 1
-    assert "where the motion begins" in companion.communicate()[1]
+    observer.publish_until(states, message, lambda: controller.poll() is not None, "the end")
+    assert controller.returncode == 1
+    assert "where the motion begins" in controller.communicate()[1]
     assert commands == []
 
 

@@ -53,6 +53,14 @@ PreparedSweep.chunk = slow
 
 
 @pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A folder of compiled code apart from the user's, as that of another machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
 def expected(tmp_path_factory):
     return run_study(STUDY, None)
 
