@@ -18,11 +18,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import mean, median
+from typing import Any
 
 import rclpy
 
@@ -31,6 +34,7 @@ from sst_ros.nodes import middleware, topics
 from sst_ros.nodes.messages import StateMessages, TorqueLog, stamp
 from sst_ros.nodes.polling import Reader
 from sst_ros.runtime import realtime
+from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
 
@@ -109,7 +113,7 @@ def run_loop(name: str, seconds: float) -> dict[str, float]:
     publish = exchange(number, read) if number else None
     sleep = python_sleep if sleeper == "python" else libc_sleep()
     time.sleep(1.0)  # until discovery is quiet
-    realtime.schedule(20)
+    realtime.schedule(20, threading.get_native_id())
     realtime.quiet()
     missed, step_ns, used = 0, ticks * TICK_NS, time.process_time()
     began = deadline = time.monotonic_ns()
@@ -124,6 +128,56 @@ def run_loop(name: str, seconds: float) -> dict[str, float]:
             publish(deadline)
     wall_ns, used = time.monotonic_ns() - began, time.process_time() - used
     return {"processor": 1e11 * used / wall_ns, "missed": 100.0 * missed * TICK_NS / wall_ns}
+
+
+class Beside:
+    """A loop in a process of its own that only sleeps to the deadlines of the node's samples.
+
+    What it misses beside the node, at the same priority and by the same rule, is the machine's.
+    """
+
+    def __init__(self, priority: int) -> None:
+        own = get_context("spawn")
+        self._counts = own.RawArray("q", 3)
+        self._ends = own.Event()
+        given = (self._counts, self._ends, priority)
+        self._process = own.Process(target=_only_sleep, args=given, daemon=True)
+
+    def __enter__(self) -> Beside:
+        self._process.start()
+        end = time.monotonic() + 60.0
+        while not self._counts[0]:
+            if time.monotonic() > end or not self._process.is_alive():
+                raise SystemExit("the loop beside the node does not run")
+            time.sleep(0.1)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ends.set()
+        self._process.join()
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Ticks kept and missed since its start."""
+        return self._counts[0], self._counts[1]
+
+    @property
+    def latest_us(self) -> float:
+        """Largest lateness since its start [us]."""
+        return self._counts[2] / 1000.0
+
+
+def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
+    pacer, ticks = Pacer(TICK_NS, 1.0, SteadyTime()), LOOPS["sleeps every sample"][0]
+    realtime.schedule(priority, threading.get_native_id())
+    realtime.quiet()
+    pacer.start()
+    while not ends.is_set():
+        for _ in range(100):
+            pacer.wait(lambda: False, ticks)
+            counts[0] += ticks
+            counts[1] = pacer.missed
+            counts[2] = max(counts[2], pacer.late_ns)
 
 
 @contextmanager

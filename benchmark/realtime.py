@@ -21,25 +21,23 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from multiprocessing import Pipe, get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from benchmark import bare_loops, machine
+from benchmark.bare_loops import Beside
 from benchmark.nodes import Process, Watch, markdown
 from sst_ros.nodes.polling import NeverSpun
-from sst_ros.runtime import realtime
-from sst_ros.runtime.pacing import Pacer, SteadyTime
 
-TICKS = 2
-"""Of one sample: the compiled simulator wakes once for both."""
-BESIDE = "a loop that only sleeps, beside it: missed [%]"
-MISSED = "missed ticks [%]"
+MISSED, RATIO = "missed ticks [%]", "missed ticks, times those of the loop"
+_LATE = (("mean", "mean"), ("standard deviation", "std"), ("largest", "max"))
+BLOCKS = 20
+"""Of a run: their scatter is the error of the ratio of missed ticks."""
 PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
 Figures = dict[str, str]
 
@@ -65,34 +63,6 @@ def commanded(watch: Watch, topic: str, readers: int) -> Iterator[None]:
         watch.node.destroy_publisher(commands)
 
 
-def asleep(end: float, priority: int, result: Connection) -> None:
-    """Only sleep to the deadlines of 500 samples a second at 1 kHz, until that monotonic time."""
-    pacer, ticks = Pacer(1_000_000, 1.0, SteadyTime()), 0
-    realtime.schedule(priority)
-    realtime.quiet()
-    pacer.start()
-    latest = 0
-    while time.monotonic() < end:
-        pacer.wait(lambda: False, TICKS)
-        latest, ticks = max(latest, pacer.late_ns), ticks + TICKS
-    result.send((100.0 * pacer.missed / (ticks + pacer.missed), latest / 1000.0))
-
-
-@contextmanager
-def beside(seconds: float, priority: int) -> Iterator[Figures]:
-    """Measure what a loop that only sleeps misses meanwhile."""
-    found: Figures = {}
-    there, here = Pipe()
-    end = time.monotonic() + seconds
-    process = get_context("spawn").Process(target=asleep, args=(end, priority, here), daemon=True)
-    process.start()
-    yield found
-    missed, latest = there.recv()
-    process.join()
-    found[BESIDE] = f"{missed:.4f}"
-    found["its lateness, largest [us]"] = f"{latest:.0f}"
-
-
 def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
     """1 kHz with the recorder attached."""
     name, folder = "/sst_simulator", Path(tempfile.mkdtemp())
@@ -105,26 +75,33 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
         stack.callback(simulator.end)
         recorder.line()  # it is ready when it has heard all that speak
         memory: list[tuple[float, int]] = []
+        counts: list[tuple[int, int, int, int]] = []
+
+        def count() -> None:
+            said = watch.values[name]
+            counts.append((int(said["ticks"]), int(said["ticks_missed"]), *loop.counts))
+
         with commanded(watch, f"{name}/commands", readers=2):
             watch.until(lambda: watch.phase(name) == "running", "run")
-            began, used = time.monotonic(), simulator.processor_s()
-            with beside(60.0 * minutes, int(given["realtime_priority"])) as machine_itself:
+            with Beside(int(given["realtime_priority"])) as loop:
+                watch.spin(3.0)  # until all have begun
+                count()
+                began, used = time.monotonic(), simulator.processor_s()
                 while (passed := time.monotonic() - began) < 60.0 * minutes:
-                    watch.spin(min(5.0, 6.0 * minutes))
+                    watch.spin(60.0 * minutes / BLOCKS)
+                    count()
                     memory.append((passed, simulator.memory_kb()))
                 wall, used = time.monotonic() - began, simulator.processor_s() - used
         simulator.end()
         watch.spin(1.5)
         recorder.end()
         said = watch.values[name]
-        on_time, least = _on_time(said), float(machine_itself[BESIDE])
-        ratio = f"{float(on_time[MISSED]) / least:.2f}" if least else "the loop missed none"
         return {
             "scheduling": said["scheduling"],
             "length [min]": f"{wall / 60.0:.1f}",
-            **on_time,
-            **machine_itself,
-            "missed ticks, times those of the loop": ratio,
+            **_compared(np.diff(counts, axis=0)),
+            **{f"lateness, {key} [us]": f"{float(said[f'late_{of}_us']):.0f}" for key, of in _LATE},
+            "largest of the loop [us]": f"{loop.latest_us:.0f}",
             "processor [% of a core]": f"{100.0 * used / wall:.1f}",
             "mean step [us]": f"{float(said['step_mean_us']):.1f}",
             "memory [MB]": f"{memory[-1][1] / 1024.0:.0f}",
@@ -204,14 +181,23 @@ def _missed_of(all_said: list[dict[str, str]]) -> float:
     return 100.0 * missed / max(ticks + missed, 1)
 
 
-def _on_time(said: dict[str, str]) -> Figures:
-    return {
-        MISSED: f"{_missed(said):.4f}",
-        "of ticks": str(int(said["ticks"]) + int(said["ticks_missed"])),
-        "lateness, mean [us]": f"{float(said['late_mean_us']):.0f}",
-        "lateness, standard deviation [us]": f"{float(said['late_std_us']):.0f}",
-        "lateness, largest [us]": f"{float(said['late_max_us']):.0f}",
+def _compared(blocks: np.ndarray) -> Figures:
+    """Missed ticks of the node and of the loop beside it, of rows with ticks and missed of both.
+
+    The standard error of their ratio is that of the jackknife over the rows.
+    """
+    ticks, missed, kept, lost = blocks.sum(axis=0)
+    found = {
+        MISSED: f"{100.0 * missed / (ticks + missed):.4f}",
+        "of ticks": str(ticks + missed),
+        "a loop that only sleeps, beside it: missed [%]": f"{100.0 * lost / (kept + lost):.4f}",
     }
+    others = blocks.sum(axis=0) - blocks
+    if not others[:, 3].all():
+        return {**found, RATIO: "the loop missed too few"}
+    ratios = others[:, 1] / others[:, 3]
+    error = np.sqrt((len(blocks) - 1) * ratios.var())
+    return {**found, RATIO: f"{missed / lost:.2f} +- {error:.2f}"}
 
 
 def _growth(memory: list[tuple[float, int]], wall: float) -> str:
@@ -313,7 +299,8 @@ tables. Python without a real-time kernel is soft real time. A tick is missed wh
 it, or the machine, makes it late by a whole period; simulated time then drops it and the
 diagnostics count it. The compiled simulator wakes once for the two ticks of a sample; a loop that
 only sleeps to the same deadlines, in a process of its own at the same priority, counts in the same
-minutes and by the same rule what the machine alone misses.
+minutes and by the same rule what the machine alone misses. The error of their ratio is that of the
+jackknife over twenty parts of the run. Lateness is since the start of the node.
 
 As fast as possible, samples that nothing receives are passed over and only the last of several is
 made, which is what makes the runs faster in which joint_states is not read."""

@@ -85,7 +85,7 @@ class Simulator:
 
     def _live(self) -> None:
         """Run in a thread of its own."""
-        self._schedule()
+        self._schedule()  # at once: the run may begin before the first report
         try:
             self._loop.run()
         finally:
@@ -140,8 +140,14 @@ class Simulator:
 
     def _schedule(self) -> None:
         """Real-time scheduling for a run that sleeps; without deadlines it would starve others."""
-        given = self.parameters
-        granted = realtime.schedule(given.realtime_priority if given.real_time_factor else 0)
+        given, thread = self.parameters, self._thread.native_id
+        if thread is None or not self._thread.is_alive():
+            return
+        priority = given.realtime_priority if given.real_time_factor else 0
+        try:
+            granted = realtime.schedule(priority, thread)
+        except ProcessLookupError:  # it has ended since
+            return
         if granted != self._diagnostics.scheduling:
             self._diagnostics.scheduling = granted
             self.node.get_logger().info(f"scheduling of the run: {granted}")
@@ -152,6 +158,7 @@ class Simulator:
 
     def _report(self) -> None:
         """Publish the diagnostics, log what is new, request gauges for the next time."""
+        self._schedule()  # the threads that have begun since: of callbacks and of DDS
         own = self.node.get_fully_qualified_name()
         commands = [topic.at(own) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)]
         publishers = sum(map(self.node.count_publishers, commands))

@@ -7,39 +7,47 @@ import contextlib
 import gc
 import os
 import sys
-import threading
 from pathlib import Path
 
 _SWITCH_INTERVAL_S = 1e-4
 
 
-def schedule(priority: int) -> str:
+def schedule(priority: int, thread: int) -> str:
     """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); return what was granted.
 
-    The calling thread gets the priority, the others half of it: they hold locks that it waits for,
-    the interpreter's and those of DDS, and must not be preempted meanwhile.
-    Children of these threads are scheduled as usual.
+    Args:
+        priority: from 0 to 99.
+        thread: native id of the thread that gets the priority. The others of this process get half
+            of it: they hold locks that it waits for, the interpreter's and those of DDS, and must
+            not be preempted meanwhile. What they begin later, threads or processes, is scheduled as
+            usual until the next call.
+
+    Raises:
+        ProcessLookupError: the thread has ended.
+
     """
     if not hasattr(os, "sched_setscheduler"):
         return "usual: this system has no SCHED_FIFO"
     if priority == 0:
-        if os.sched_getscheduler(0) != os.SCHED_OTHER:
-            _schedule_all(os.SCHED_OTHER, 0, 0)
+        if os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:
+            _schedule_all(os.SCHED_OTHER, thread, 0, 0)
         return "usual"
     try:
-        _schedule_all(os.SCHED_FIFO, priority, (priority + 1) // 2)
+        _schedule_all(os.SCHED_FIFO, thread, priority, (priority + 1) // 2)
+    except ProcessLookupError:
+        raise
     except (OSError, ValueError) as error:
         return f"usual: SCHED_FIFO {priority} is not permitted ({error})"
     return f"SCHED_FIFO {priority}"
 
 
-def _schedule_all(policy: int, own: int, others: int) -> None:
+def _schedule_all(policy: int, thread: int, priority: int, others: int) -> None:
     policy |= os.SCHED_RESET_ON_FORK
-    os.sched_setscheduler(0, policy, os.sched_param(own))
-    for thread in Path("/proc/self/task").iterdir():
-        if int(thread.name) != threading.get_native_id():
+    os.sched_setscheduler(thread, policy, os.sched_param(priority))
+    for task in Path("/proc/self/task").iterdir():
+        if int(task.name) != thread:
             with contextlib.suppress(ProcessLookupError):  # it has ended
-                os.sched_setscheduler(int(thread.name), policy, os.sched_param(others))
+                os.sched_setscheduler(int(task.name), policy, os.sched_param(others))
 
 
 def quiet() -> None:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters at start and at run time."""
 
+import contextlib
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,44 @@ def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, obs
         assert reason, (name, value)
     assert "read" in put("use_sim_time", True)[1]
     observer.told("phase", "running")
+
+
+def fifo_is_permitted():
+    number = os.fork() if hasattr(os, "sched_setscheduler") else None
+    if number == 0:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
+        except OSError:
+            os._exit(1)
+        os._exit(0)
+    return number is not None and os.waitpid(number, 0)[1] == 0
+
+
+def scheduling(process):
+    """Return policy and priority of the threads of a process."""
+    found = []
+    for thread in Path(f"/proc/{process.pid}/task").iterdir():
+        number = int(thread.name)
+        with contextlib.suppress(ProcessLookupError):  # it has ended
+            policy = os.sched_getscheduler(number) & ~os.SCHED_RESET_ON_FORK
+            found.append((policy, os.sched_getparam(number).sched_priority))
+    return sorted(found)
+
+
+def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes, observer):
+    if not fifo_is_permitted():
+        pytest.skip("SCHED_FIFO is not permitted here")
+    process = nodes.run("simulator", realtime_priority=20)
+    observer.told("phase", "running")
+    fifo = os.SCHED_FIFO
+
+    def all_are(others, run):
+        return lambda: {*scheduling(process)[:-1]} == {others} and scheduling(process)[-1] == run
+
+    observer.until(all_are((fifo, 10), (fifo, 20)), "SCHED_FIFO of all threads")
+    assert observer.set_parameter("/sst_simulator", "real_time_factor", 0.0).successful
+    usual = (os.SCHED_OTHER, 0)
+    observer.until(all_are(usual, usual), "usual scheduling as fast as possible")
 
 
 @pytest.mark.slow
