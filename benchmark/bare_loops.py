@@ -164,7 +164,7 @@ class Beside:
     @property
     def latest_us(self) -> float:
         """Largest lateness since its start [us]."""
-        return self._counts[2] / 1000.0
+        return float(self._counts[2]) / 1000.0
 
 
 def _only_sleep(counts: Any, ends: Any, priority: int) -> None:

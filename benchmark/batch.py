@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -115,7 +116,7 @@ class _Work:
         system = ODE(dynamics, self._scene.torque)
         slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
         for who, slope in slopes.items():
-            self.calls[name, who] = lambda slope=slope: _step(method, slope, 0.0, columns)
+            self.calls[name, who] = partial(_step, method, slope, 0.0, columns)
 
     def _add_varied(
         self,
@@ -228,9 +229,9 @@ def _print(rows: list[dict[str, Any]], seconds: dict[tuple[str, str], list[float
     for name in METHODS:
         for floor in (FLOOR, PLAIN):
             if (name, floor) in seconds:
-                over = ratio(seconds, (name, ONE), (name, floor))
-                met = "met" if over <= AT_MOST_C else "MISSED"
-                print(f"{name}: numba over {floor}, 1 thread each {over:.2f}, "
+                to_c = ratio(seconds, (name, ONE), (name, floor))
+                met = "met" if to_c <= AT_MOST_C else "MISSED"
+                print(f"{name}: numba over {floor}, 1 thread each {to_c:.2f}, "
                       f"target {AT_MOST_C}: {met}")  # fmt: skip
         for who in (variants.STAR, variants.BODIES):
             print(f"{name}: {who} over fixed {ratio(seconds, (name, who), (name, ONE)):.2f}")

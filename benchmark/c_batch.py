@@ -12,7 +12,9 @@ import re
 import subprocess
 from pathlib import Path
 
+from sst_ros.dynamics.expression import Program
 from sst_ros.integration.batch_source import batch_source
+from sst_ros.integration.methods import Tableau
 
 HEAD = """\
 #include <math.h>
@@ -29,7 +31,7 @@ NUMBERS = ("lo", "last", "n")
 """Names that are whole numbers; all others are double."""
 
 
-def source(program, margins, tableau, size: int) -> tuple[str, int]:
+def source(program: Program, margins: Program, tableau: Tableau, size: int) -> tuple[str, int]:
     """C text, and the number of its loops that shall be SIMD."""
     nodes = ", ".join(map(repr, tableau.c))
     lines = [HEAD, f"static const double NODES[] = {{{nodes}}};", SIGNATURE]

@@ -6,26 +6,30 @@ python -m benchmark.front_door
 `simulate` runs Example 2 at 1e-9 rad, compiled; the command is `sst-ros scene list`.
 """
 
+from __future__ import annotations
+
 import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from statistics import median
 
-from sst_ros import Simulation, load_scene, simulate
+from sst_ros import Simulation, Trajectory, load_scene, simulate
 from sst_ros.integration.gauss_motion import GaussMotion
 
 ROUNDS, CALLS, STARTS = 50, 40, 9
 
 
-def seconds(call):
+def seconds(call: Callable[[], object]) -> float:
+    """Time of a call, mean of several [s]."""
     began = time.perf_counter()
     for _ in range(CALLS):
         call()
     return (time.perf_counter() - began) / CALLS
 
 
-def processor_seconds(*words):
+def processor_seconds(*words: str) -> float:
     """Processor time of one start of Python [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True, timeout=60)
@@ -33,12 +37,13 @@ def processor_seconds(*words):
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def main():
+def main() -> None:
     scene = load_scene("example2_heavy")
     state = Simulation(scene).state
+    assert scene.torque is not None
     motion = GaussMotion(scene, scene.torque, [*state.quaternion, *state.body_rate], 1.0, 1e-9)
 
-    def whole():
+    def whole() -> Trajectory:
         return simulate(scene, method="gauss", tolerance=1e-9)
 
     found = whole()

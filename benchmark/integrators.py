@@ -14,7 +14,9 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from statistics import median
 
 from benchmark import machine as described
@@ -23,7 +25,7 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.scene.scene import Friction, JointFriction, Spring, Stroke, Workspace, load
+from sst_ros.scene.scene import Friction, JointFriction, Scene, Spring, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 
 REPEATS = 7
@@ -32,7 +34,7 @@ AT_LEAST = 5
 RESTS = (0.9, 0.7, 0.8)
 
 
-def sprung(stiffness, damping):
+def sprung(stiffness: float, damping: float) -> Scene:
     springs = [Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=RESTS[k]) for k in range(3)]
     return replace(
         load("example2_heavy"),
@@ -42,15 +44,23 @@ def sprung(stiffness, damping):
     )
 
 
-def scenes():
-    free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+def scenes() -> Iterator[tuple[str, Scene, float]]:
+    """Name, scene and length [s] of each."""
+    stroke, workspace = Stroke(at_end="ignore"), Workspace(at_edge="ignore")
+    free = replace(load("example2_heavy"), stroke=stroke, workspace=workspace)
     yield "viscous 1e3, 1 s", sprung(500.0, 1e3), 1.0
     yield "viscous 1e5, 1 s", sprung(500.0, 1e5), 1.0
     yield "PD 1e6, 1e4, 0.1 s", sprung(1e6, 1e4), 0.1
-    yield "example2_heavy, 1 s", replace(load("example2_heavy"), **free), 1.0
+    yield "example2_heavy, 1 s", free, 1.0
 
 
-def counts_for(machine, arguments, truth, wanted, most):
+def counts_for(
+    machine: CompiledMethod,
+    arguments: tuple[list[float], tuple[float, ...], float],
+    truth: Sequence[float],
+    wanted: float,
+    most: int,
+) -> int | None:
     """Smallest power of two of steps that reaches the error; None where none does."""
     y, drive, span = arguments
     count = 4
@@ -65,7 +75,8 @@ def counts_for(machine, arguments, truth, wanted, most):
     return None
 
 
-def compare(name, scene, span, wanted, compiled):
+def compare(name: str, scene: Scene, span: float, wanted: float, compiled: bool) -> None:
+    """Print the steps and the time of every method to an error [rad] on a scene."""
     dynamics = Dynamics.of(scene)
     system = ODE(dynamics, scene.torque)
     state = Simulation(replace(scene, torque=None)).state
@@ -77,8 +88,8 @@ def compare(name, scene, span, wanted, compiled):
     machines = {m.name: CompiledMethod(system, m, compiled=compiled) for m in METHODS.values()}
     most = MOST_STEPS if compiled else 2**13
     counts = {k: counts_for(m, arguments, truth, wanted, most) for k, m in machines.items()}
-    runs = {
-        k: lambda m=machines[k], n=n: m.step_fixed(0.0, span / n, n, y, drive)
+    runs: dict[str, Callable[[], object]] = {
+        k: partial(machines[k].step_fixed, 0.0, span / n, n, y, drive)
         for k, n in counts.items()
         if n is not None
     }
@@ -96,7 +107,7 @@ def compare(name, scene, span, wanted, compiled):
         print(f"{name:20} {how:6} {wanted:.0e}  best explicit / rodas4 = {ratio:.3g}{target}")
 
 
-def main():
+def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmark.integrators", description=__doc__)
     parser.add_argument("--plain", action="store_true", help="time plain Python too: minutes")
     options = parser.parse_args()

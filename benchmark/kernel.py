@@ -12,6 +12,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -87,8 +88,8 @@ def _calls(
         fast = CompiledMethod(system, method, compiled=True)
         plain = CompiledMethod(system, method, compiled=False)
         work = f"{name} step"
-        calls[work, NUMBA] = lambda fast=fast: fast.step_fixed(0.0, STEP, STEPS, y, [])
-        calls[work, PLAIN] = lambda plain=plain: plain.step_fixed(0.0, STEP, STEPS // 10, y, [])
+        calls[work, NUMBA] = partial(fast.step_fixed, 0.0, STEP, STEPS, y, [])
+        calls[work, PLAIN] = partial(plain.step_fixed, 0.0, STEP, STEPS // 10, y, [])
         if folder is not None:
             _add_c(calls, c_floor.source(system.program, method), y, folder, name, fast)
     return calls

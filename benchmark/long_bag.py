@@ -139,7 +139,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
         )
 
 
-def _patched(raw: bytes, stamps: Any, numbers: Array) -> Array:
+def _patched(raw: bytes, stamps: Any, numbers: Array) -> np.ndarray:
     """Copies of a serialized message with other stamps and numbers in the places of the marks."""
     rows = np.tile(np.frombuffer(raw, np.uint8), (len(numbers), 1))
     mark = np.float64(_MARK).tobytes()

@@ -266,8 +266,9 @@ def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> 
         if options.rounds:
             costs = bare_loops.compare(watch, options.seconds, options.rounds)
             yield printed("Processor time beside bare loops", f"{_COST}\n\n{costs}")
+        seconds = min(60.0 * options.minutes, 8.0) or 8.0
         runs = [
-            {"": f"run {k + 1}", **free_run(watch, 8.0, rate, given, read=read)}
+            {"": f"run {k + 1}", **free_run(watch, seconds, rate, given, read=read)}
             for k, (rate, read) in enumerate(
                 ((1000, True), (1000, False), (500, True), (500, False), (50, True))
             )

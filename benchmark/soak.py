@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from benchmark import machine
 from benchmark.campaign.processes import domain
@@ -73,7 +74,7 @@ def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> d
         processes[name] = make()
         stack.callback(processes[name].end)
 
-    rates = {"scene": SCENE, "rate": 1000, "publish_rate": 1000}
+    rates: dict[str, Any] = {"scene": SCENE, "rate": 1000, "publish_rate": 1000}
     waits = {"wait_for_command": "true", "publish_description": "true"}
     if control:
         add("recorder", lambda: Process("recorder", output=folder / "bag"))
@@ -83,7 +84,8 @@ def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> d
     if control:
         processes["recorder"].line()  # it has subscribed to the topics of the simulator
         given = {"scene": SCENE, "rate": 1000, "mode": "computed_torque", "hold": seconds + 60.0}
-        add("controller", lambda: Process("inverse_dynamics", min_subscribers=2, **given))
+        given["min_subscribers"] = 2
+        add("controller", lambda: Process("inverse_dynamics", "/", **given))
     return processes
 
 
@@ -177,8 +179,8 @@ def killed(folder: Path) -> tuple[int, list[str], list[str]]:
     before = existing()
     with ExitStack() as stack:
         processes = start(stack, folder, 0.0, control=False)
-        for process in processes.values():
-            until(lambda pid=process.pid: len(shared([pid])) >= 3, "shared memory")
+        every = processes.values()
+        until(lambda: all(len(shared([one.pid])) >= 3 for one in every), "shared memory")
         time.sleep(shared_memory.AGE_S + 1.0)  # a start removes what is older
         names = shared(process.pid for process in processes.values()) - before
         for process in processes.values():

@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -129,10 +130,10 @@ def _ratios(steps: int) -> dict[str, float]:
     times = []
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory() as folder:
-            whole = _timed(lambda folder=folder: _chunks(study, steps, folder))
+            whole = _timed(partial(_chunks, study, steps, folder))
         more = np.full(study.rows, np.nan), np.zeros(study.rows)
         arrays = y.copy(), given, code.copy(), *more
-        alone = _timed(lambda arrays=arrays: batch.advance(0, steps, study.length / steps, *arrays))
+        alone = _timed(partial(batch.advance, 0, steps, study.length / steps, *arrays))
         times.append((whole, alone))
     quotients = np.median([np.divide(*both) for both in times], axis=0)
     least = 1e6 * np.min(times, axis=0) / study.rows

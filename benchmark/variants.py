@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Link, Scene, Star
 
 COUNT = 100
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -14,7 +14,8 @@ STAR, BODIES = "numba, 1 thread, star.inertia varied", "numba, 1 thread, all bod
 
 def parameters(scene: Scene) -> dict[str, dict[str, np.ndarray]]:
     """Numbers that differ between scenarios: rotations and stretches of all bodies, by a little."""
-    rng, bodies = np.random.default_rng(2), {"star": scene.star}
+    rng = np.random.default_rng(2)
+    bodies: dict[str, Star | Link] = {"star": scene.star}
     bodies |= {f"actuated_links[{k}]": link for k, link in enumerate(scene.actuated_links)}
     bodies |= {f"intermediate_links[{k}]": link for k, link in enumerate(scene.intermediate_links)}
     turn = rng.uniform(-1.0, 1.0, (COUNT, 1)) * (1.0, -1.0, 0.0)

@@ -135,7 +135,7 @@ def services(budget: Budget, seed: int) -> Ledger:
             rng, caller = random.Random(seed + index), Client(number)
             kinds = [(SetBool, "pause", {"data": True}), (SetBool, "pause", {"data": False}),
                      (Trigger, "step", {}), (Trigger, "reset", {})]  # fmt: skip
-            clients = {name: caller.node.create_client(kind, f"{NODE}/{name}",
+            clients: dict[str, Any] = {name: caller.node.create_client(kind, f"{NODE}/{name}",
                                                              qos_profile=caller.qos)
                        for kind, name, _ in kinds}  # fmt: skip
             for one in clients.values():
@@ -170,8 +170,8 @@ def parameters(budget: Budget, seed: int) -> Ledger:
     from rclpy.parameter import Parameter
 
     ledger, rng = budget.ledger("parameters set at run time"), random.Random(seed)
-    values = (True, 0, -1, 2**62, 0.0, -0.0, 5e-324, 1e308, math.nan, math.inf, "", "x", [1.0],
-              ["a"], [])  # fmt: skip
+    values: list[Any] = [True, 0, -1, 2**62, 0.0, -0.0, 5e-324, 1e308, math.nan, math.inf]
+    values += ["", "x", [1.0], ["a"], []]
     with running() as (process, client):
         reply, _ = client.call(ListParameters, f"{NODE}/list_parameters")
         if reply is None:

@@ -96,7 +96,7 @@ class Client:
 
     def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> tuple[Any, float]:
         """Call a service; return the reply, or None, and how long it took [s]."""
-        client = self.node.create_client(kind, name, qos_profile=self.qos)
+        client: Any = self.node.create_client(kind, name, qos_profile=self.qos)
         try:
             if not self.until(client.service_is_ready):
                 return None, math.inf

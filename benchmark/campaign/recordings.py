@@ -88,7 +88,7 @@ def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: R
         if not np.array_equal(whole.gamma[kept], again.gamma):
             ledger.found("silent", f"{name}: recovered numbers differ")
         missing = len(whole.time_ns) - len(again.time_ns)
-        if missing and not (result.cut or getattr(result, "lost", 0)):
+        if missing and not (result.cut or getattr(result, "lost", False)):
             ledger.found("lost", f"{name}: {missing} samples missing and not reported", missing)
     shutil.rmtree(saved, ignore_errors=True)
 

@@ -22,8 +22,12 @@ from sst_ros.scene.yaml_document import read
 
 NUMBERS = (0, -1, 5e-324, 1e-320, 1e-12, 1e-9, 1e9, 1e18, 1e308, -1e308, 10**400, math.nan,
            math.inf, -math.inf, 1.5707963267948966)  # fmt: skip
-OTHERS = (None, True, "", "gamma_1", "\ud800", "\x1b[31m", [], {}, [[]], [{}], {"xx": 1}, "3_5",
-          "yes", "0o17", [1] * 50)  # fmt: skip
+OTHERS: tuple[Any, ...] = (
+    *(None, True, "", "gamma_1", "\ud800", "\x1b[31m", "3_5", "yes", "0o17"),
+    *([], {}, [[]], [{}], {"xx": 1}, [1] * 50),
+)
+Changes = dict[tuple[Any, ...], object]
+"""Values by their paths in a scene."""
 PERIOD_NS = 1_000_000
 CALIBRATION_STEPS = 50
 STEP_BOUND_S = 0.4
@@ -95,17 +99,17 @@ def _read(ledger: Ledger, name: str, source: str) -> None:
         raise
 
 
-def _extremes() -> dict[str, dict[tuple[Any, ...], object]]:
+def _extremes() -> dict[str, Changes]:
     """Changes of scene `swing` that make it as stiff, light or sharp as possible."""
     star = ("star", "inertia")
-    sharp = {
+    sharp: dict[str, Changes] = {
         f"Coulomb {c:g} N m, smoothing {s:g} rad/s": {
             ("friction",): {"gamma": {"coulomb": c, "smoothing": s}}
         }
         for c in (0.1, 5.0, 1e9)
         for s in (1e-2, 1e-6, 1e-9, 1e-12)
     }
-    needles = {
+    needles: dict[str, Changes] = {
         f"star diag(1, 1, {z:g})": {
             star: {"xx": 1.0, "yy": 1.0, "zz": z},
             ("actuated_links",): [{}],
@@ -113,22 +117,22 @@ def _extremes() -> dict[str, dict[tuple[Any, ...], object]]:
         }
         for z in (1e-3, 1e-6, 1e-9, 1e-12)
     }
-    light = {
+    light: dict[str, Changes] = {
         f"star diag({a:g}, {a:g}, {z:g})": {star: {"xx": a, "yy": a, "zz": z}}
         for a, z in ((1e-6, 1e-12), (1e-12, 1e-12), (1e6, 1e6), (1e-6, 1e-6))
     }
-    stiff = {
+    stiff: dict[str, Changes] = {
         f"viscous {v:g} N m s/rad": {("friction",): {"beta": {"viscous": v}}}
         for v in (1e2, 1e5, 1e9)
     }
-    springs = {
+    springs: dict[str, Changes] = {
         f"spring {k:g} N m/rad": {("springs",): [{"joint": "gamma_1", "stiffness": k, "rest": 0.8}]}
         for k in (1e3, 1e6, 1e9)
     }
-    fast = {
+    fast: dict[str, Changes] = {
         f"gamma_dot {w:g} rad/s": {("initial", "gamma_dot"): [w, -w, w]} for w in (1e2, 1e5, 1e8)
     }
-    lag = {
+    lag: dict[str, Changes] = {
         f"actuator lag {t:g} s": {("actuators",): {"time_constant": t}} for t in (1e-2, 1e-6, 1e-9)
     }
     return {**sharp, **needles, **light, **stiff, **springs, **fast, **lag}
@@ -220,7 +224,7 @@ def invariants(budget: Budget, seed: int) -> Ledger:
             scene = random_scene(rng)
             fine = Simulation(scene, tolerance=1e-13)
             plain = Simulation(scene, tolerance=1e-9)
-            torque = tuple(rng.uniform(-2, 2) for _ in range(3))
+            torque = rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
             for _ in range(100):
                 _finite(ledger, name, plain.step(torque, PERIOD_NS))
                 fine.step(torque, PERIOD_NS)
@@ -254,7 +258,7 @@ def bits(budget: Budget, seed: int) -> Ledger:
             warnings.simplefilter("error")
             scene = random_scene(rng)
             runs = [Simulation(scene, method, compiled=compiled) for compiled in (False, True)]
-            torque = tuple(rng.uniform(-2, 2) for _ in range(3))
+            torque = rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
             for _ in range(40):
                 plain, fast = (run.step(torque, PERIOD_NS) for run in runs)
                 if plain != fast:

@@ -45,7 +45,9 @@ class _Model:
         self.task, self.kind, self.radius = task, kind, radius
         self.system = exudyn.SystemContainer()
         self.mbs: Any = self.system.AddSystem()
-        self.markers, self.nodes, self.turned = {}, {}, {}
+        self.markers: dict[Any, Any] = {}
+        self.nodes: dict[Any, Any] = {}
+        self.turned: dict[Any, Any] = {}
         self._add_bodies(at)
         self._add_joints()
         self._add_torques()

@@ -94,6 +94,7 @@ class NativeCallback:
     def __init__(self, model: Model) -> None:
         import numba
         from numba import types
+        from numba.np.numpy_support import carray
 
         self._table = np.zeros(2, dtype=np.int64)
         table = int(self._table.ctypes.data)
@@ -103,14 +104,15 @@ class NativeCallback:
 
         @numba.cfunc(types.void(types.intp, types.intp))
         def callback(_model: Any, _data: Any) -> None:
-            addresses = numba.carray(words(table), 2)
-            t = numba.carray(doubles(addresses[0]), 1)[0]
-            force = numba.carray(doubles(addresses[1]), 7)
+            addresses = carray(words(table), 2)
+            t = carray(doubles(addresses[0]), 1)[0]
+            force = carray(doubles(addresses[1]), 7)
             force[p0] = a0 * math.sin(f0 * t + s0)
             force[p1] = a1 * math.sin(f1 * t + s1)
             force[p2] = a2 * math.sin(f2 * t + s2)
 
         self._kept = callback
+        assert callback.address is not None
         kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
         self.function = kind(callback.address)
 
@@ -129,8 +131,10 @@ class NativeCallback:
 
 def _pointer(kind: Any) -> Any:
     """A function for compiled code: address -> pointer to numbers of that kind."""
-    from numba import types
+    import numba
     from numba.extending import intrinsic
+
+    types: Any = numba.types
 
     @intrinsic
     def pointer(_context: Any, address: Any) -> Any:

@@ -23,7 +23,7 @@ ENGINE, PACKAGE = "MuJoCo", "mujoco"
 MOBILITIES, SETTLES = (0.01, 0.1, 1.0, 10.0), (0.003, 0.01, 0.03, 0.1)
 TOLERANCE = 1e-3
 
-Model = cache(Model)  # type: ignore[misc]
+model_of = cache(Model)
 
 
 def series(task: Task, quick: bool) -> list[Series]:
@@ -42,7 +42,7 @@ def series(task: Task, quick: bool) -> list[Series]:
             for mobility, settle in pairs
             for steps in ladder(40, last, factor)
         ]
-        gates = [Model(task, integrator, *pair, False) for pair in pairs]
+        gates = [model_of(task, integrator, *pair, False) for pair in pairs]
 
         def worst(at: Moving) -> np.ndarray:
             answers = [gate.acceleration(at) for gate in gates]
@@ -62,12 +62,12 @@ def series(task: Task, quick: bool) -> list[Series]:
 
 @cache
 def _callback(task: Task) -> NativeCallback:
-    return NativeCallback(Model(task, "RK4", MOBILITIES[0], SETTLES[1], False))
+    return NativeCallback(model_of(task, "RK4", MOBILITIES[0], SETTLES[1], False))
 
 
 def _native(task: Task, integrator: str, mobility: float, settle: float, steps: int) -> Setting:
     def prepare() -> Run:
-        model, callback = Model(task, integrator, mobility, settle, False), _callback(task)
+        model, callback = model_of(task, integrator, mobility, settle, False), _callback(task)
         callback.aim(model)
 
         def ready() -> None:
@@ -81,7 +81,7 @@ def _native(task: Task, integrator: str, mobility: float, settle: float, steps: 
 
 def _python(task: Task, integrator: str, mobility: float, settle: float, steps: int) -> Setting:
     def prepare() -> Run:
-        model = Model(task, integrator, mobility, settle, False)
+        model = model_of(task, integrator, mobility, settle, False)
         callback = python_callback(model)
         return _stepping(model, steps, lambda: model.mujoco.set_mjcb_control(callback))
 
@@ -116,7 +116,7 @@ def _rollout(task: Task, integrator: str, mobility: float, settle: float, steps:
     def prepare() -> Run:
         from mujoco import rollout
 
-        model = Model(task, integrator, mobility, settle, True)
+        model = model_of(task, integrator, mobility, settle, True)
         middles = (np.arange(steps) + 0.5) * (DURATION / steps)
         controls = np.array([task.torque_at(t) for t in middles])[None]
         model.reset(steps)

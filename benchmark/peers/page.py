@@ -10,6 +10,7 @@ from pandas import DataFrame
 from benchmark import machine
 from benchmark.peers import results as tables
 from benchmark.peers.results import Results
+from benchmark.peers.study import TARGETS
 from sst_ros.studies.results import markdown
 
 TEXT = """\
@@ -137,7 +138,7 @@ def _settings(results: Results) -> str:
     lines = ["The settings behind the best times:", ""]
     for engine in results.engines:
         parts = []
-        for target in tables.TARGETS:
+        for target in TARGETS:
             point = results.best(engine, target).point
             if point is not None:
                 method = next(c.series.name for c in results.curves if point in c.points)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Benchmarks of the nodes that are run by hand still run, for seconds."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+ROOT = Path(__file__).parents[2]
+
+
+def printed(name, *words):
+    """Return what a benchmark prints; it has a ROS domain of its own."""
+    argv = [sys.executable, "-m", f"benchmark.{name}", *words]
+    done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def rows(text):
+    """Cells of the tables, by the first cell of each row."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {first: others for first, *others in cells}
+
+
+def test_realtime():
+    pytest.importorskip("numba", reason="what is measured is compiled")
+    found = rows(printed("realtime", "--minutes", "0.05", "--rounds", "0"))
+    for recorded in found["recorded"]:
+        one, other = map(int, re.findall(r"\d+", recorded))
+        assert one == other > 1000
+    assert len(found["missed ticks, times those of the loop"]) == 2
+    assert [float(factor) > 1.0 for factor in found["real-time factor"]] == 5 * [True]
+    assert found["simulators"] == ["10"]
+
+
+def test_bare_loops():
+    pytest.importorskip("numba", reason="what is measured is compiled")
+    found = rows(printed("bare_loops", "--seconds", "1", "--rounds", "1"))
+    assert found["and looks for commands on 2 topics"][2] == "1.00"
+    assert all(float(cells[0]) > 0.0 for name, cells in found.items() if name not in ("", "---"))
+
+
+def test_soak():
+    pytest.importorskip("viser", reason="what is soaked has a viewer")
+    said = printed("soak", "--minutes", "0.3")
+    assert "missing 0;" in said and "WRONG" not in said
