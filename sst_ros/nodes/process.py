@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import importlib
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import rclpy
@@ -23,6 +25,9 @@ _POLL_S = 0.1
 """Longest delay of a signal. The executor would take half a millisecond for each look."""
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
+_CLEAN_UP_S = 10.0
+"""Longer than any clean-up of the middleware, also on a busy machine."""
+_STDERR = 2
 
 
 class Worker(Protocol):
@@ -74,9 +79,25 @@ def run(words: Sequence[str]) -> int:
         print(f"{command}: {error}", file=sys.stderr)
         return 1
     finally:
-        rclpy.try_shutdown()
+        with _bounded():
+            rclpy.try_shutdown()
         signals.ignore()
     return 0
+
+
+@contextlib.contextmanager
+def _bounded() -> Iterator[None]:
+    """End the process, with a traceback and status 1, where the middleware hangs for ten seconds.
+
+    Fast DDS 3.2 deadlocks now and then when another node leaves (eProsima/Fast-DDS issue 6502), and
+    rclpy holds the interpreter's lock while it gives up a node: neither another thread nor a signal
+    could end it from Python.
+    """
+    faulthandler.dump_traceback_later(_CLEAN_UP_S, exit=True, file=_STDERR)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 class _Callbacks(threading.Thread):
@@ -130,6 +151,7 @@ def spin(worker: Worker) -> None:
         try:
             worker.close()
         finally:
-            middleware.finish(worker.node.publishers)
-            callbacks.shut_down()
-            worker.node.destroy_node()
+            with _bounded():
+                middleware.finish(worker.node.publishers)
+                callbacks.shut_down()
+                worker.node.destroy_node()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The end of a process: by a signal, by its work, by a callback that fails."""
 
+import subprocess
+import sys
 import threading
 import time
 
@@ -66,3 +68,37 @@ def test_the_failure_of_a_callback_is_that_of_the_process(context, stop):
     with pytest.raises(SstError, match="the disk is full"):
         process.spin(worker)
     assert worker.closed.is_set()
+
+
+HANGS = """
+import ctypes, threading
+import rclpy
+from rclpy.node import Node
+from sst_ros.nodes import process
+
+class Hangs(Node):
+    def destroy_node(self):
+        # As in a deadlock of Fast DDS rclpy holds the interpreter's lock: PyDLL does, too.
+        ctypes.PyDLL(None).sleep(60)
+
+class Worker:
+    def __init__(self):
+        self.node, self.done = Hangs("worker"), threading.Event()
+        self.done.set()
+
+    def close(self):
+        print("closed", flush=True)
+
+process._CLEAN_UP_S = 1.0
+rclpy.init()
+process.spin(Worker())
+"""
+
+
+def test_a_node_ends_though_its_middleware_hangs(domain):
+    began = time.monotonic()
+    argv = [sys.executable, "-c", HANGS]
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=100, check=False)
+    assert time.monotonic() - began < 50.0  # it would wait for 60 s
+    assert (ended.returncode, ended.stdout) == (1, "closed\n")
+    assert "in destroy_node" in ended.stderr
