@@ -152,7 +152,7 @@ class Propagator:
         numbers = torque if type(torque) is tuple else self.torque.begin(torque, start)
         before = self._checkpoint(stepper)
         self._stepper = stepper
-        drive = (*numbers, *moment)
+        drive = (*numbers, *moment) if moment else numbers
         try:
             done = 0
             if stepper is self._constant:
