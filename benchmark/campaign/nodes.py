@@ -135,9 +135,10 @@ def services(budget: Budget, seed: int) -> Ledger:
             rng, caller = random.Random(seed + index), Client(number)
             kinds = [(SetBool, "pause", {"data": True}), (SetBool, "pause", {"data": False}),
                      (Trigger, "step", {}), (Trigger, "reset", {})]  # fmt: skip
-            clients: dict[str, Any] = {name: caller.node.create_client(kind, f"{NODE}/{name}",
-                                                             qos_profile=caller.qos)
-                       for kind, name, _ in kinds}  # fmt: skip
+            clients: dict[str, Any] = {}
+            for kind, name, _ in kinds:
+                service = f"{NODE}/{name}"
+                clients[name] = caller.node.create_client(kind, service, qos_profile=caller.qos)
             for one in clients.values():
                 caller.until(one.service_is_ready)
             for _ in budget.cases(1000, least=15):
