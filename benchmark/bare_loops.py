@@ -29,7 +29,7 @@ from typing import Any
 
 import rclpy
 
-from benchmark.nodes import Process, Watch, markdown
+from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.nodes import middleware, topics
 from sst_ros.nodes.messages import StateMessages, TorqueLog, stamp
 from sst_ros.nodes.polling import Reader
@@ -68,11 +68,11 @@ def libc_sleep() -> Callable[[int], None]:
     sleep, at, absolute = ctypes.CDLL(None).clock_nanosleep, _Timespec(), 1
     given = time.CLOCK_MONOTONIC, absolute, ctypes.byref(at), None
 
-    def until(until_ns: int) -> None:
+    def sleep_until(until_ns: int) -> None:
         at.seconds, at.nanoseconds = divmod(until_ns, 1_000_000_000)
         sleep(*given)
 
-    return until
+    return sleep_until
 
 
 def exchange(number: int, read: int) -> Callable[[int], None]:
@@ -89,11 +89,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     messages, log = StateMessages(), TorqueLog(2, TICK_NS)
     messages.fill(*Simulation("swing").sample)
     states = (messages.joints, messages.orientation, messages.euler)
-    end = time.monotonic() + 60.0
-    while not all(one.get_subscription_count() for one in publishers):
-        if time.monotonic() > end:
-            raise SystemExit("no recorder within 60 s")
-        time.sleep(0.01)
+    until(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
 
     def publish(stamp_ns: int) -> None:
         for reader in readers:
@@ -145,11 +141,7 @@ class Beside:
 
     def __enter__(self) -> Beside:
         self._process.start()
-        end = time.monotonic() + 60.0
-        while not self._counts[0]:
-            if time.monotonic() > end or not self._process.is_alive():
-                raise SystemExit("the loop beside the node does not run")
-            time.sleep(0.1)
+        until(lambda: self._counts[0], "loop beside the node", 60.0)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -173,11 +165,10 @@ def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
     realtime.quiet()
     pacer.start()
     while not ends.is_set():
-        for _ in range(100):
-            pacer.wait(lambda: False, ticks)
-            counts[0] += ticks
-            counts[1] = pacer.missed
-            counts[2] = max(counts[2], pacer.late_ns)
+        pacer.wait(lambda: False, ticks)
+        counts[0] += ticks
+        counts[1] = pacer.missed
+        counts[2] = max(counts[2], pacer.late_ns)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from typing import Any
 
 from benchmark import machine
 from benchmark.campaign.processes import domain
-from benchmark.nodes import Process
+from benchmark.nodes import Process, until
 from benchmark.realtime import table
 from sst_ros.nodes import shared_memory
 from sst_ros.recording import recording
@@ -83,9 +83,9 @@ def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> d
     add("subscriber", Subscriber)
     if control:
         processes["recorder"].line()  # it has subscribed to the topics of the simulator
-        given = {"scene": SCENE, "rate": 1000, "mode": "computed_torque", "hold": seconds + 60.0}
-        given["min_subscribers"] = 2
-        add("controller", lambda: Process("inverse_dynamics", "/", **given))
+        given: dict[str, Any] = {"scene": SCENE, "rate": 1000, "mode": "computed_torque"}
+        given |= {"hold": seconds + 60.0, "min_subscribers": 2}
+        add("controller", lambda: Process("inverse_dynamics", **given))
     return processes
 
 
@@ -119,15 +119,6 @@ def left(names: set[str], seconds: float = 10.0) -> list[str]:
             break
         time.sleep(0.2)
     return sorted(found)
-
-
-def until(condition: Callable[[], object], what: str, timeout: float = 120.0) -> None:
-    """Wait for a condition."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() > deadline:
-            raise SystemExit(f"no {what} within {timeout:g} s")
-        time.sleep(0.1)
 
 
 def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:

@@ -109,8 +109,8 @@ class Task:
     def kernel_answer(self, y: list[float], torque: Array) -> Array:
         """gamma_ddot [rad/s^2] of the kernel that sst_ros runs."""
         rate = np.array(self.dynamics.derivative(*y, *torque)[4:7])
-        q0, q1, q2, q3, *rates = y[:7]
-        rows, body_rate = rotation_rows((q0, q1, q2, q3)), (rates[0], rates[1], rates[2])
+        q0, q1, q2, q3, w0, w1, w2 = y[:7]
+        rows, body_rate = rotation_rows((q0, q1, q2, q3)), (w0, w1, w2)
         legs = [kernel.leg_motion(leg, rows, body_rate) for leg in self.dynamics.model.legs]
         at_rest = [kernel.rest_accelerations(at, body_rate)[1] for at in legs]
         answer: Array = np.array([at.g for at in legs]) @ rate + at_rest

@@ -34,7 +34,8 @@ def test_realtime():
         one, other = map(int, re.findall(r"\d+", recorded))
         assert one == other > 1000
     assert len(found["missed ticks, times those of the loop"]) == 2
-    assert [float(factor) > 1.0 for factor in found["real-time factor"]] == 5 * [True]
+    factors = [float(factor) for factor in found["real-time factor"]]
+    assert len(factors) == 5 and min(factors) > 1.0
     assert found["simulators"] == ["10"]
 
 
