@@ -39,6 +39,7 @@ from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
 
 TICK_NS = 1_000_000
+LOG_TICKS = 50
 NODE = "the node"
 LEAST = "and looks for commands on 2 topics"
 LOOPS: dict[str, tuple[int, str, int, int]] = {
@@ -86,7 +87,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     named = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ, topics.APPLIED_TORQUES)
     publishers = [topic.publisher(node, 1000) for topic in named]
     readers = [Reader(node, topic) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)[:read]]
-    messages, log = StateMessages(), TorqueLog(2, TICK_NS)
+    messages, log = StateMessages(), TorqueLog(LOG_TICKS, TICK_NS)
     messages.fill(*Simulation("swing").sample)
     states = (messages.joints, messages.orientation, messages.euler)
     until(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
@@ -96,7 +97,8 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
             reader.take(stamp_ns)
         if number > 3:
             log.append(ZERO, ZERO, 2)
-            publishers[3].publish(log.take(stamp_ns))
+            if len(log) == LOG_TICKS:
+                publishers[3].publish(log.take(stamp_ns))
         for one, message in zip(publishers, states, strict=False):
             one.publish(message.stamped(stamp(stamp_ns)))
 

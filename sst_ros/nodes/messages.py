@@ -187,7 +187,7 @@ class TorqueLog:
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
         self._rows: list[tuple[float, ...]] = []
-        # One layout for each number of ticks: mostly the usual one, none where there is no run.
+        # Allocated for the usual number of ticks, and for none, where there is no run.
         self._layouts = {count: self._layout(count) for count in (0, usual)}
 
     def __len__(self) -> int:
@@ -205,9 +205,7 @@ class TorqueLog:
     def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
         count = len(self._rows)
-        if count not in self._layouts:
-            self._layouts[count] = self._layout(count)
-        message, writes = self._layouts[count]
+        message, writes = self._layouts.get(count) or self._layout(count)
         for write, row in zip(writes, self._rows, strict=True):
             write(*row)
         self._rows.clear()

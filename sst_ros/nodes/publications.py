@@ -11,6 +11,7 @@ only add switches between threads.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from typing import Any
 
@@ -35,6 +36,9 @@ _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 _COUNT_NS = 20_000_000
 """Subscribers are counted this often: to count those of four topics takes as long as a tick."""
+_LOG_NS = 50_000_000
+"""Torques are published once for about this time: with each sample they would cost as much as all
+else in it."""
 
 
 class SimulatorTopics:
@@ -48,8 +52,8 @@ class SimulatorTopics:
     def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
         self._node = node
         self._clock = PublishedClock(node) if given.publish_clock else None
-        samples = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
-        depth = round(min(max(samples, _LEAST_DEPTH), _MOST_DEPTH))
+        history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
+        depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         self._joints, self._orientation, self._euler, self._torques = (
             topic.publisher(node, depth)
             for topic in (
@@ -72,8 +76,10 @@ class SimulatorTopics:
         self._awaited = self._named(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         moments = scene.moment is not None and scene.moment.topic
-        self._log = TorqueLog(given.ticks_per_sample, given.period_ns, moments=moments)
-        self._period_ns = given.period_ns
+        samples = math.ceil(_LOG_NS / (given.ticks_per_sample * given.period_ns))
+        self._log_ticks = samples * given.ticks_per_sample
+        self._log = TorqueLog(self._log_ticks, given.period_ns, moments=moments)
+        self._log_from_ns = 0
 
     def now_ns(self) -> int:
         """Return the ROS time [ns]; 0 as long as a followed clock has none."""
@@ -101,7 +107,7 @@ class SimulatorTopics:
         self._log.append(torque, moment, count)
 
     def sample(self, simulation: HasState, stamp_ns: int) -> None:
-        """Publish a sample of the run and the torques that led to it.
+        """Publish a sample of the run, and from time to time the torques logged up to it.
 
         Raises:
             NotFinite: nothing has been published.
@@ -112,13 +118,20 @@ class SimulatorTopics:
             self._samples.fill(*simulation.sample)
         if self._clock is not None:
             self._clock.publish(stamp_ns)
-        if (ticks := len(self._log)) and self._torques in self._read:
-            self._torques.publish(self._log.take(stamp_ns - ticks * self._period_ns))
-        else:
-            self._log.clear()
+        if not len(self._log):
+            self._log_from_ns = stamp_ns
+        elif len(self._log) >= self._log_ticks or self._torques not in self._read:
+            self.flush()
+            self._log_from_ns = stamp_ns
         at = stamp(stamp_ns)
         for publisher, message in self._states:
             publisher.publish(message.stamped(at))
+
+    def flush(self) -> None:
+        """Publish the torques that have been logged, if any and if they are subscribed to."""
+        if len(self._log) and self._torques in self._read:
+            self._torques.publish(self._log.take(self._log_from_ns))
+        self._log.clear()
 
     def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts.
@@ -127,7 +140,7 @@ class SimulatorTopics:
         """
         if self._clock is not None:
             self._clock.repeat()
-        self._log.clear()
+        self.flush()
         self._torques.publish(self._log.take(0))
         with contextlib.suppress(NotFinite):  # then the last valid one is shown
             self._idles.fill(state.quaternion, sum(state.joints, ()), state.torque)

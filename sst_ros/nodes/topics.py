@@ -111,8 +111,9 @@ APPLIED_TORQUES = Endpoint(
     PUBLISHES,
     "~/applied_torques",
     JointTrajectory,
-    "torques of every step since the last message [N m]; where the scene takes a moment from a "
-    "topic also moment_x, moment_y, moment_z in {B}",
+    "torques of every step since the last message [N m], with the sample after 50 ms of simulated "
+    "time and when the run pauses or ends; where the scene takes a moment from a topic also "
+    "moment_x, moment_y, moment_z in {B}",
     depth=0,
 )
 SCENE = Endpoint(PUBLISHES, "~/scene", String, "the scene, as YAML", 1, latched=True)

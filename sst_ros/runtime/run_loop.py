@@ -95,7 +95,8 @@ class RunLoop:
         while not pending.done.wait(_POLL_S):
             since = self._ticks.step_since
             stuck = since and time.perf_counter() - since > _STUCK_S
-            if stuck or self._ticks.stopped.is_set() or time.monotonic() > deadline:
+            ends = stuck or self._ticks.stopped.is_set() or time.monotonic() > deadline
+            if ends and not pending.done.is_set():  # it may have been served just before
                 with self._changing, contextlib.suppress(ValueError):  # it is being served
                     self._requests.remove((request, pending))
                 reason = self.fault or ("a step does not end" if stuck else "the node is ending")
@@ -129,11 +130,12 @@ class RunLoop:
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._thread, self._awaited_since = threading.current_thread(), time.monotonic()
         self._publish_phase()
-        act = {
+        act: dict[Phase, Callable[[], None]] = {
             Phase.WAITING: self._wait_for_start,
             Phase.RUNNING: self._to_next_sample,
             Phase.PAUSED: self._idle,
             Phase.FAULT: self._idle,
+            Phase.FINISHED: lambda: None,  # a step led to the end
         }
         warm = False
         while not (self._ticks.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
@@ -191,6 +193,7 @@ class RunLoop:
             if self.fault:
                 return Reply(False, self._status)
             if self._ticks.complete:
+                self._ticks.publish_rest()
                 self._to(Phase.FINISHED)
                 break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
@@ -277,9 +280,10 @@ class RunLoop:
 
     def _to_next_sample(self) -> None:
         done = self._ticks.to_next_sample(paced=True)
-        if self.fault:  # latched by `watch`: the step has ended after all
+        complete = done and self._ticks.complete
+        if complete or self.fault:  # a fault latched by `watch`: the step has ended after all
             self._ticks.publish_rest()
-        elif done and self._ticks.complete:
+        if complete:
             self._to(Phase.FINISHED)
 
     def _fail(self, reason: str) -> None:
@@ -297,8 +301,7 @@ class RunLoop:
         self._ticks.show(fault=bool(self.fault))
 
     def _end_of_run(self) -> None:
-        if self.phase is Phase.RUNNING:
-            self._ticks.publish_rest()
+        self._ticks.publish_rest()
         self.counters.hold()
         self._ticks.stopped.set()
         while self._requests:

@@ -68,7 +68,10 @@ class RunOutput(Protocol):
         """Log the torque [N m] and external moment [N m] of some ticks."""
 
     def sample(self, simulation: HasState, stamp_ns: int) -> None:
-        """Publish a sample of the run and the torques that led to it."""
+        """Publish a sample of the run, and from time to time the torques logged up to it."""
+
+    def flush(self) -> None:
+        """Publish the torques that are logged and not published."""
 
     def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts."""

@@ -223,6 +223,8 @@ class TickLoop:
         if self.begun and self._start_ns + self._tick * self._period_ns != self._stamp_ns:
             with contextlib.suppress(Exception):  # publishing may be what failed
                 self._publish()
+        with contextlib.suppress(Exception):
+            self._output.flush()
 
     def show(self, *, fault: bool) -> None:
         """Publish the state of a run that does not advance, marked as idle.

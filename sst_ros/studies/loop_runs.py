@@ -80,7 +80,7 @@ class LoopOutput:
     def _nothing(self, *_: Any, **__: Any) -> None:
         """Do nothing: there is nothing to publish to."""
 
-    start = ticks = idle = phase_changed = _nothing
+    start = ticks = flush = idle = phase_changed = _nothing
 
 
 def run_in_loop(

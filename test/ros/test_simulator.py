@@ -80,6 +80,18 @@ def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes,
     assert angles.y == pytest.approx(math.acos(e[2]), abs=1e-14)
 
 
+def test_torques_are_published_every_50_ms_and_at_the_end(nodes, observer):
+    applied = observer.listen(JointTrajectory, "/sst_simulator/applied_torques")
+    nodes.run("simulator", wait_for_command=True, duration=0.131)
+    observer.until(lambda: applied, "preview")
+    observer.publisher(Float64MultiArray, COMMANDS).publish(Float64MultiArray(data=[1.0, 0.0, 0.0]))
+    observer.until(lambda: sum(len(m.points) for m in applied) == 131, "torques of the 131 ticks")
+    messages = [m for m in applied if m.points]
+    assert [len(m.points) for m in messages] == [50, 50, 31]
+    begins = [nanoseconds(m) for m in messages]
+    assert begins == [begins[0] + k * 50_000_000 for k in range(3)]
+
+
 def test_bad_commands_are_dropped_whole_and_counted(nodes, observer):
     told = observer.listen(DiagnosticArray, "/diagnostics")
     states = observer.listen(JointState, "/joint_states")

@@ -27,6 +27,7 @@ class Output:
 
     def __init__(self):
         self.samples, self.acted, self.idles, self.phases = [], [], [], []
+        self.flushed, self.unpublished = 0, {}
         self.now, self.missing = 1_000_000_000, []
 
     def now_ns(self):
@@ -46,11 +47,15 @@ class Output:
     def sample(self, simulation, stamp_ns):
         self.samples.append((stamp_ns, simulation.state))
 
+    def flush(self):
+        self.flushed = len(self.acted)
+
     def idle(self, state, stamp_ns, *, at_rest):
         self.idles.append((state, at_rest, stamp_ns))
 
     def phase_changed(self, phase):
         self.phases.append(phase)
+        self.unpublished[phase.partition(":")[0]] = len(self.acted) - self.flushed
 
 
 class Queue(list):
@@ -114,6 +119,40 @@ def test_a_run_ends_after_its_duration_with_every_sample():
     assert stamps(bench) == [first + k * 1_000_000 for k in (0, 4, 8, 11)]
     assert len(bench.output.acted) == bench.loop.counters.ticks == 11
     assert bench.output.phases == ["waiting", "running", "finished"]
+
+
+def test_no_torque_is_unpublished_when_a_run_does_not_go_on():
+    bench = Bench(duration=0.0105, publish_rate=250)
+    bench.loop.run()
+    assert bench.output.unpublished["finished"] == 0 < bench.output.flushed == 11
+
+    bench = Bench(scene="example2_heavy")
+    with bench.running() as loop:
+        bench.until(lambda: bench.output.acted)
+        loop.ask(partial(loop.pause, True))
+        assert bench.output.unpublished["paused"] == 0 < bench.output.flushed
+        bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
+        loop.ask(partial(loop.pause, False))
+        bench.until(lambda: loop.phase is Phase.FAULT)
+        assert bench.output.unpublished["fault"] == 0
+
+    bench = Bench()
+    with bench.running() as loop:
+        bench.until(lambda: bench.output.acted)
+        loop.ask(partial(loop.pause, True))
+        assert loop.ask(loop.step).success
+    assert bench.output.flushed == len(bench.output.acted)  # it ends right after a step
+
+
+def test_a_run_that_is_stepped_to_its_end_is_finished_and_has_no_fault():
+    bench = Bench(duration=0.02, real_time_factor=0.01)
+    with bench.running() as loop:
+        bench.until(lambda: bench.output.acted)
+        loop.ask(partial(loop.pause, True))
+        assert loop.ask(partial(loop.step, 20)).success
+        bench.thread.join(10.0)
+    assert bench.output.phases[-2:] == ["paused", "finished"]
+    assert bench.output.unpublished["finished"] == 0
 
 
 def test_compiled_ticks_between_samples_are_done_together_and_commands_keep_their_tick():
