@@ -83,6 +83,7 @@ class CompiledMethod:
         if derivative is not None:
             self._module.__dict__["rhs"] = derivative
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
+        self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
         self._error = self._vector([0.0] * len(system.state))
         self.sizes: Any = self._vector([])
         self._at: StepPoint = ([], [], ())
@@ -186,10 +187,6 @@ class CompiledMethod:
         new = self._vector(y)
         self._module.step_fixed(t, h, count, self._vector(y), self._vector(d), new)
         return self._listed(new)
-
-    def _listed(self, y: Any) -> list[float]:
-        listed: list[float] = y.tolist() if self.compiled else list(y)
-        return listed
 
 
 def has_code(system: ODE, method: Method) -> bool:

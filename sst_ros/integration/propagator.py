@@ -148,8 +148,10 @@ class Propagator:
                 and nothing has changed.
 
         """
-        stepper = self._stepper_for(torque)
-        numbers = torque if type(torque) is tuple else self.torque.begin(torque, start)
+        if type(torque) is tuple:
+            stepper, numbers = self._constant, torque
+        else:
+            stepper, numbers = self._stepper_for(torque), self.torque.begin(torque, start)
         before = self._checkpoint(stepper)
         self._stepper = stepper
         drive = (*numbers, *moment) if moment else numbers

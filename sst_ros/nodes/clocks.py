@@ -90,7 +90,7 @@ class FollowedClock:
         """Return the time [ns]; 0 before the first /clock."""
         return int(self._clock.now().nanoseconds)
 
-    def sleep(self, ns: int) -> None:
+    def sleep(self, seconds: float, /) -> None:
         """Wait for the next /clock."""
         self._moved.wait(_LONGEST_WAIT_S)
         self._moved.clear()

@@ -163,18 +163,16 @@ def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
     sine, cosine = math.hypot(x, y), math.hypot(z, w)
     total = math.atan2(z, w) if cosine else 0.0
     difference = math.atan2(-x, y) if sine else 0.0
-    if not (sine and cosine):
-        theta, psi = 0.0, 2.0 * (total - difference)
-    else:
+    if sine and cosine:
         theta, psi = total + difference, total - difference
-    return _wrapped(theta), 2.0 * math.atan2(sine, cosine), _wrapped(psi)
-
-
-def _wrapped(angle: float) -> float:
-    """In (-pi, pi], as atan2 gives it."""
-    if angle > math.pi:
-        return angle - 2.0 * math.pi
-    return angle if angle > -math.pi else angle + 2.0 * math.pi
+    else:
+        theta, psi = 0.0, 2.0 * (total - difference)
+    # In (-pi, pi], as atan2 gives it.
+    if not -math.pi < theta <= math.pi:
+        theta -= math.copysign(2.0 * math.pi, theta)
+    if not -math.pi < psi <= math.pi:
+        psi -= math.copysign(2.0 * math.pi, psi)
+    return theta, 2.0 * math.atan2(sine, cosine), psi
 
 
 class TorqueLog:

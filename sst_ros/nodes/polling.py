@@ -9,31 +9,36 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from sst_ros.nodes.topics import Endpoint
+from sst_ros.runtime.torque_input import MOST_WAITING
 
-_LOOK_NS = 20_000_000
-"""Topics without publishers are looked at this often: to look costs 5 us at each wake, in which
-the processor's caches are cold. An event says when the first publisher is there."""
+_COUNT_NS = 20_000_000
+"""Publishers are counted this often, and a topic without any is looked at no more often: a look
+costs 5 us in a run that wakes for each sample, because the processor's caches are cold then."""
 
 
 class NeverSpun(CallbackGroup):
-    """Keeps the messages of subscriptions out of the executor, but not their events."""
+    """Keeps subscriptions out of the executor, and their events.
+
+    In a wait for an event of a subscription of Fast DDS, each message that has not been taken ends
+    the wait at once.
+    """
 
     def can_execute(self, entity: object) -> bool:
-        """Refuse messages."""
-        return not isinstance(entity, Subscription)
+        """Refuse."""
+        return False
 
     def beginning_execution(self, entity: object) -> bool:
-        """Refuse messages."""
-        return not isinstance(entity, Subscription)
+        """Refuse."""
+        return False
 
     def ending_execution(self, entity: object) -> None:
         """Do nothing."""
@@ -51,29 +56,38 @@ class Reader:
     """Messages of a topic, each as soon as it has arrived.
 
     Attributes:
-        waiting: a message is known that arrived after the time of the last `take`.
+        waiting: a message is known that arrived after the time last given to `arrived`.
 
     """
 
     def __init__(self, node: Node, topic: Endpoint) -> None:
-        events = SubscriptionEventCallbacks(matched=self._matched, use_default_callbacks=False)
         self._subscription = node.create_subscription(
-            topic.kind, topic.name, lambda _: None, topic.depth,
-            callback_group=NeverSpun(), event_callbacks=events,
-        )  # fmt: skip
+            topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
+        )
         self._next: tuple[Any, int] | None = None
-        self._look_ns = 0.0
-        self._publishers = 0
+        self._count_ns = 0.0
+        self._published = True
         self.waiting = False
 
-    def take(self, until_ns: float) -> Any:
-        """Return the next message if it arrived until this monotonic time [ns], or None."""
+    def arrived(self, until_ns: float) -> Sequence[Any]:
+        """Return the next messages that arrived until this monotonic time [ns], 50 at most.
+
+        The first of a new publisher may be returned 20 ms later, except where the time is infinite.
+        """
+        if self._count_ns <= until_ns < math.inf:
+            self._count_ns = until_ns + _COUNT_NS
+            self._published = self._subscription.get_publisher_count() > 0
+        elif not self._published and until_ns < math.inf:
+            return ()
+        found: list[Any] = []
+        while len(found) < MOST_WAITING and (message := self._take(until_ns)) is not None:
+            found.append(message)
+        return found
+
+    def _take(self, until_ns: float) -> Any:
         if self._next is None:
-            if until_ns < self._look_ns and not self._publishers:
-                return None
             # As bytes: otherwise an empty message is made each time that there is none.
             if (taken := take(self._subscription, raw=True)) is None:
-                self._look_ns = until_ns + _LOOK_NS if until_ns < math.inf else 0.0
                 return None
             data, information = taken
             message = deserialize_message(data, self._subscription.msg_type)
@@ -85,8 +99,3 @@ class Reader:
             return None
         self._next = None
         return message
-
-    def _matched(self, now: QoSSubscriptionMatchedInfo) -> None:
-        """Count publishers: called by the thread of callbacks."""
-        self._publishers = now.current_count
-        self._look_ns = 0.0  # also after the last has left: for what it left

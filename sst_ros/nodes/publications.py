@@ -118,9 +118,8 @@ class SimulatorTopics:
             self._samples.fill(*simulation.sample)
         if self._clock is not None:
             self._clock.publish(stamp_ns)
-        if not len(self._log):
-            self._log_from_ns = stamp_ns
-        elif len(self._log) >= self._log_ticks or self._torques not in self._read:
+        logged = len(self._log)
+        if logged >= self._log_ticks or not logged or self._torques not in self._read:
             self.flush()
             self._log_from_ns = stamp_ns
         at = stamp(stamp_ns)

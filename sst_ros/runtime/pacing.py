@@ -7,7 +7,9 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-_LONGEST_SLEEP_NS = 50_000_000
+_LONGEST_SLEEP_S = 0.05
+_TOGETHER_NS = 2_000_000
+"""Bounds the ticks that one sleep ends in, so that few commands wait."""
 
 
 class TimeSource(Protocol):
@@ -16,18 +18,15 @@ class TimeSource(Protocol):
     def now_ns(self) -> int:
         """Return the time [ns]."""
 
-    def sleep(self, ns: int) -> None:
-        """Wait for about this time [ns]; may return early."""
+    def sleep(self, seconds: float, /) -> None:
+        """Wait for about this time [s]; may return early."""
 
 
 class SteadyTime:
     """The monotonic clock of the machine."""
 
     now_ns = staticmethod(time.monotonic_ns)
-
-    def sleep(self, ns: int) -> None:
-        """Wait for this time [ns]."""
-        time.sleep(ns / 1e9)
+    sleep = staticmethod(time.sleep)
 
 
 class Pacer:
@@ -36,6 +35,8 @@ class Pacer:
     Attributes:
         speed: real-time factor; 0 for deadlines that have always come.
         interval_ns: time between deadlines [ns]; 0 without any.
+        together: ticks that one sleep of 2 ms may end in, 1 at least; 1 on a clock that is
+            followed: the next deadline is not known by it.
         missed: ticks dropped.
         overruns: times that ticks were dropped.
         jumps: times that the clock went back.
@@ -52,13 +53,6 @@ class Pacer:
         self._set(speed)
         self.missed = self.overruns = self.jumps = self.late_ns = 0
 
-    def ticks_within(self, ns: int) -> int:
-        """Return how many ticks one sleep of this length may end in, 1 at least.
-
-        It is 1 on a clock that is followed: the next deadline is not known by it.
-        """
-        return 1 if self._tolerance_ns else max(1, int(ns // self._interval))
-
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
         self._anchor = self._seen = self._source.now_ns()
@@ -72,6 +66,8 @@ class Pacer:
     def _set(self, speed: float) -> None:
         self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
         self.interval_ns = round(self._interval)
+        several = speed > 0.0 and self._tolerance_ns == 0
+        self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
 
     def excuse(self, ticks: int) -> None:
         """Put the deadlines off if the last of the next ticks is past: that is no overrun."""
@@ -83,11 +79,14 @@ class Pacer:
         return self._anchor + round((self._count + ticks - 1) * self._interval)
 
     def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
-        """Wait for the next deadline, or the last of several; False if interrupted before."""
+        """Wait for the next deadline, or the last of several; False if interrupted before.
+
+        That is asked after each sleep, the longest of which is 50 ms.
+        """
         if self.speed == 0.0:
             self.late_ns = 0
             return not interrupted()
-        due = self._due(ticks)
+        due, slept = self._due(ticks), False
         while True:
             now = self._source.now_ns()
             if now < self._seen:
@@ -97,9 +96,10 @@ class Pacer:
             self._seen = now
             if (late := now - due) >= 0:
                 break
-            if interrupted():
+            if slept and interrupted():
                 return False
-            self._source.sleep(min(-late, _LONGEST_SLEEP_NS))
+            self._source.sleep(min(-late / 1e9, _LONGEST_SLEEP_S))
+            slept = True
         if late >= self._interval and late >= self._tolerance_ns:
             dropped = int(late // self._interval)
             self.missed += dropped

@@ -143,7 +143,8 @@ class RunLoop:
                 if not warm:
                     warm = True
                     self._ticks.warm_up()
-                self._serve()
+                if self._ticks.requested.is_set():
+                    self._serve()
                 act[self.phase]()
             except NoSubscribers as missing:
                 self._fail(str(missing))
@@ -227,8 +228,6 @@ class RunLoop:
         self._show()
 
     def _serve(self) -> None:
-        if not self._ticks.requested.is_set():
-            return
         self._ticks.requested.clear()
         while self._requests:
             with self._changing:

@@ -21,8 +21,6 @@ _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.advance`, after which requests are served."""
-_LONGEST_SLEEP_NS = 2_000_000
-"""Bounds the ticks that one sleep ends in, so that few commands wait."""
 _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
@@ -34,12 +32,14 @@ class Counters:
         ticks, published: steps done and samples published.
         resets, states_set: number of resets and of states set.
         step_total_s, step_max_s: total time of the steps and longest mean time of one [s].
+        ticks_at_once: steps that one call may take: one as long as none has been measured.
 
     """
 
     def __init__(self) -> None:
         self.ticks = self.published = self.resets = self.states_set = 0
         self.step_total_s = self.step_max_s = 0.0
+        self.ticks_at_once = 1
         self._late_total = self._late_square = self._late_max = 0.0
         self._wall_s = 0.0
         self._resumed: float | None = None
@@ -61,6 +61,7 @@ class Counters:
         self.step_total_s += took_s
         if took_s > self.step_max_s * ticks:
             self.step_max_s = took_s / ticks
+            self.ticks_at_once = int(min(max(1.0, _AT_ONCE_S / self.step_max_s), _TICKS_AT_ONCE))
         late = 1e-3 * late_ns
         self._late_total += late * ticks
         self._late_square += late * late * ticks
@@ -194,8 +195,7 @@ class TickLoop:
         while True:
             ticks, unread = self._ticks_left(), 0
             if interval_ns:
-                longest_ns = _LONGEST_SLEEP_NS if self.simulation.compiled else 0
-                ticks = min(ticks, self._pacer.ticks_within(longest_ns))
+                ticks = min(ticks, self._pacer.together if self.simulation.compiled else 1)
             elif paced and not self._lockstep and self._output.unread:
                 unread = self._unread_samples(ticks)
                 ticks += unread * self._ticks_per_sample
@@ -213,6 +213,8 @@ class TickLoop:
                 self._kept = None
                 self._publish()
                 return True
+            if paced and self._interrupted():
+                return False
 
     def _interrupted(self) -> bool:
         late = self.requested.is_set() and time.monotonic() - self._waits_since > _LONGEST_WAIT_S
@@ -242,17 +244,14 @@ class TickLoop:
 
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
-        return min(left, self._ticks_at_once())
+        return min(left, self._last_tick - self._tick, self.counters.ticks_at_once)
 
     def _unread_samples(self, ticks: int) -> int:
         """Count samples behind the one that these ticks lead to, within what is done at once."""
         if (self._tick + ticks) % self._ticks_per_sample:
             return 0
-        return (self._ticks_at_once() - ticks) // self._ticks_per_sample
-
-    def _ticks_at_once(self) -> int:
-        most = max(1.0, _AT_ONCE_S / (self.counters.step_max_s or _AT_ONCE_S))
-        return int(min(self._last_tick - self._tick, _TICKS_AT_ONCE, most))
+        most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
+        return (most - ticks) // self._ticks_per_sample
 
     def _advance(self, torque: Triple, ticks: int) -> None:
         simulation, moment = self.simulation, self._input.moment
@@ -289,5 +288,6 @@ class TickLoop:
     def _publish(self) -> None:
         self._stamp_ns = self._start_ns + self._tick * self._period_ns
         self._output.sample(self.simulation, self._stamp_ns)
-        self._awaited_since = time.monotonic()
+        if self._lockstep:
+            self._awaited_since = time.monotonic()
         self.counters.published += 1

@@ -28,10 +28,10 @@ class Arrivals(Protocol):
 
     @property
     def waiting(self) -> bool:
-        """Whether a message is known that arrived after the time of the last `take`."""
+        """Whether a message is known that arrived after the time last given to `arrived`."""
 
-    def take(self, until_ns: float) -> Any:
-        """Return the next message if it arrived until this monotonic time [ns], or None."""
+    def arrived(self, until_ns: float) -> Sequence[Any]:
+        """Return the next messages that arrived until this monotonic time [ns], within bounds."""
 
 
 class HasParameters(Protocol):
@@ -81,7 +81,7 @@ class TorqueInput:
     def clear(self) -> None:
         """Forget the command and what has arrived: zero torque until the next command."""
         for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
-            _arrived(arrivals)
+            arrivals.arrived(math.inf)
         self._forget()
 
     def _forget(self) -> None:
@@ -144,9 +144,9 @@ class TorqueInput:
         ignored, because they may arrive late.
         """
         found: Vector3 | None = None
-        for _ in _arrived(self._commands):
+        for _ in self._commands.arrived(math.inf):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
-        for message in self._commanded():
+        for message in self._commanded(self._stamped.arrived(math.inf)):
             stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             try:
@@ -161,17 +161,17 @@ class TorqueInput:
         return found
 
     def _take(self, now_ns: int) -> None:
-        for message in _arrived(self._commands, now_ns):
+        for message in self._commands.arrived(now_ns):
             self._use(three, message.data, now_ns)
-        for message in self._commanded(now_ns):
-            self._use(torque_by_name, message, now_ns)
+        if found := self._stamped.arrived(now_ns):
+            for message in self._commanded(found):
+                self._use(torque_by_name, message, now_ns)
         if self._moments is not None:
             self._take_moments(now_ns)
 
-    def _commanded(self, until_ns: float = math.inf) -> Sequence[Any]:
+    def _commanded(self, found: Sequence[Any]) -> Sequence[Any]:
         """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""
-        found = _arrived(self._stamped, until_ns)
-        if not (found and self._owner.parameters.partial_commands):
+        if not self._owner.parameters.partial_commands:
             return found
         given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
         for message in given:
@@ -181,7 +181,7 @@ class TorqueInput:
     def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
             return
-        for message in _arrived(self._moments, math.inf if self._lockstep else now_ns):
+        for message in self._moments.arrived(math.inf if self._lockstep else now_ns):
             vector = message.wrench.torque
             try:
                 self.moment = three((vector.x, vector.y, vector.z), "moments [N m]")
@@ -216,16 +216,6 @@ class TorqueInput:
         self.timeouts += old and not self.stale
         self.stale = old
         return old
-
-
-def _arrived(arrivals: Arrivals, until_ns: float = math.inf) -> Sequence[Any]:
-    """Return what has arrived until this monotonic time [ns], within bounds."""
-    if (message := arrivals.take(until_ns)) is None:
-        return ()
-    found = [message]
-    while len(found) < MOST_WAITING and (message := arrivals.take(until_ns)) is not None:
-        found.append(message)
-    return found
 
 
 def three(data: Sequence[float], what: str = "torques [N m]") -> Vector3:

@@ -39,8 +39,8 @@ class _Parameters(SimulatorParameters):
 class _NoMessages:
     waiting = False
 
-    def take(self, until_ns: float) -> None:
-        return None
+    def arrived(self, until_ns: float) -> tuple[()]:
+        return ()
 
 
 class FunctionInput(TorqueInput):

@@ -18,7 +18,7 @@ from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.run_types import Phase, Reply
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, TorqueInput
+from sst_ros.runtime.torque_input import MOST_WAITING, ZERO, TorqueInput
 from sst_ros.simulation.simulation import Simulation
 
 
@@ -67,12 +67,14 @@ class Queue(list):
         super().__init__()
         self.asked = []
 
-    def take(self, until_ns):
+    def arrived(self, until_ns):
         self.asked.append(until_ns)
         if self.waiting and len(self.asked) <= 3:
-            return None
+            return ()
         self.waiting = False
-        return self.pop(0) if self else None
+        found = self[:MOST_WAITING]
+        del self[:MOST_WAITING]
+        return found
 
 
 class Bench:

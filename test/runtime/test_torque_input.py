@@ -9,7 +9,7 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, MessageRefused, TorqueInput, by_name
+from sst_ros.runtime.torque_input import MOST_WAITING, ZERO, MessageRefused, TorqueInput, by_name
 from sst_ros.scene.scene import Actuators
 from sst_ros.simulation.simulation import Simulation
 
@@ -33,8 +33,12 @@ class Queue(list):
     def waiting(self):
         return self.arrived_ns > 0 and len(self) > 0
 
-    def take(self, until_ns):
-        return self.pop(0) if self and self.arrived_ns <= until_ns else None
+    def arrived(self, until_ns):
+        if self.arrived_ns > until_ns:
+            return ()
+        found = self[:MOST_WAITING]
+        del self[:MOST_WAITING]
+        return found
 
 
 class Bench:
