@@ -6,6 +6,7 @@ import time
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
 from sst_ros.nodes import polling, topics
@@ -74,3 +75,18 @@ def test_without_a_time_every_command_is_taken_at_once(node):
     assert not reader.arrived(time.monotonic_ns())
     publish(node, 1.0, 2.0, 3.0)
     assert len(reader.arrived(math.inf)) == 1
+
+
+def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
+    """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
+    reader = polling.Reader(node, topics.COMMANDS)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    publish(node, 1.0, 2.0, 3.0)
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.0)  # what else there was to do
+    before = time.thread_time()
+    executor.spin_once(timeout_sec=1.0)
+    assert time.thread_time() - before < 0.05  # 0.002 asleep, up to 1.0 awake
+    assert len(reader.arrived(math.inf)) == 1
+    executor.shutdown()
