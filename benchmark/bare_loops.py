@@ -33,13 +33,14 @@ from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.nodes import middleware, topics
 from sst_ros.nodes.messages import StateMessages, TorqueLog, stamp
 from sst_ros.nodes.polling import Reader
+from sst_ros.nodes.publications import LOG_NS
 from sst_ros.runtime import realtime
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
 
 TICK_NS = 1_000_000
-LOG_TICKS = 50
+LOG_TICKS = LOG_NS // TICK_NS
 NODE = "the node"
 LEAST = "and looks for commands on 2 topics"
 LOOPS: dict[str, tuple[int, str, int, int]] = {

@@ -17,12 +17,9 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from sst_ros.nodes.graph import COUNT_NS
 from sst_ros.nodes.topics import Endpoint
 from sst_ros.runtime.torque_input import MOST_WAITING
-
-_COUNT_NS = 20_000_000
-"""Publishers are counted this often, and a topic without any is looked at no more often: a look
-costs 5 us in a run that wakes for each sample, because the processor's caches are cold then."""
 
 
 class NeverSpun(CallbackGroup):
@@ -70,12 +67,14 @@ class Reader:
         self.waiting = False
 
     def arrived(self, until_ns: float) -> Sequence[Any]:
-        """Return the next messages that arrived until this monotonic time [ns], 50 at most.
+        """Return the next messages that arrived until this monotonic time [ns].
 
-        The first of a new publisher may be returned 20 ms later, except where the time is infinite.
+        They are MOST_WAITING at most. A topic without publishers is looked at every 20 ms, because
+        a look costs 5 us in a run that wakes for each sample, with cold caches; at once where the
+        time is infinite.
         """
         if self._count_ns <= until_ns < math.inf:
-            self._count_ns = until_ns + _COUNT_NS
+            self._count_ns = until_ns + COUNT_NS
             self._published = self._subscription.get_publisher_count() > 0
         elif not self._published and until_ns < math.inf:
             return ()

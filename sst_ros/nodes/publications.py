@@ -24,6 +24,7 @@ from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
+from sst_ros.nodes.graph import COUNT_NS
 from sst_ros.nodes.messages import CdrMessage, NotFinite, StateMessages, TorqueLog, stamp
 from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
@@ -34,11 +35,9 @@ from sst_ros.simulation.simulation import State, Triple
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
-_COUNT_NS = 20_000_000
-"""Subscribers are counted this often: to count those of four topics takes as long as a tick."""
-_LOG_NS = 50_000_000
-"""Torques are published once for about this time: with each sample they would cost as much as all
-else in it."""
+LOG_NS = 50_000_000
+"""Torques are published once for about this time: with each sample they would take 16 us of the 180
+of a wake."""
 
 
 class SimulatorTopics:
@@ -76,7 +75,7 @@ class SimulatorTopics:
         self._awaited = self._named(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         moments = scene.moment is not None and scene.moment.topic
-        samples = math.ceil(_LOG_NS / (given.ticks_per_sample * given.period_ns))
+        samples = math.ceil(LOG_NS / (given.ticks_per_sample * given.period_ns))
         self._log_ticks = samples * given.ticks_per_sample
         self._log = TorqueLog(self._log_ticks, given.period_ns, moments=moments)
         self._log_from_ns = 0
@@ -94,7 +93,7 @@ class SimulatorTopics:
     @property
     def unread(self) -> bool:
         """Whether nothing receives samples, so that only the last of several has to be made."""
-        self._count_subscribers(_COUNT_NS)
+        self._count_subscribers(COUNT_NS)
         return not self._read and self._clock is None
 
     def start(self) -> None:
@@ -113,7 +112,7 @@ class SimulatorTopics:
             NotFinite: nothing has been published.
 
         """
-        self._count_subscribers(_COUNT_NS)
+        self._count_subscribers(COUNT_NS)
         if self._states:
             self._samples.fill(*simulation.sample)
         if self._clock is not None:

@@ -194,8 +194,7 @@ class RunLoop:
             if self.fault:
                 return Reply(False, self._status)
             if self._ticks.complete:
-                self._ticks.publish_rest()
-                self._to(Phase.FINISHED)
+                self._finish()
                 break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
@@ -279,11 +278,14 @@ class RunLoop:
 
     def _to_next_sample(self) -> None:
         done = self._ticks.to_next_sample(paced=True)
-        complete = done and self._ticks.complete
-        if complete or self.fault:  # a fault latched by `watch`: the step has ended after all
+        if self.fault:  # latched by `watch`: the step has ended after all
             self._ticks.publish_rest()
-        if complete:
-            self._to(Phase.FINISHED)
+        elif done and self._ticks.complete:
+            self._finish()
+
+    def _finish(self) -> None:
+        self._ticks.publish_rest()
+        self._to(Phase.FINISHED)
 
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
