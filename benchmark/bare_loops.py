@@ -31,13 +31,13 @@ import rclpy
 
 from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.nodes import middleware, topics
-from sst_ros.nodes.messages import StateMessages, TorqueLog, stamp
+from sst_ros.nodes.messages import StateMessages, TorqueLog, finite
 from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import LOG_NS
 from sst_ros.runtime import realtime
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
-from sst_ros.simulation.simulation import Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 
 TICK_NS = 1_000_000
 LOG_TICKS = LOG_NS // TICK_NS
@@ -89,8 +89,8 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     publishers = [topic.publisher(node, 1000) for topic in named]
     readers = [Reader(node, topic) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)[:read]]
     messages, log = StateMessages(), TorqueLog(LOG_TICKS, TICK_NS)
-    messages.fill(*Simulation("swing").sample)
-    states = (messages.joints, messages.orientation, messages.euler)
+    numbers = finite(*Simulation("swing").sample)
+    states = (messages.joint_states, messages.orientation, messages.euler_zyz)
     until(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
 
     def publish(stamp_ns: int) -> None:
@@ -100,8 +100,9 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
             log.append(ZERO, ZERO, 2)
             if len(log) == LOG_TICKS:
                 publishers[3].publish(log.take(stamp_ns))
+        at = divmod(stamp_ns, NANOSECONDS)
         for one, message in zip(publishers, states, strict=False):
-            one.publish(message.stamped(stamp(stamp_ns)))
+            one.publish(message(at, numbers))
 
     return publish
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
@@ -25,12 +26,14 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
 from sst_ros.nodes.graph import COUNT_NS
-from sst_ros.nodes.messages import CdrMessage, NotFinite, StateMessages, TorqueLog, stamp
+from sst_ros.nodes.messages import NotFinite, Numbers, StateMessages, TorqueLog, finite
 from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.torque_input import ZERO
+from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.simulation import State, Triple
+from sst_ros.simulation.simulation import NANOSECONDS, State, Triple
 
 _HISTORY_S = 2
 _FAST = 10
@@ -38,6 +41,10 @@ _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180
 of a wake."""
+
+Message = Callable[[tuple[int, int], Numbers], bytes]
+"""Makes a message of a stamp (s, ns) and the numbers of a state."""
+_AT_REST = (0.0,) * len(JOINTS)
 
 
 class SimulatorTopics:
@@ -63,7 +70,7 @@ class SimulatorTopics:
             )
         )
         self._read: list[Publisher[Any]] = []
-        self._states: list[tuple[Publisher[Any], CdrMessage]] = []
+        self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
         self._phase = topics.PHASE.publisher(node)
         self._scene = topics.SCENE.publisher(node)
@@ -74,6 +81,7 @@ class SimulatorTopics:
         self.diagnostics = topics.DIAGNOSTICS.publisher(node)
         self._awaited = self._named(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
+        self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
         samples = math.ceil(LOG_NS / (given.ticks_per_sample * given.period_ns))
         self._log_ticks = samples * given.ticks_per_sample
@@ -113,17 +121,16 @@ class SimulatorTopics:
 
         """
         self._count_subscribers(COUNT_NS)
-        if self._states:
-            self._samples.fill(*simulation.sample)
+        numbers = finite(*simulation.sample)
         if self._clock is not None:
             self._clock.publish(stamp_ns)
         logged = len(self._log)
         if logged >= self._log_ticks or not logged or self._torques not in self._read:
             self.flush()
             self._log_from_ns = stamp_ns
-        at = stamp(stamp_ns)
+        at = divmod(stamp_ns, NANOSECONDS)
         for publisher, message in self._states:
-            publisher.publish(message.stamped(at))
+            publisher.publish(message(at, numbers))
 
     def flush(self) -> None:
         """Publish the torques that have been logged, if any and if they are subscribed to."""
@@ -141,13 +148,14 @@ class SimulatorTopics:
         self.flush()
         self._torques.publish(self._log.take(0))
         with contextlib.suppress(NotFinite):  # then the last valid one is shown
-            self._idles.fill(state.quaternion, sum(state.joints, ()), state.torque)
+            self._valid = finite(state.quaternion, sum(state.joints, ()), state.torque)
+        quaternion, joints, torque = self._valid
         if at_rest:
-            self._idles.set_at_rest()
+            joints, torque = (*joints[:9], *_AT_REST), ZERO
         self._count_subscribers(0)
         for publisher, message in self._messages(self._idles):
-            at = stamp_ns if publisher is self._joints else 0
-            publisher.publish(message.stamped(stamp(at)))
+            at = divmod(stamp_ns, NANOSECONDS) if publisher is self._joints else (0, 0)
+            publisher.publish(message(at, (quaternion, joints, torque)))
 
     def phase_changed(self, phase: str) -> None:
         """Publish and log the phase, with the reason of a fault."""
@@ -171,10 +179,10 @@ class SimulatorTopics:
             self._read = [topic for topic in every if topic.get_subscription_count()]
             self._states = self._messages(self._samples)
 
-    def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], CdrMessage]]:
+    def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], Message]]:
         """Messages of a state whose topics have subscribers."""
         publishers = (self._joints, self._orientation, self._euler)
-        pairs = zip(publishers, (of.joints, of.orientation, of.euler), strict=True)
+        pairs = zip(publishers, (of.joint_states, of.orientation, of.euler_zyz), strict=True)
         return [pair for pair in pairs if pair[0] in self._read]
 
     def _named(self, names: tuple[str, ...]) -> list[Publisher[Any]]:

@@ -21,6 +21,7 @@ from sst_ros.nodes.messages import (
     StateMessages,
     TorqueLog,
     clock_message,
+    finite,
     stamp,
 )
 from sst_ros.nodes.messages import (
@@ -39,17 +40,16 @@ def state():
     return simulation.step((1.0, 2.0, 3.0), 50_000_000)
 
 
-def stamped(messages, stamp_ns):
+def stamped(messages, stamp_ns, state):
     """joint_states, orientation, euler_zyz."""
-    return [
-        message.stamped(stamp(stamp_ns))
-        for message in (messages.joints, messages.orientation, messages.euler)
-    ]
+    numbers, at = finite(*sample(state)), divmod(stamp_ns, 10**9)
+    made = messages.joint_states, messages.orientation, messages.euler_zyz
+    return [message(at, numbers) for message in made]
 
 
-def numbers(state):
-    """Those of `Simulation.sample`."""
-    return state.quaternion, sum(state.joints, ()), state.torque
+def sample(state):
+    """Return what `Simulation.sample` returns."""
+    return [*state.quaternion, *state.body_rate], sum(state.joints, ()), state.torque
 
 
 def strictly(data, name):
@@ -58,9 +58,7 @@ def strictly(data, name):
 
 
 def test_a_state_is_read_as_it_is(state):
-    messages = StateMessages()
-    messages.fill(*numbers(state))
-    joints, orientation, euler = stamped(messages, STAMP_NS)
+    joints, orientation, euler = stamped(StateMessages(), STAMP_NS, state)
     read = deserialize_message(joints, JointState)
     at = state.joints
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
@@ -74,18 +72,15 @@ def test_a_state_is_read_as_it_is(state):
     read = deserialize_message(euler, Vector3Stamped).vector
     expected = zyz_angles(rotation_matrix(state.quaternion))
     np.testing.assert_allclose((read.x, read.y, read.z), expected, atol=1e-14)
-    messages.set_at_rest()
-    read = strictly(stamped(messages, 0)[0], "sensor_msgs/msg/JointState")
-    assert not read.velocity.any() and not read.effort.any() and read.position.all()
+    strictly(joints, "sensor_msgs/msg/JointState")
     strictly(orientation, "geometry_msgs/msg/QuaternionStamped")
     strictly(euler, "geometry_msgs/msg/Vector3Stamped")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_what_is_not_finite_is_not_taken_over(state, bad):
-    messages = StateMessages()
-    messages.fill(*numbers(state))
-    before = stamped(messages, 5)
+def test_what_is_not_finite_is_refused(state, bad):
+    quaternion, joints, torque = finite(*sample(state))
+    assert (tuple(quaternion), joints, torque) == (state.quaternion, *sample(state)[1:])
     joints = state.joints._replace(mu_dot=(0.0, bad, 0.0))
     for broken in (
         replace(state, joints=joints),
@@ -93,8 +88,7 @@ def test_what_is_not_finite_is_not_taken_over(state, bad):
         replace(state, quaternion=(bad, *state.quaternion[1:])),
     ):
         with pytest.raises(NotFinite, match="not finite"):
-            messages.fill(*numbers(broken))
-    assert stamped(messages, 5) == before
+            finite(*sample(broken))
 
 
 @pytest.mark.parametrize("moments", [False, True])
@@ -130,13 +124,12 @@ def test_ticks_noted_at_once_are_those_noted_one_by_one():
 @pytest.mark.parametrize("frame_id", ["", "idle", "four"])
 def test_the_layout_is_that_of_the_middleware(state, frame_id):
     """Byte for byte, except padding, which the middleware leaves as it is."""
-    messages = StateMessages(frame_id)
-    messages.fill(*numbers(state))
+    states = stamped(StateMessages(frame_id), 7, state)
     log = TorqueLog(2, 1_000_000, moments=True)
     log.append((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 2)
     clock = clock_message().stamped(stamp(STAMP_NS))
     kinds = (JointState, QuaternionStamped, Vector3Stamped, JointTrajectory, Clock)
-    for data, kind in zip([*stamped(messages, 7), log.take(9), clock], kinds, strict=True):
+    for data, kind in zip([*states, log.take(9), clock], kinds, strict=True):
         again = serialize_message(deserialize_message(data, kind))
         assert all(ours == theirs for ours, theirs in zip(data, again, strict=False) if ours), kind
         assert deserialize_message(again, kind) == deserialize_message(data, kind)
