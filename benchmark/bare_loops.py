@@ -4,9 +4,10 @@
 python -m benchmark.bare_loops [--seconds 20] [--rounds 3]   # scene swing, compiled, 1 kHz
 
 All keep the deadlines of the node, one after the other, several times in turn, each with a recorder
-of its own where messages are published. The loops publish what the node publishes, as serialised
-bytes with a new stamp, look for commands as the node does, and do nothing else: no program with
+of its own where messages are published. The loops make and publish the messages of the node, of one
+state with a new stamp, look for commands as the node does, and do nothing else: no program with
 these topics costs less by rclpy.
+Each is measured as the machine is, and where it is asked to let no core sleep (cpu_dma_latency 0).
 """
 
 from __future__ import annotations
@@ -107,8 +108,10 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     return publish
 
 
-def run_loop(name: str, seconds: float) -> dict[str, float]:
+def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
+    latency = realtime.CpuDmaLatency()
+    latency.request(latency_us)
     ticks, sleeper, number, read = LOOPS[name]
     publish = exchange(number, read) if number else None
     sleep = python_sleep if sleeper == "python" else libc_sleep()
@@ -187,17 +190,17 @@ def recorder() -> Iterator[None]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def measure(watch: Watch, name: str, seconds: float) -> dict[str, float]:
-    """Measure a loop, or the node, in a process of its own."""
+def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> dict[str, float]:
+    """Measure a loop, or the node, in a process of its own, with this cpu_dma_latency."""
     with recorder():
         if name != NODE:
             command = [sys.executable, "-m", "benchmark.bare_loops", "--loop", name]
-            command += ["--seconds", str(seconds)]
+            command += ["--seconds", str(seconds), "--cpu-dma-latency", str(latency_us)]
             found = subprocess.run(command, check=True, capture_output=True, text=True)
             return dict(json.loads(found.stdout))
         full = "/sst_simulator"
         watch.values.clear()
-        simulator = Process("simulator", scene="swing", compiled="true")
+        simulator = Process("simulator", scene="swing", compiled="true", cpu_dma_latency=latency_us)
         try:
             watch.until(lambda: watch.phase(full) == "running", "run")
             watch.spin(2.5)
@@ -212,21 +215,38 @@ def measure(watch: Watch, name: str, seconds: float) -> dict[str, float]:
     return {"processor": 100.0 * used / wall, "missed": 100.0 * missed / max(1, ticks + missed)}
 
 
+def refused(latency_us: int) -> str | None:
+    """Return why this exit latency cannot be asked for here, None where it can."""
+    said = realtime.CpuDmaLatency().request(latency_us)
+    return said if realtime.NO_LIMIT in said else None
+
+
 def compare(watch: Watch, seconds: float, rounds: int) -> str:
-    """Measure all in turn; Markdown, a row for each."""
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in (NODE, *LOOPS)}
+    """Measure all in turn; Markdown, a row for each, a table for each cpu_dma_latency."""
+    settings = {-1: "no limit of the exit latency, the default"}
+    if (said := refused(0)) is None:
+        settings[0] = "`cpu_dma_latency` 0"
+    found: dict[tuple[int, str], list[dict[str, float]]] = {
+        (latency_us, name): [] for name in (NODE, *LOOPS) for latency_us in settings
+    }
     for _ in range(rounds):
-        for name, runs in found.items():
-            runs.append(measure(watch, name, seconds))
-    least = [run["processor"] for run in found[LEAST]]
-    rows = [["", "processor [% of a core]", "of each run", "times the least", "missed ticks [%]"]]
-    for name, runs in found.items():
-        used = [run["processor"] for run in runs]
-        each = ", ".join(f"{one:.1f}" for one in used)
-        ratio = median(a / b for a, b in zip(used, least, strict=True))
-        missed = mean(run["missed"] for run in runs)
-        rows.append([name, f"{median(used):.1f}", each, f"{ratio:.2f}", f"{missed:.3f}"])
-    return markdown(rows)
+        for (latency_us, name), runs in found.items():
+            runs.append(measure(watch, name, seconds, latency_us))
+    tables = []
+    for latency_us, title in settings.items():
+        least = [run["processor"] for run in found[latency_us, LEAST]]
+        rows = [[title, "processor [% of a core]", "of each run", "times the least", "missed [%]"]]
+        for name in (NODE, *LOOPS):
+            runs = found[latency_us, name]
+            used = [run["processor"] for run in runs]
+            each = ", ".join(f"{one:.1f}" for one in used)
+            ratio = median(a / b for a, b in zip(used, least, strict=True))
+            missed = mean(run["missed"] for run in runs)
+            rows.append([name, f"{median(used):.1f}", each, f"{ratio:.2f}", f"{missed:.3f}"])
+        tables.append(markdown(rows))
+    if said is not None:
+        tables.append(f"With `cpu_dma_latency` 0: {said}.")
+    return "\n\n".join(tables)
 
 
 def main() -> None:
@@ -235,10 +255,11 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=20.0, help="of each run")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--cpu-dma-latency", type=int, default=-1, help="of --loop [us]")
     parser.add_argument("--loop", choices=LOOPS, help="run this loop alone, in this process")
     options = parser.parse_args()
     if options.loop:
-        print(json.dumps(run_loop(options.loop, options.seconds)))
+        print(json.dumps(run_loop(options.loop, options.seconds, options.cpu_dma_latency)))
         return
     with Watch.started() as watch:
         print(compare(watch, options.seconds, options.rounds))

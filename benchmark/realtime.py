@@ -4,10 +4,11 @@
 python -m benchmark.realtime --minutes 10 --write   # the official figures, on an idle machine
 python -m benchmark.realtime --fleet 10 --rate 200  # namespaced simulators side by side
 
-Simulator and recorder run for so long with SCHED_FIFO, half as long without; in the same minutes
-a loop that only sleeps to the same deadlines, in a process of its own at the same priority,
-measures what the machine itself misses. Then the simulator runs as fast as possible, without and
-with a subscriber to joint_states, then a fleet. Commands of zero torque come at 100 Hz.
+Simulator and recorder run for so long with SCHED_FIFO, half as long with cpu_dma_latency 0 as well,
+and as long with neither; in the same minutes a loop that only sleeps to the same deadlines, in a
+process of its own at the same priority, measures what the machine itself misses. Then the simulator
+runs as fast as possible, without and with a subscriber to joint_states, then a fleet. Commands of
+zero torque come at 100 Hz.
 """
 
 from __future__ import annotations
@@ -97,6 +98,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
         said = watch.values[name]
         return {
             "scheduling": said["scheduling"],
+            "cpu_dma_latency": said["cpu_dma_latency"],
             "length [min]": f"{wall / 60.0:.1f}",
             **_compared(np.diff(counts, axis=0)),
             "lateness, mean [us]": f"{float(said['late_mean_us']):.0f}",
@@ -226,7 +228,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--minutes", type=float, default=1.0, help="of each run at 1 kHz; 0: none")
-    parser.add_argument("--usual", type=float, help="minutes without SCHED_FIFO; half as many")
+    parser.add_argument("--usual", type=float, help="minutes of the other two runs; half as many")
     parser.add_argument("--scene", default="example2_heavy")
     parser.add_argument("--plain", action="store_true", help="plain Python, no machine code")
     parser.add_argument("--priority", type=int, default=20, help="of SCHED_FIFO")
@@ -239,6 +241,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     given = {"scene": options.scene, "compiled": str(not options.plain).lower()}
+    given["realtime_priority"] = options.priority
     if not options.plain:
         made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
@@ -256,14 +259,16 @@ def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> 
 
     if not options.fleet:
         if options.minutes:
-            both = [
-                {"": name, **keep_time(watch, minutes, {**given, "realtime_priority": priority})}
-                for name, minutes, priority in (
-                    ("SCHED_FIFO asked for", options.minutes, options.priority),
-                    ("not", options.usual or options.minutes / 2.0, 0),
+            usual = options.usual or options.minutes / 2.0
+            kept = [
+                {"": name, **keep_time(watch, minutes, {**given, **more})}
+                for name, minutes, more in (
+                    ("SCHED_FIFO", options.minutes, {}),
+                    ("and `cpu_dma_latency` 0", usual, {"cpu_dma_latency": 0}),
+                    ("neither", usual, {"realtime_priority": 0}),
                 )
             ]
-            yield printed("1 kHz, 500 samples a second, recorder attached", table(both))
+            yield printed("1 kHz, 500 samples a second, recorder attached", table(kept))
         if options.rounds:
             costs = bare_loops.compare(watch, options.seconds, options.rounds)
             yield printed("Processor time beside bare loops", f"{_COST}\n\n{costs}")
@@ -289,9 +294,13 @@ def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> 
 _COST = """\
 Scene swing, compiled, 1 kHz, 500 samples a second, with a recorder, by
 `python -m benchmark.bare_loops`: each in a process of its own, in turn. The recorder subscribes to
-four topics: the loop that publishes four and looks for commands on two is the least that a program
-with the topics of the node costs here by rclpy. What the node adds is two steps in one compiled
-call, the joints of the sample, its log of torques, the executor and the diagnostics."""
+four topics: the loop that makes and publishes four, and looks for commands on two, is the least
+that a program with the topics of the node costs here by rclpy. What the node adds is two steps in
+one compiled call, the joints of the sample, its log of torques, the executor and the diagnostics.
+
+With `cpu_dma_latency` 0 no core sleeps (the whole machine is asked, so the loops have it too): the
+difference is what it costs to leave an idle state, to wake the recorder on a core that sleeps, and
+the caches that are cold afterwards."""
 
 _HEAD = """\
 # Real-time performance: missed ticks, lateness, processor load

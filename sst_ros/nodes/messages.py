@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the simulator, laid out once; afterwards only their numbers are written.
+"""Messages of the simulator: the layout is made once, afterwards only numbers are written.
 
 They are bytes, which `Publisher.publish` takes: CDR, little-endian (OMG DDS-XTypes, XCDR1). To
 convert a message object each time costs three times as much as the rest of publishing it

@@ -52,6 +52,7 @@ class Simulator:
         self._code = (
             CodeCompiler(self.node, simulated, given) if given.compiled and traced else None
         )
+        self._latency = realtime.CpuDmaLatency()
         self._loop = RunLoop(simulated, self._build, self, self._input, self._pacer, self._topics)
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
@@ -73,6 +74,7 @@ class Simulator:
         """
         self._loop.stop()
         self.done.set()
+        self._latency.request(-1)
         self._thread.join(_END_S)
         if not self._thread.is_alive():
             self._read_gauges()
@@ -143,14 +145,18 @@ class Simulator:
         given, thread = self.parameters, self._thread.native_id
         if thread is None or not self._thread.is_alive():
             return
-        priority = given.realtime_priority if given.real_time_factor else 0
+        paced, log = given.real_time_factor > 0.0, self.node.get_logger()
         try:
-            granted = realtime.schedule(priority, thread)
+            granted = realtime.schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
         if granted != self._diagnostics.scheduling:
             self._diagnostics.scheduling = granted
-            self.node.get_logger().info(f"scheduling of the run: {granted}")
+            log.info(f"scheduling of the run: {granted}")
+        granted = self._latency.request(given.cpu_dma_latency if paced else -1)
+        if granted != self._diagnostics.cpu_dma_latency:
+            self._diagnostics.cpu_dma_latency = granted
+            log.info(f"exit latency of idle states: {granted}")
 
     def _read_gauges(self) -> Reply:
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)

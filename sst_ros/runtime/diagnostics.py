@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from sst_ros.dynamics.limits import limits_of
+from sst_ros.runtime import realtime
 from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import RunLoop
@@ -65,6 +66,7 @@ KEYS = {
     "resets": "times that the run began anew",
     "states_set": "times that a state was set",
     "scheduling": "scheduling of the thread of the run",
+    "cpu_dma_latency": "largest exit latency of idle states that the machine was asked to use",
     **GAUGES,
     "fault": "reason why the run stopped",
 }
@@ -90,7 +92,7 @@ class RunDiagnostics:
     ) -> None:
         self._loop, self._input, self._pacer, self._period_s = loop, torque_input, pacer, period_s
         self.gauges: dict[str, object] = {}
-        self.scheduling = ""
+        self.scheduling, self.cpu_dma_latency = "", realtime.NO_LIMIT
         self._before = (0, 0.0)
         self._noted = (0, 0, 0, 0)
         self._warned: list[str] = []
@@ -138,6 +140,7 @@ class RunDiagnostics:
             "resets": count.resets,
             "states_set": count.states_set,
             "scheduling": self.scheduling,
+            "cpu_dma_latency": self.cpu_dma_latency,
             **self.gauges,
             "fault": self._loop.fault,
         }

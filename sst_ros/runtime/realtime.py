@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real-time scheduling of the threads of the node, and quiet garbage collection."""
+"""Real-time scheduling of the node's threads, short wake-ups, quiet garbage collection."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import gc
 import os
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 _SWITCH_INTERVAL_S = 1e-4
+NO_LIMIT = "no limit"
 
 
 def schedule(priority: int, thread: int) -> str:
@@ -48,6 +50,35 @@ def _schedule_all(policy: int, thread: int, priority: int, others: int) -> None:
         if int(task.name) != thread:
             with contextlib.suppress(ProcessLookupError):  # it has ended
                 os.sched_setscheduler(int(task.name), policy, os.sched_param(others))
+
+
+class CpuDmaLatency:
+    """Request that no core uses an idle state with a longer exit latency (Linux PM QoS).
+
+    A core that leaves a deep idle state does so late and with cold caches. The kernel keeps the
+    request as long as the file is open: it ends with the process, however that ends.
+    """
+
+    def __init__(self, device: Path = Path("/dev/cpu_dma_latency")) -> None:
+        self._device, self._asked_us, self._granted = device, -1, NO_LIMIT
+        self._file: BinaryIO | None = None
+
+    def request(self, latency_us: int) -> str:
+        """Ask for this largest exit latency [us], -1 for no limit; return what was granted."""
+        if latency_us == self._asked_us:
+            return self._granted
+        if self._file is not None:
+            self._file.close()
+        self._file, self._granted = None, NO_LIMIT
+        if latency_us >= 0:
+            try:
+                self._file = self._device.open("r+b", buffering=0)
+                self._file.write(latency_us.to_bytes(4, sys.byteorder))
+                self._granted = f"{latency_us} us"
+            except OSError as error:
+                self._granted = f"{NO_LIMIT}: {latency_us} us is not permitted ({error})"
+        self._asked_us = latency_us
+        return self._granted
 
 
 def quiet() -> None:

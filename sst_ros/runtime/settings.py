@@ -113,6 +113,15 @@ class SimulatorParameters(Section):
         least=0,
         most=99,
     )
+    cpu_dma_latency: int = integer(
+        "largest exit latency of idle states that the machine is asked to use during a run with "
+        "deadlines, where /dev/cpu_dma_latency may be written; with 0 no core sleeps, which wakes "
+        "the run earlier and costs power; -1 for no limit",
+        "us",
+        default=-1,
+        least=-1,
+        most=1000000,
+    )
 
     def check(self) -> Iterator[Problem]:
         """Refuse rates that have no whole period, and bounds too small to be meant."""

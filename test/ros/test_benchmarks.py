@@ -33,7 +33,7 @@ def test_realtime():
     for recorded in found["recorded"]:
         one, other = map(int, re.findall(r"\d+", recorded))
         assert one == other > 1000
-    assert len(found["missed ticks, times those of the loop"]) == 2
+    assert len(found["missed ticks, times those of the loop"]) == 3
     factors = [float(factor) for factor in found["real-time factor"]]
     assert len(factors) == 5 and min(factors) > 1.0
     assert found["simulators"] == ["10"]
@@ -41,9 +41,13 @@ def test_realtime():
 
 def test_bare_loops():
     pytest.importorskip("numba", reason="what is measured is compiled")
-    found = rows(printed("bare_loops", "--seconds", "1", "--rounds", "1"))
-    assert found["and looks for commands on 2 topics"][2] == "1.00"
-    assert all(float(cells[0]) > 0.0 for name, cells in found.items() if name not in ("", "---"))
+    tables = printed("bare_loops", "--seconds", "1", "--rounds", "1").strip().split("\n\n")
+    assert len(tables) == 2
+    for text in tables:
+        if "not permitted" not in text:
+            found = rows(text)
+            assert found["and looks for commands on 2 topics"][2] == "1.00"
+            assert all(float(found[name][0]) > 0.0 for name in ("the node", "the same, in C"))
 
 
 def test_soak():

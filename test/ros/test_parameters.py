@@ -4,6 +4,7 @@
 import contextlib
 import math
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,32 @@ def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes,
     assert observer.set_parameter("/sst_simulator", "real_time_factor", 0.0).successful
     usual = (os.SCHED_OTHER, 0)
     observer.until(all_are(usual, usual), "usual scheduling as fast as possible")
+
+
+def machine_latency_us():
+    """Return what all requests together allow [us]; None where they may not be read or made."""
+    try:
+        with Path("/dev/cpu_dma_latency").open("r+b", buffering=0) as device:
+            return int.from_bytes(device.read(4), sys.byteorder, signed=True)
+    except OSError:
+        return None
+
+
+def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(nodes, observer):
+    before = machine_latency_us()
+    if not before:
+        pytest.skip("/dev/cpu_dma_latency may not be written here, or another process asks for 0")
+    process = nodes.run("simulator", cpu_dma_latency=0)
+    observer.told("cpu_dma_latency", "0 us")
+    assert machine_latency_us() == 0
+    assert observer.set_parameter("/sst_simulator", "real_time_factor", 0.0).successful
+    observer.told("cpu_dma_latency", "no limit")
+    assert machine_latency_us() == before
+    assert observer.set_parameter("/sst_simulator", "real_time_factor", 1.0).successful
+    observer.until(lambda: machine_latency_us() == 0, "limit of a run with deadlines")
+    process.kill()
+    process.wait(10)
+    assert machine_latency_us() == before
 
 
 @pytest.mark.slow
