@@ -102,11 +102,15 @@ def test_a_goal_is_followed_with_feedback_and_succeeds(client):
     assert handle.accepted
     status, code, reply = client.result(handle)
     assert (status, code) == (SUCCEEDED, ErrorCode.SUCCESSFUL), reply
-    assert len(client.feedback) > 3
-    times = [message.desired.time_from_start for message in client.feedback]
-    times = [time.sec + 1e-9 * time.nanosec for time in times]
-    assert times == sorted(times) and times[-1] >= 0.6
-    for time, message in zip(times, client.feedback, strict=True):
+
+    def times():
+        found = [message.desired.time_from_start for message in client.feedback]
+        return [time.sec + 1e-9 * time.nanosec for time in found]
+
+    # Feedback and result are two topics: ROS promises no order between them.
+    client.observer.until(lambda: max(times(), default=0.0) >= 0.6, "the last feedback")
+    assert len(client.feedback) > 3 and times() == sorted(times())
+    for time, message in zip(times(), client.feedback, strict=True):
         assert message.joint_names == NAMES
         assert message.index == (0 if time < 0.2 else 1)
         off = np.subtract(message.desired.positions, message.actual.positions)
