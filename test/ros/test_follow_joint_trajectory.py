@@ -100,15 +100,15 @@ def client(types, tmp_path_factory, domain_of_module):
 def test_a_goal_is_followed_with_feedback_and_succeeds(client):
     handle = client.send((0.2, HOME), (0.6, AWAY))
     assert handle.accepted
-    status, code, reply = client.result(handle)
-    assert (status, code) == (SUCCEEDED, ErrorCode.SUCCESSFUL), reply
 
     def times():
         found = [message.desired.time_from_start for message in client.feedback]
         return [time.sec + 1e-9 * time.nanosec for time in found]
 
-    # Feedback and result are two topics: ROS promises no order between them.
+    # rclpy takes one feedback at a time, and hears none of those left when the result comes.
     client.observer.until(lambda: max(times(), default=0.0) >= 0.6, "the last feedback")
+    status, code, reply = client.result(handle)
+    assert (status, code) == (SUCCEEDED, ErrorCode.SUCCESSFUL), reply
     assert len(client.feedback) > 3 and times() == sorted(times())
     for time, message in zip(times(), client.feedback, strict=True):
         assert message.joint_names == NAMES
