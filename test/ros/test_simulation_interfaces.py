@@ -112,9 +112,11 @@ def test_steps_by_count_and_by_the_action(client):
     cancelled = handle.cancel_goal_async()
     client.observer.until(cancelled.done, "the answer")
     assert result(handle)[0] == GoalStatus.STATUS_CANCELED
-    status, reply = result(send(7))
+    handle = send(7)
+    # Before the result is asked for: after it rclpy's client hears no feedback.
+    client.observer.until(lambda: len(feedback) >= 7, "feedback")
+    status, reply = result(handle)
     assert (status, reply.result) == (GoalStatus.STATUS_SUCCEEDED, OK)
-    client.observer.until(lambda: len(feedback) >= 7, "feedback, which may come after the result")
     counts = [(message.completed_steps, message.remaining_steps) for message in feedback]
     assert counts == [(k, 7 - k) for k in range(1, 8)]
     client.to(PLAYING)
