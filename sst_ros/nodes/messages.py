@@ -69,17 +69,15 @@ class CdrMessage:
         for text in listed:
             self.string(text)
 
-    def doubles(self, count: int) -> Write:
-        """Append `count` doubles, zero; the function writes their values."""
+    def double_sequence(self, count: int) -> Write:
+        """Append a sequence of `count` doubles, zero; the function writes their values."""
+        self.length(count)
+        if count == 0:
+            return _nothing
         self._align(8)
         place = len(self._data)
         self._data += bytes(8 * count)
         return partial(struct.Struct(f"<{count}d").pack_into, self._data, place)
-
-    def double_sequence(self, count: int) -> Write:
-        """Append a sequence of `count` doubles, zero; the function writes their values."""
-        self.length(count)
-        return self.doubles(count) if count else _nothing
 
     def stamped(self, stamp: bytes) -> bytes:
         """Return the message with this stamp in the header that it begins with."""

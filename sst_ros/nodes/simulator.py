@@ -74,7 +74,6 @@ class Simulator:
         """
         self._loop.stop()
         self.done.set()
-        self._latency.request(-1)
         self._thread.join(_END_S)
         if not self._thread.is_alive():
             self._read_gauges()
@@ -141,7 +140,10 @@ class Simulator:
         return Reply(True, "")
 
     def _schedule(self) -> None:
-        """Real-time scheduling for a run that sleeps; without deadlines it would starve others."""
+        """Real-time scheduling for a run that sleeps; without deadlines it would starve others.
+
+        The machine may sleep as it likes where no deadlines are kept.
+        """
         given, thread = self.parameters, self._thread.native_id
         if thread is None or not self._thread.is_alive():
             return
@@ -153,7 +155,8 @@ class Simulator:
         if granted != self._diagnostics.scheduling:
             self._diagnostics.scheduling = granted
             log.info(f"scheduling of the run: {granted}")
-        granted = self._latency.request(given.cpu_dma_latency if paced else -1)
+        running = self._loop.phase is Phase.RUNNING
+        granted = self._latency.request(given.cpu_dma_latency if paced and running else -1)
         if granted != self._diagnostics.cpu_dma_latency:
             self._diagnostics.cpu_dma_latency = granted
             log.info(f"exit latency of idle states: {granted}")

@@ -5,11 +5,13 @@ import contextlib
 import math
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 from rcl_interfaces.srv import DescribeParameters
+from std_srvs.srv import SetBool
 
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.schema import specs
@@ -104,6 +106,11 @@ def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(no
     assert machine_latency_us() == before
     assert observer.set_parameter("/sst_simulator", "real_time_factor", 1.0).successful
     observer.until(lambda: machine_latency_us() == 0, "limit of a run with deadlines")
+    pause = partial(observer.call, SetBool, "/sst_simulator/pause")
+    assert pause(data=True).success
+    observer.until(lambda: machine_latency_us() == before, "no limit in a pause")
+    assert pause(data=False).success
+    observer.until(lambda: machine_latency_us() == 0, "limit of a run that was resumed")
     process.kill()
     process.wait(10)
     assert machine_latency_us() == before
