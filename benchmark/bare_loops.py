@@ -32,13 +32,13 @@ import rclpy
 
 from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.nodes import middleware, topics
-from sst_ros.nodes.messages import StateMessages, TorqueLog, finite
+from sst_ros.nodes.messages import StateMessages, TorqueLog, finite, stamp
 from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import LOG_NS
 from sst_ros.runtime import realtime
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import Simulation
 
 TICK_NS = 1_000_000
 LOG_TICKS = LOG_NS // TICK_NS
@@ -101,7 +101,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
             log.append(ZERO, ZERO, 2)
             if len(log) == LOG_TICKS:
                 publishers[3].publish(log.take(stamp_ns))
-        at = divmod(stamp_ns, NANOSECONDS)
+        at = stamp(stamp_ns)
         for one, message in zip(publishers, states, strict=False):
             one.publish(message(at, numbers))
 

@@ -299,8 +299,8 @@ that a program with the topics of the node costs here by rclpy. What the node ad
 one compiled call, the joints of the sample, its log of torques, the executor and the diagnostics.
 
 With `cpu_dma_latency` 0 no core sleeps (the whole machine is asked, so the loops have it too): the
-difference is what it costs to leave an idle state, to wake the recorder on a core that sleeps, and
-the caches that are cold afterwards."""
+difference is the cost of leaving an idle state, of waking the recorder on a core that sleeps, and
+of caches that are cold afterwards."""
 
 _HEAD = """\
 # Real-time performance: missed ticks, lateness, processor load

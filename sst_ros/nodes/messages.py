@@ -126,7 +126,7 @@ def finite(y: Sequence[float], joints: Sequence[float], torque: Sequence[float])
 
 
 class StateMessages:
-    """Bytes of joint_states, orientation and euler_zyz, for the stamp (s, ns) and the numbers.
+    """Bytes of joint_states, orientation and euler_zyz, for the bytes of a stamp and the numbers.
 
     Each is one call of a struct: field by field takes 1.7 times as long.
 
@@ -142,28 +142,28 @@ class StateMessages:
         joints.length(len(JOINTS))
         star.header(BASE_FRAME)
         self._names, self._base = joints.behind_stamp(), star.behind_stamp()
-        stamped, count = f"<{len(_ENCAPSULATION)}siI", len(JOINTS)
+        stamped, count = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s", len(JOINTS)
         more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
         self._joints = struct.Struct(f"{stamped}{len(self._names)}s{count}d{more}{more}").pack
         self._quaternion, self._angles = (
             struct.Struct(f"{stamped}{len(self._base)}s{numbers}d").pack for numbers in (4, 3)
         )
 
-    def joint_states(self, at: tuple[int, int], numbers: Numbers) -> bytes:
+    def joint_states(self, at: bytes, numbers: Numbers) -> bytes:
         """Return a JointState; the effort is the torque over the step that ended."""
         _, joints, torque = numbers
         angles, rates, count = joints[:9], joints[9:], len(JOINTS)
         return self._joints(
-            _ENCAPSULATION, *at, self._names, *angles, count, *rates, count, *torque, *_PASSIVE
+            _ENCAPSULATION, at, self._names, *angles, count, *rates, count, *torque, *_PASSIVE
         )
 
-    def orientation(self, at: tuple[int, int], numbers: Numbers) -> bytes:
+    def orientation(self, at: bytes, numbers: Numbers) -> bytes:
         """Return a QuaternionStamped."""
-        return self._quaternion(_ENCAPSULATION, *at, self._base, *numbers[0])
+        return self._quaternion(_ENCAPSULATION, at, self._base, *numbers[0])
 
-    def euler_zyz(self, at: tuple[int, int], numbers: Numbers) -> bytes:
+    def euler_zyz(self, at: bytes, numbers: Numbers) -> bytes:
         """Return a Vector3Stamped of the ZYZ angles theta, phi, psi [rad]."""
-        return self._angles(_ENCAPSULATION, *at, self._base, *zyz_angles(numbers[0]))
+        return self._angles(_ENCAPSULATION, at, self._base, *zyz_angles(numbers[0]))
 
 
 def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:

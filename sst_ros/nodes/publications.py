@@ -26,14 +26,14 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
 from sst_ros.nodes.graph import COUNT_NS
-from sst_ros.nodes.messages import NotFinite, Numbers, StateMessages, TorqueLog, finite
+from sst_ros.nodes.messages import NotFinite, Numbers, StateMessages, TorqueLog, finite, stamp
 from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.simulation import NANOSECONDS, State, Triple
+from sst_ros.simulation.simulation import State, Triple
 
 _HISTORY_S = 2
 _FAST = 10
@@ -42,8 +42,8 @@ LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180
 of a wake."""
 
-Message = Callable[[tuple[int, int], Numbers], bytes]
-"""Makes a message of a stamp (s, ns) and the numbers of a state."""
+Message = Callable[[bytes, Numbers], bytes]
+"""Makes a message of the bytes of a stamp and the numbers of a state."""
 _AT_REST = (0.0,) * len(JOINTS)
 
 
@@ -128,7 +128,7 @@ class SimulatorTopics:
         if logged >= self._log_ticks or not logged or self._torques not in self._read:
             self.flush()
             self._log_from_ns = stamp_ns
-        at = divmod(stamp_ns, NANOSECONDS)
+        at = stamp(stamp_ns)
         for publisher, message in self._states:
             publisher.publish(message(at, numbers))
 
@@ -154,7 +154,7 @@ class SimulatorTopics:
             joints, torque = (*joints[:9], *_AT_REST), ZERO
         self._count_subscribers(0)
         for publisher, message in self._messages(self._idles):
-            at = divmod(stamp_ns, NANOSECONDS) if publisher is self._joints else (0, 0)
+            at = stamp(stamp_ns if publisher is self._joints else 0)
             publisher.publish(message(at, (quaternion, joints, torque)))
 
     def phase_changed(self, phase: str) -> None:

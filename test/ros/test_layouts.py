@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from sst_ros.description.headers import BASE_FRAME
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
-from sst_ros.nodes.messages import StateMessages
+from sst_ros.nodes.messages import StateMessages, stamp
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import load, names
 from sst_ros.simulation.simulation import Simulation
@@ -143,7 +143,7 @@ def test_the_loops_of_the_drawn_tree_are_closed(name):
     for _ in range(5):
         state = simulation.step((0.2, -0.1, 0.15), 2_000_000)
     numbers = state.quaternion, sum(state.joints, ()), state.torque
-    published = deserialize_message(StateMessages().joint_states((0, 1), numbers), JointState)
+    published = deserialize_message(StateMessages().joint_states(stamp(1), numbers), JointState)
     angles = dict(zip(published.name, published.position, strict=True))
     base, found = transforms(urdf(scene), angles)
     assert base == BASE_FRAME

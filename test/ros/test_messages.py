@@ -42,7 +42,7 @@ def state():
 
 def stamped(messages, stamp_ns, state):
     """joint_states, orientation, euler_zyz."""
-    numbers, at = finite(*sample(state)), divmod(stamp_ns, 10**9)
+    numbers, at = finite(*sample(state)), stamp(stamp_ns)
     made = messages.joint_states, messages.orientation, messages.euler_zyz
     return [message(at, numbers) for message in made]
 
