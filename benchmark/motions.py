@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bits of motions, before and after a change of the code that should change none.
+
+`python -m benchmark.motions FILE` writes a line a motion: what it is, and a hash of its numbers:
+shipped scenes by all methods, steps plain and compiled, a batch, a sweep, a lockstep run through
+the nodes and the evaluation of its recording. `diff` shows what changed.
+"""
+
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sst_ros import Batch, Simulation, load_scene, simulate, sweep
+from sst_ros.errors import SstError
+
+SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
+METHODS = ("auto", "gauss", "dopri5", "dop853", "rk4", "rodas4")
+DURATION = 0.25
+STEPS = 50
+MEASURED = ("wall", "cpu", "seconds", "time", "latency", "lateness", "date", "version", "folder")
+"""Parts of names in a report whose values differ from run to run."""
+
+
+def digest(*arrays: Any) -> str:
+    """Hash the bytes of arrays of numbers."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array, dtype=float).tobytes())
+    return found.hexdigest()[:16]
+
+
+def simulated(name: str, method: str) -> str:
+    """Simulate a shipped scene, with and without times of the samples."""
+    even = np.linspace(0.0, DURATION, 26)
+    found = []
+    for times in (None, even):
+        motion = simulate(name, duration=DURATION, t_eval=times, method=method, tolerance=1e-8)
+        found += [motion.t, motion.quaternion, motion.gamma, motion.gamma_dot]
+        found.append([motion.error_estimate, motion.status])
+    return digest(*found)
+
+
+def stepped(name: str, compiled: bool) -> str:
+    """Go step by step with held torques."""
+    run = Simulation(load_scene(name), compiled=compiled)
+    torque, found = np.array([0.3, -0.2, 0.1]), []
+    for number in range(STEPS):
+        run.step(tuple(torque * np.cos(0.3 * number)), 2_000_000)
+        found.append([*run.state.gamma, *run.state.gamma_dot, run.error_estimate])
+    return digest(found)
+
+
+def batched() -> str:
+    """Run a batch of 64 starts."""
+    scene = load_scene("example2_heavy")
+    gamma = np.random.default_rng(5).uniform(0.7, 0.85, (64, 3))
+    result = Batch(scene).run(gamma, np.zeros((64, 3)), (0.1, 0.2, -0.1), step=1e-3, count=100)
+    return digest(result.quaternion, result.body_rate, result.gamma)
+
+
+def swept() -> str:
+    """Run a sweep of 500 rows."""
+    vary = {
+        "star.inertia": ("uniform", 0.8, 1.2, "relative"),
+        "initial.gamma": ("uniform", 0.7, 0.85),
+    }
+    table = sweep("example2_heavy", vary, n=500)
+    return digest(table.select_dtypes("number").to_numpy())
+
+
+def recorded(folder: Path) -> Iterator[tuple[str, str]]:
+    """Run the demo in lockstep; hash the messages' bytes and the evaluation."""
+    from mcap.reader import make_reader
+
+    command = [sys.executable, "-m", "sst_ros", "demo", "--out", str(folder), "--force"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=300)
+    (bag,) = folder.glob("bag/*.mcap")
+    with bag.open("rb") as stream:
+        topics: dict[str, Any] = {}
+        for _, channel, message in make_reader(stream).iter_messages():
+            topics.setdefault(channel.topic, hashlib.sha256()).update(message.data)
+    for topic in sorted(topics):
+        if "diagnostics" not in topic and "rosout" not in topic and "events" not in topic:
+            yield f"lockstep {topic}", topics[topic].hexdigest()[:16]
+    for path in sorted(folder.glob("*.json")):
+        for key, value in sorted(flat(json.loads(path.read_text(encoding="utf-8")))):
+            if not any(word in key for word in MEASURED):
+                yield f"report {path.name} {key}", repr(value)
+
+
+def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Walk through the leaves of a document."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from flat(part, f"{key}.{name}")
+    else:
+        yield key, value
+
+
+def lines() -> Iterator[str]:
+    """All motions, a line each; a refusal is its text."""
+    jobs: list[tuple[str, Any]] = []
+    for name in SCENES:
+        jobs += [(f"simulate {name} {m}", lambda n=name, m=m: simulated(n, m)) for m in METHODS]
+        jobs += [(f"steps {name} {c}", lambda n=name, c=c: stepped(n, c)) for c in (False, True)]
+    jobs += [("batch", batched), ("sweep", swept)]
+    for what, job in jobs:
+        try:
+            yield f"{what}: {job()}"
+        except SstError as error:
+            yield f"{what}: {type(error).__name__} {error}"
+    with tempfile.TemporaryDirectory() as folder:
+        yield from (f"{what}: {found}" for what, found in recorded(Path(folder)))
+
+
+if __name__ == "__main__":
+    with Path(sys.argv[1]).open("w", encoding="utf-8") as out:
+        for line in lines():
+            print(line, file=out, flush=True)
