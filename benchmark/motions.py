@@ -24,7 +24,7 @@ SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
 METHODS = ("auto", "gauss", "dopri5", "dop853", "rk4", "rodas4")
 DURATION = 0.25
 STEPS = 50
-MEASURED = ("wall", "cpu", "seconds", "time", "latency", "lateness", "date", "version", "folder")
+MEASURED = ("_us", "_age_", "bag", "commands_followed", "idle_states", "command_stamp", "report.")
 """Parts of names in a report whose values differ from run to run."""
 
 
@@ -39,7 +39,7 @@ def digest(*arrays: Any) -> str:
 def simulated(name: str, method: str) -> str:
     """Simulate a shipped scene, with and without times of the samples."""
     even = np.linspace(0.0, DURATION, 26)
-    found = []
+    found: list[Any] = []
     for times in (None, even):
         motion = simulate(name, duration=DURATION, t_eval=times, method=method, tolerance=1e-8)
         found += [motion.t, motion.quaternion, motion.gamma, motion.gamma_dot]
@@ -47,13 +47,22 @@ def simulated(name: str, method: str) -> str:
     return digest(*found)
 
 
+def whole(name: str) -> str:
+    """Simulate a shipped scene over its own duration, up to its limits."""
+    duration = load_scene(name).duration or 1.0
+    times = np.linspace(0.0, duration, 11)
+    motion = simulate(name, duration=duration, t_eval=times, method="dop853", tolerance=1e-8)
+    found = digest(motion.t, motion.quaternion, motion.body_rate, motion.torque)
+    return f"{found} {motion.message}"
+
+
 def stepped(name: str, compiled: bool) -> str:
     """Go step by step with held torques."""
     run = Simulation(load_scene(name), compiled=compiled)
-    torque, found = np.array([0.3, -0.2, 0.1]), []
+    torque, found = np.array([0.3, -0.2, 0.1]), list[float]()
     for number in range(STEPS):
         run.step(tuple(torque * np.cos(0.3 * number)), 2_000_000)
-        found.append([*run.state.gamma, *run.state.gamma_dot, run.error_estimate])
+        found += [*run.state.quaternion, *run.state.body_rate]
     return digest(found)
 
 
@@ -110,6 +119,7 @@ def lines() -> Iterator[str]:
     for name in SCENES:
         jobs += [(f"simulate {name} {m}", lambda n=name, m=m: simulated(n, m)) for m in METHODS]
         jobs += [(f"steps {name} {c}", lambda n=name, c=c: stepped(n, c)) for c in (False, True)]
+        jobs.append((f"whole {name}", lambda n=name: whole(n)))
     jobs += [("batch", batched), ("sweep", swept)]
     for what, job in jobs:
         try:
