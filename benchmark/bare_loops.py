@@ -31,11 +31,11 @@ from typing import Any
 import rclpy
 
 from benchmark.nodes import Process, Watch, markdown, until
+from sst_ros.host import scheduling
 from sst_ros.nodes import middleware, topics
 from sst_ros.nodes.messages import StateMessages, TorqueLog, finite, stamp
 from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import LOG_NS
-from sst_ros.runtime import realtime
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
@@ -110,14 +110,14 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
 
 def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
-    latency = realtime.CpuDmaLatency()
+    latency = scheduling.CpuDmaLatency()
     latency.request(latency_us)
     ticks, sleeper, number, read = LOOPS[name]
     publish = exchange(number, read) if number else None
     sleep = python_sleep if sleeper == "python" else libc_sleep()
     time.sleep(1.0)  # until discovery is quiet
-    realtime.schedule(20, threading.get_native_id())
-    realtime.quiet()
+    scheduling.schedule(20, threading.get_native_id())
+    scheduling.quiet()
     missed, step_ns, used = 0, ticks * TICK_NS, time.process_time()
     began = deadline = time.monotonic_ns()
     while deadline < began + seconds * 1e9:
@@ -168,8 +168,8 @@ class Beside:
 
 def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
     pacer, ticks = Pacer(TICK_NS, 1.0, SteadyTime()), LOOPS["sleeps every sample"][0]
-    realtime.schedule(priority, threading.get_native_id())
-    realtime.quiet()
+    scheduling.schedule(priority, threading.get_native_id())
+    scheduling.quiet()
     pacer.start()
     while not ends.is_set():
         pacer.wait(lambda: False, ticks)
@@ -217,8 +217,8 @@ def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> di
 
 def refused(latency_us: int) -> str | None:
     """Return why this exit latency cannot be asked for here, None where it can."""
-    said = realtime.CpuDmaLatency().request(latency_us)
-    return said if realtime.NO_LIMIT in said else None
+    said = scheduling.CpuDmaLatency().request(latency_us)
+    return said if scheduling.NO_LIMIT in said else None
 
 
 def compare(watch: Watch, seconds: float, rounds: int) -> str:

@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
 from benchmark.campaign.processes import domain
-from sst_ros import child_process
+from sst_ros.host import child_process
 
 _TICK = os.sysconf("SC_CLK_TCK")
 

@@ -14,9 +14,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sst_ros import child_process
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
+from sst_ros.host import child_process
 from sst_ros.report import tracking
 from sst_ros.report.run import report
 from sst_ros.report.text import text

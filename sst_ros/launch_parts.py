@@ -27,8 +27,8 @@ from launch.launch_description import LaunchDescription
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from sst_ros import child_process
 from sst_ros.description.urdf import urdf, urdf_with_ros2_control
+from sst_ros.host import child_process
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
 from sst_ros.scene import scene

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from sst_ros import demo
 from sst_ros.extras import MissingDependency
+from sst_ros.host.output import writing
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array
-from sst_ros.output_folder import writing
 from sst_ros.plot import paper_figures
 from sst_ros.plot.paper_figures import NUMBERS, Solution
 from sst_ros.plot.pictures import PICTURES, save

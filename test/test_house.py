@@ -14,7 +14,7 @@ import sst_ros
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
     {"state", "version"},
-    {"errors", "extras", "child_process", "output_folder", "progress"},
+    {"errors", "extras", "host"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},

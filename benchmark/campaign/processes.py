@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmark.campaign.ledger import Ledger
-from sst_ros import child_process
+from sst_ros.host import child_process
 
 FAULT_S = 1.0
 """A step that does not end is a fault within this time."""

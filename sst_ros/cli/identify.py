@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sst_ros.cli.parsing import Commands, add_scene_name, command, free_out
 from sst_ros.errors import InputError, Problem
-from sst_ros.output_folder import writing
+from sst_ros.host.output import writing
 
 DESIGN = "design"
 INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"

@@ -9,7 +9,7 @@ from pathlib import Path
 from sst_ros.cli.parsing import Commands, add_scene_name, command, free_out, group, refuse
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.output_folder import require_free
+from sst_ros.host.output import require_free
 
 FORMATS = (".parquet", ".csv")
 MOST_SAMPLES = 10_000_000

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from sst_ros.errors import InputError, Problem, printable, suggestion
-from sst_ros.output_folder import require_free
+from sst_ros.host.output import require_free
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Run: TypeAlias = Callable[[argparse.Namespace], "int | None"]

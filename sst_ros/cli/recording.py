@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from sst_ros.cli.parsing import Commands, add_out, add_scene_name, command, free_out, group
-from sst_ros.output_folder import results_folder
+from sst_ros.host.output import results_folder
 
 
 def add_report(commands: Commands) -> None:

@@ -104,8 +104,8 @@ def _describe(options: argparse.Namespace) -> None:
 
 
 def _compile(options: argparse.Namespace) -> None:
+    from sst_ros.host.cache_folder import cache_folder, configured_folder
     from sst_ros.integration import code_cache, codegen
-    from sst_ros.integration.cache_folder import cache_folder, configured_folder
     from sst_ros.scene.scene import load
     from sst_ros.simulation.simulation import INTEGRATORS
 

@@ -8,9 +8,9 @@ import signal
 import threading
 from pathlib import Path
 
-from sst_ros import child_process
 from sst_ros.cli.parsing import Commands, add_scene_name, command, integer_from, refuse
 from sst_ros.extras import require
+from sst_ros.host import child_process
 
 
 def add_view(commands: Commands) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics.traced_dynamics import TORQUE
+from sst_ros.host.output import slices
 from sst_ros.integration.batch_result import BatchResult, BatchStates
 from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
 from sst_ros.mechanism.geometry import Array
-from sst_ros.progress import slices
 
 FINE = 16
 """Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""

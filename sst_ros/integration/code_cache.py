@@ -11,8 +11,8 @@ import fcntl
 from collections.abc import Iterator
 
 from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
+from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import codegen
-from sst_ros.integration.cache_folder import cache_folder
 from sst_ros.integration.compiled_method import CompiledMethod, Method, has_code
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4
 from sst_ros.scene.scene import Scene

@@ -17,7 +17,7 @@ from functools import lru_cache
 from types import CodeType, ModuleType
 from typing import Any
 
-from sst_ros.integration.cache_folder import cache_folder, imported
+from sst_ros.host.cache_folder import cache_folder, imported
 from sst_ros.integration.methods import Tableau
 
 _PLAIN = """\

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics.initial_state import SINGULAR
+from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.progress import slices
 
 NO_ASSEMBLY, NO_RATE, OUTSIDE = -1, -2, -3
 REASONS = {

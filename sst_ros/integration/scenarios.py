@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.host.output import slices
 from sst_ros.integration.scenario_columns import valid_rows, with_columns
 from sst_ros.integration.scenario_constants import Place
 from sst_ros.mechanism.geometry import Array
-from sst_ros.progress import slices
 from sst_ros.scene.bodies import Link, Payload, Star
 from sst_ros.scene.scene import Actuators, Friction, Gravity, JointFriction, Scene, Spring
 from sst_ros.scene.schema import Section, Spec, accept, specs

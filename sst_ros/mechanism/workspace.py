@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.direct_kinematics import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
-from sst_ros.progress import slices
 
 _BLOCK = 20_000
 

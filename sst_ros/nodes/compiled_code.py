@@ -11,8 +11,8 @@ import sys
 from rclpy.node import Node
 from rclpy.timer import Timer
 
+from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import code_cache, codegen
-from sst_ros.integration.cache_folder import cache_folder
 from sst_ros.nodes.clocks import STEADY
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.scene import Scene

@@ -17,8 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from sst_ros.child_process import orphaned
 from sst_ros.errors import InputError, SstError
+from sst_ros.host.child_process import orphaned
 from sst_ros.nodes import arguments, middleware, shared_memory, signals
 
 _POLL_S = 0.1

@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from sst_ros.errors import InputError, SstError
+from sst_ros.host import scheduling
 from sst_ros.nodes import graph, parameters, simulation_interfaces, topics
 from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
 from sst_ros.nodes.compiled_code import CodeCompiler
@@ -18,7 +19,6 @@ from sst_ros.nodes.messages import diagnostics
 from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import SimulatorTopics
 from sst_ros.nodes.services import Services
-from sst_ros.runtime import realtime
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
@@ -52,7 +52,7 @@ class Simulator:
         self._code = (
             CodeCompiler(self.node, simulated, given) if given.compiled and traced else None
         )
-        self._latency = realtime.CpuDmaLatency()
+        self._latency = scheduling.CpuDmaLatency()
         self._loop = RunLoop(simulated, self._build, self, self._input, self._pacer, self._topics)
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
@@ -94,7 +94,7 @@ class Simulator:
 
     def _quiet(self) -> Reply:
         """Settle the process once the code of all methods is loaded: the run's first request."""
-        realtime.quiet()
+        scheduling.quiet()
         return Reply(True, "")
 
     def _watch(self) -> None:
@@ -149,7 +149,7 @@ class Simulator:
             return
         paced, log = given.real_time_factor > 0.0, self.node.get_logger()
         try:
-            granted = realtime.schedule(given.realtime_priority if paced else 0, thread)
+            granted = scheduling.schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
         if granted != self._diagnostics.scheduling:
@@ -178,7 +178,7 @@ class Simulator:
         values = self._diagnostics.values(publishers)
         message = diagnostics(f"{own}: run", stamp_ns, _LEVELS[level], text, values)
         self._topics.diagnostics.publish(message)
-        realtime.tidy()
+        scheduling.tidy()
         if self._loop.phase is not Phase.FINISHED:
             self._loop.post(self._read_gauges)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.output_folder import writing
+from sst_ros.host.output import writing
 from sst_ros.plot import energy, joints, paper_figures, sphere
 from sst_ros.plot.downsampling import envelope
 from sst_ros.plot.paper_figures import Solution

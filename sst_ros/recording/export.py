@@ -14,7 +14,7 @@ import numpy as np
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.output_folder import require_free, writing
+from sst_ros.host.output import require_free, writing
 from sst_ros.recording import signals
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import TIMES, Column

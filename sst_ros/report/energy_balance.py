@@ -10,10 +10,10 @@ import numpy as np
 from sst_ros.dynamics import energy
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.host.output import slices
 from sst_ros.integration import codegen
 from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import Integers
 from sst_ros.report import states

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.host.output import slices
 from sst_ros.integration.tick_propagator import LONGEST_NS, TickPropagator, TickSequence
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.progress import slices
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.time_series import NANOSECONDS, Integers, places
 from sst_ros.report import states

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sst_ros.output_folder import writing
+from sst_ros.host.output import writing
 from sst_ros.plot import pictures
 from sst_ros.plot.run_figures import draw_errors
 from sst_ros.plot.style import save_figure

@@ -11,10 +11,10 @@ import numpy as np
 
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate, table
 from sst_ros.errors import InputError, SingularConfiguration
+from sst_ros.host.output import writing
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.output_folder import writing
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refused

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from sst_ros.dynamics.limits import limits_of
-from sst_ros.runtime import realtime
+from sst_ros.host import scheduling
 from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import RunLoop
@@ -92,7 +92,7 @@ class RunDiagnostics:
     ) -> None:
         self._loop, self._input, self._pacer, self._period_s = loop, torque_input, pacer, period_s
         self.gauges: dict[str, object] = {}
-        self.scheduling, self.cpu_dma_latency = "", realtime.NO_LIMIT
+        self.scheduling, self.cpu_dma_latency = "", scheduling.NO_LIMIT
         self._before = (0, 0.0)
         self._noted = (0, 0, 0, 0)
         self._warned: list[str] = []

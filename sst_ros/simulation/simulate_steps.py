@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from sst_ros.errors import Diverged, RunStopped
+from sst_ros.host.output import slices
 from sst_ros.integration.applied_torque import StateFeedback
 from sst_ros.integration.methods import RK4, RODAS4
-from sst_ros.progress import slices
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.simulation.torque import TorqueTable

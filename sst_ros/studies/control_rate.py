@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
-from sst_ros.progress import slices
 from sst_ros.runtime.run_types import Phase
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_ros.extras import require
-from sst_ros.output_folder import writing
+from sst_ros.host.output import writing
 from sst_ros.plot.style import save_figure
 from sst_ros.report.summary import made_on
 from sst_ros.report.text import made_line

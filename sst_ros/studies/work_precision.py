@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sst_ros.errors import SstError
+from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.geometry import Array
-from sst_ros.progress import slices
 from sst_ros.report import formulation
 from sst_ros.scene.scene import Scene
 from sst_ros.studies.initial_value_problem import InitialValueProblem

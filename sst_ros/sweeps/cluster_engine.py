@@ -17,7 +17,7 @@ from typing import Any
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
-from sst_ros.integration.cache_folder import cache_folder, store
+from sst_ros.host.cache_folder import cache_folder, store
 from sst_ros.sweeps.chunk_task import DONE, ChunkOutcome, ChunkTask, run_chunk
 from sst_ros.sweeps.local_engine import SweepFailed
 

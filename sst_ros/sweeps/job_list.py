@@ -16,7 +16,7 @@ from contextlib import nullcontext
 from typing import Any, TypeVar
 
 from sst_ros.extras import require
-from sst_ros.progress import slices
+from sst_ros.host.output import slices
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sst_ros.extras import require
+from sst_ros.host.output import writing
 from sst_ros.mechanism.geometry import Array
-from sst_ros.output_folder import writing
 from sst_ros.plot import sweep
 from sst_ros.plot.style import save_figure
 from sst_ros.sweeps.sweep_summary import early_end_correlations, output_columns

@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sst_ros import child_process
+from sst_ros.host import child_process
 
 PUBLISH_RATE = 100
 """Samples a second [Hz]: more than a screen shows."""

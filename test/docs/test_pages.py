@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
 
-from sst_ros import child_process
 from sst_ros.cli.main import NODES, parser
+from sst_ros.host import child_process
 
 PAGES = pages()
 LONG = (

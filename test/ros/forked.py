@@ -15,8 +15,8 @@ from multiprocessing import forkserver, resource_tracker
 
 import pytest
 
-from sst_ros import child_process
 from sst_ros.__main__ import main
+from sst_ros.host import child_process
 from sst_ros.nodes import inverse_dynamics, recorder, simulator, torque_player  # noqa: F401
 
 CONTEXT = multiprocessing.get_context("forkserver")

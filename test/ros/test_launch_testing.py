@@ -23,7 +23,7 @@ from launch import LaunchDescription  # noqa: E402
 from launch.actions import IncludeLaunchDescription  # noqa: E402
 from launch.launch_description_sources import PythonLaunchDescriptionSource  # noqa: E402
 
-from sst_ros import child_process  # noqa: E402
+from sst_ros.host import child_process  # noqa: E402
 
 LAUNCHES = {
     "simulate.launch.py": ({"scene": "swing", "duration": "0.0"}, "running", "stderr"),

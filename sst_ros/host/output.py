@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where results are written: named after the recording, and never over earlier results unasked."""
+"""What a long command leaves and shows: its folder of results, and a bar while it works.
+
+A folder is named after the recording, and is never written over unasked.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +14,7 @@ from pathlib import Path
 from sst_ros.errors import InputError, Problem
 
 _BAG_SUFFIXES = (".mcap", ".db3")
+_PARTS = 50
 
 
 def results_folder(bag: Path, kind: str) -> Path:
@@ -58,3 +63,16 @@ def writing(out: Path, origin: str) -> Iterator[None]:
     except OSError as error:
         allowed = f"must be a folder that can be written ({error})"
         raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
+
+
+def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
+    """Yield slices of `size`, 0 for some fifty; where `shown`, draw a bar on a terminal."""
+    size = size or max(1, total // _PARTS)
+    drawn = shown and sys.stderr.isatty()
+    for start in range(0, total, size):
+        done = min(start + size, total)
+        yield slice(start, done)
+        if drawn:
+            bar = "#" * (40 * done // total)
+            end = "\n" if done == total else ""
+            print(f"\r{label} [{bar:40}] {100 * done // total:3d} %", end=end, file=sys.stderr)

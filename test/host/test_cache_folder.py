@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from sst_ros.integration import cache_folder as module
-from sst_ros.integration.cache_folder import cache_folder, objection
+from sst_ros.host import cache_folder as module
+from sst_ros.host.cache_folder import cache_folder, objection
 from sst_ros.integration.codegen import numba_version
 
 OTHER_USER = 65534

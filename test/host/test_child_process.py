@@ -8,12 +8,12 @@ import sys
 
 import pytest
 
-from sst_ros import child_process
 from sst_ros.errors import SstError
+from sst_ros.host import child_process
 
 KEEP = """
 import os, sys
-from sst_ros import child_process
+from sst_ros.host import child_process
 child_process.keep_domain()
 print(os.environ["ROS_DOMAIN_ID"], os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"], flush=True)
 sys.stdin.read()

@@ -5,7 +5,7 @@ import pytest
 
 from sst_ros.__main__ import main
 from sst_ros.errors import InputError
-from sst_ros.output_folder import require_free, results_folder, writing
+from sst_ros.host.output import require_free, results_folder, writing
 
 
 @pytest.mark.parametrize(
