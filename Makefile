@@ -10,7 +10,7 @@ PARALLEL = --numprocesses auto --dist loadfile
 # The tests of the nodes wait half of their time.
 PARALLEL_NODES = --numprocesses $$(($$(nproc) + 1)) --dist loadfile
 
-.PHONY: help demo demo-feedforward demo-identify demo-sweep docs view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
+.PHONY: help demo demo-feedforward demo-identify demo-sweep docs paper view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -26,7 +26,10 @@ demo-sweep: $(VENV)/.sweep  ## 100,000 runs with random inertias and starts: tab
 	$(RUN) -m sst_ros sweep plot sweep_out
 
 demo-identify: $(VENV)/.demo  ## identify a wrong model from a recorded motion; results in demo_out/identify
-	$(RUN) -m sst_ros demo identify --force
+	$(RUN) -m studies.identification --force
+
+paper: $(VENV)/.paper  ## draw Figs. 8 to 14 of the paper: nodes, continuous solution, Pinocchio; results in paper_out
+	$(RUN) -m studies.paper --force
 
 docs: $(VENV)/.docs  ## build the documentation into site, in a folder named after the version
 	@site=site/$$($(RUN) -c 'print(__import__("sst_ros").__version__)') && \
@@ -81,6 +84,10 @@ $(VENV)/.demo: $(VENV)/.python setup.py
 	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
 	@touch $@
 
+$(VENV)/.paper: $(VENV)/.python setup.py
+	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS),engines]"
+	@touch $@
+
 $(VENV)/.sweep: $(VENV)/.python setup.py
 	$(RUN) -m pip install --quiet --disable-pip-version-check --editable ".[sweep,plot]"
 	@touch $@
@@ -102,4 +109,4 @@ $(VENV)/.test: $(VENV)/.python setup.py
 	@touch $@
 
 clean:  ## remove environments and results
-	rm -rf $(VENV) .venv-jazzy demo_out view_out sweep_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-jazzy demo_out view_out paper_out sweep_out site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

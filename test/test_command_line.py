@@ -191,8 +191,6 @@ def test_a_reader_that_leaves_is_no_error():
         (["recover", "bag"], "rosbags", "record"),
         (["report", "run", "bag"], "rosbags|matplotlib", "record|plot"),
         (["report", "accuracy"], "rosbags|matplotlib", "record|plot"),
-        (["report", "stability"], "rosbags|matplotlib", "record|plot"),
-        (["study", "feedforward"], "rosbags|matplotlib", "record|plot"),
         (["plot", "bag"], "rosbags|matplotlib", "record|plot"),
         (["plot", "--list"], "rosbags|matplotlib", "record|plot"),
         (["workspace", "example2"], "matplotlib", "plot"),

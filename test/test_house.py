@@ -27,7 +27,7 @@ FLOORS = (
     {"runtime"},
     {"studies", "identification", "sweeps"},
     {"nodes"},
-    {"demo", "identification_demo", "launch_parts", "paper"},
+    {"demo", "launch_parts"},
     {"cli"},
     {"__main__"},
     {"sst_ros"},

@@ -61,7 +61,7 @@ def check_installed(python, folder):
     assert "reached the end" in done.stdout
     for words in (["simulator"], ["plot", "bag"], ["view", "bag"], ["compile"], ["demo"],
                   ["export", "bag"], ["report", "run", "bag"], ["workspace", "example2"],
-                  ["recorder"], ["study", "feedforward"]):  # fmt: skip
+                  ["recorder"]):  # fmt: skip
         done = run(command, *words)
         assert done.returncode == 1, words
         assert re.fullmatch(r"sst-ros: \w+ is not installed: .*\n", done.stderr), done.stderr

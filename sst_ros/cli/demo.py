@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`demo`, `paper`: the main job by the nodes, and the paper's Figs. 8 to 14 from scratch."""
+"""`demo`: the main job by the nodes."""
 
 from __future__ import annotations
 
@@ -20,23 +20,15 @@ def add_demo(commands: Commands) -> None:
     demo.add_argument(
         "kind",
         nargs="?",
-        choices=("examples", "feedforward", "identify"),
+        choices=("examples", "feedforward"),
         default="examples",
-        help="the paper's examples; the node inverse_dynamics following a scene's motion; or a "
-        "model identified from a recorded motion, and the tracking error before and after",
+        help="the paper's examples; or the node inverse_dynamics following a scene's motion",
     )
-    add_out(demo, "folder of the results", "demo_out, demo_out/feedforward or demo_out/identify")
+    add_out(demo, "folder of the results", "demo_out or demo_out/feedforward")
     add_scene_name(
         demo, "--scene", help="with feedforward: name of a scene, or path of a .yaml file"
     )
     demo.add_argument("--mode", nargs="+", metavar="MODE", help="with feedforward: control modes")
-
-
-def add_paper(commands: Commands) -> None:
-    """Add `paper` to the command line."""
-    what = "draw Figs. 8 to 14 of the paper: nodes, continuous solution, Pinocchio"
-    paper = command(commands, "paper", _paper, what)
-    add_out(paper, "folder of the pictures and their index page", "paper_out")
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -60,17 +52,4 @@ def _demo(options: argparse.Namespace) -> int:
 
     if options.kind == "examples":
         return demo.demo(out)
-    if options.kind == "identify":
-        from sst_ros.identification_demo import identification
-
-        return identification(out)
     return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)
-
-
-def _paper(options: argparse.Namespace) -> int:
-    out = free_out(options, "paper_out")
-    for module in NEEDED:
-        require(module)
-    from sst_ros.paper import paper
-
-    return 0 if all(each.within for each in paper(out)) else 1

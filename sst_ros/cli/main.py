@@ -23,13 +23,11 @@ COMMANDS = {
     "describe": "scene",
     "compile": "scene",
     "demo": "demo",
-    "paper": "demo",
     "view": "view",
     "report": "recording",
     "plot": "recording",
     "export": "recording",
     "recover": "recording",
-    "study": "study",
     "sweep": "study",
     "identify": "identify",
 }

@@ -29,17 +29,6 @@ def add_report(commands: Commands) -> None:
     accuracy.add_argument("--all", action="store_true", help="all shipped scenes, the default")
     add_out(accuracy, "folder of the results", "accuracy_out")
     accuracy.add_argument("--mpmath", action="store_true", help="reference in 30 digits, slow")
-    accuracy.add_argument(
-        "--control", action="store_true",
-        help="error against control rate, method and hold in the run loop; scenes with torques,"
-        " default: example2 friction",
-    )  # fmt: skip
-    accuracy.add_argument("--nodes", action="store_true", help="with --control: real nodes, too")
-    stability = command(kinds, "stability", _stability, "stiff and extreme cases, largest steps")
-    add_out(stability, "folder of the results", "stability_out")
-    stability.add_argument(
-        "--long", action="store_true", help="1e5 s of swinging and a thousand contacts too, minutes"
-    )
 
 
 def add_plot(commands: Commands) -> None:
@@ -86,32 +75,12 @@ def _report(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     out = free_out(options, "accuracy_out")
-    if options.control:
-        _control(options, out)
-        return
     from sst_ros.scene.scene import names
     from sst_ros.studies.accuracy_report import report
     from sst_ros.studies.reference_solution import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
     report(names() if options.all else options.scene or names(), out, kind=kind)
-
-
-def _control(options: argparse.Namespace, out: Path) -> None:
-    from sst_ros import demo
-    from sst_ros.studies.control_rate_report import SCENES, report
-
-    def record(name: str, bag: Path, rate: int, hold: str) -> None:
-        demo.record(name, demo.empty_bag(bag.parent, bag.name), rate=rate, hold=hold)
-
-    report(options.scene or SCENES, out, record=record if options.nodes else None)
-
-
-def _stability(options: argparse.Namespace) -> int:
-    out = free_out(options, "stability_out")
-    from sst_ros.studies.stability_report import report
-
-    return 0 if report(out, long=options.long) else 1
 
 
 def _plot(options: argparse.Namespace) -> int:

@@ -27,7 +27,6 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.sampled_data import largest_stable
 from sst_ros.studies.step_advice import eigenvalues, step_advice
 from sst_ros.sweeps.job_list import run_jobs
 
@@ -182,6 +181,27 @@ def largest_step(family: str, method: Method, coefficient: float) -> LargestStep
 def bisect_step(stable: Callable[[float], bool]) -> float:
     """Return the largest h for which `stable` holds, to one per cent; nan where there is none."""
     return LONGEST_S if stable(LONGEST_S) else largest_stable(stable, _SHORTEST_S, 1e3, 0.01)
+
+
+def largest_stable(
+    stable: Callable[[float], bool], start: float, factor: float, to: float = 1e-6
+) -> float:
+    """Go up from `start` by factors until it is not stable; bisect the last one.
+
+    Returns:
+        The limit, to the relative accuracy `to`; nan where the start is not stable.
+
+    """
+    if not stable(start):
+        return math.nan
+    low = start
+    while stable(low * factor):
+        low *= factor
+    high = low * factor
+    while high > low * (1.0 + to):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
 
 
 def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:

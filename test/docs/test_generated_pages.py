@@ -9,12 +9,8 @@ import pytest
 from docs.blocks import ROOT
 
 from sst_ros.scene import scene as scenes
-from sst_ros.studies import (
-    accuracy_report,
-    control_rate_report,
-    stability_page,
-    stability_report,
-)
+from sst_ros.studies import accuracy_report
+from studies import control_rate, extreme, stability_page
 
 
 def stale(name, page, table):
@@ -22,7 +18,7 @@ def stale(name, page, table):
     rows = list(csv.DictReader(io.StringIO(table)))
     if name == "stability":
         introduction = stability_page.INTRODUCTION
-        wanted = {case.name for case in stability_report.catalogue()}
+        wanted = {case.name for case in extreme.catalogue()}
         found = {row["name"] for row in rows}
         if any(row["passed"] != "True" for row in rows):
             yield "a case failed"
@@ -39,7 +35,7 @@ def stale(name, page, table):
         if absent != ["0"] * len(wanted):
             yield "terms that are absent cost operations"
     else:
-        introduction, wanted = control_rate_report.INTRODUCTION, set(control_rate_report.SCENES)
+        introduction, wanted = control_rate.INTRODUCTION, set(control_rate.SCENES)
         found = {row["scene"] for row in rows}
         if "WARNING" in page:
             yield "an order is not that of theory"

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.identification_demo import identification
+from studies.identification import identification
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sst-ros paper`: Figs. 8 to 14 with the continuous solution and an independent engine."""
+"""`make paper`: Figs. 8 to 14 with the continuous solution and an independent engine."""
 
 import pytest
 
-from sst_ros.__main__ import main
-from sst_ros.paper import paper
+from studies.paper import main, paper
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
 PICTURES = [
@@ -29,5 +28,5 @@ def test_the_figures_are_drawn_and_their_curves_agree(tmp_path, domain, capsys):
         assert (tmp_path / "out" / f"{name}.png").stat().st_size > 10_000
         assert f"{name}.png" in page
     assert "ssumed inertias" in page
-    assert main(["paper", "--out", str(tmp_path / "out")]) == 1
+    assert main(["--out", str(tmp_path / "out")]) == 1
     assert "exists already" in capsys.readouterr().err

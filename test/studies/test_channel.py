@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.studies.control_loop import Channel, ChannelState
+from studies.control_loop import Channel, ChannelState
 
 GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 

@@ -8,17 +8,20 @@ import pytest
 
 from sst_ros.errors import InputError
 from sst_ros.scene import scene
-from sst_ros.studies import control_rate
-from sst_ros.studies.control_rate import (
+from studies import control_rate
+from studies.control_rate import (
     EXACT,
     HOLDS,
     MIDDLE,
     START,
     advice,
     control_study,
+    figure,
+    findings,
+    grid,
+    page,
     run_controlled,
 )
-from sst_ros.studies.control_rate_report import figure, findings, grid, page
 
 BRIEF = dataclasses.replace(scene.load("example2"), duration=0.2)
 RATES, METHODS = (100, 200, 500), ("rk4", "dop853")

@@ -25,17 +25,11 @@ from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies import (
-    extreme_batches,
-    extreme_cases,
-    extreme_results,
-    geometry_cases,
-    load_cases,
-)
-from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import LOOSE
-from sst_ros.studies.extreme_results import FACTOR
-from sst_ros.studies.stability_report import catalogue
+from studies import extreme_batches, extreme_cases, extreme_results, geometry_cases, load_cases
+from studies import extreme_scenes as extremes
+from studies.extreme import catalogue
+from studies.extreme_cases import LOOSE
+from studies.extreme_results import FACTOR
 
 CASES = [case for case in catalogue() if not case.compiled_only]
 EXAMPLE2 = load("example2_heavy")

@@ -10,24 +10,31 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.cli.main import run
 from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
-from sst_ros.studies import bandwidth_limits
-from sst_ros.studies.bandwidth_limits import (
+from sst_ros.studies.results import write
+from studies import bandwidth_limits, feedforward
+from studies.bandwidth_limits import (
     bandwidth_in_theory,
     bandwidth_limit,
     ideal_plant,
     stable,
 )
-from sst_ros.studies.control_loop import Channel, ControlLoop, run_loop
-from sst_ros.studies.feedforward import COLUMNS, RESTLESS, FeedforwardPlan, feedforward_study
-from sst_ros.studies.feedforward_report import document, figure, page, text
-from sst_ros.studies.model_errors import SHARE, model_errors
-from sst_ros.studies.results import write
-from sst_ros.studies.sampled_data import ORDERS, stability_limit
+from studies.control_loop import Channel, ControlLoop, run_loop
+from studies.feedforward import (
+    COLUMNS,
+    RESTLESS,
+    FeedforwardPlan,
+    document,
+    feedforward_study,
+    figure,
+    page,
+    text,
+)
+from studies.model_errors import SHARE, model_errors
+from studies.sampled_data import ORDERS, stability_limit
 
 REACH = load("reach")
 SPIRAL = dataclasses.replace(REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4)
@@ -196,7 +203,7 @@ def test_a_plant_at_the_limit_rests_until_it_is_disturbed():
 
 def test_the_command_tells_what_it_takes(capsys):
     with pytest.raises(SystemExit):
-        run(["study", "feedforward", "--help"])
+        feedforward.main(["--help"])
     said = capsys.readouterr().out
     assert all(word in said for word in ("--scene", "--period", "--bandwidths", "--out", "[rad/s]"))
 
@@ -212,6 +219,6 @@ def test_the_command_tells_what_it_takes(capsys):
     ],
 )
 def test_what_is_not_allowed_is_told_without_a_traceback(words, said, capsys):
-    assert run(["study", "feedforward", *words]) == 1
+    assert feedforward.main(words) == 1
     error = capsys.readouterr().err
     assert said in error and "Traceback" not in error

@@ -10,7 +10,7 @@ from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load
-from sst_ros.studies.model_errors import heavier, model_errors, without_friction
+from studies.model_errors import heavier, model_errors, without_friction
 
 REACH, EXAMPLE2 = load("reach"), load("example2_heavy")
 RATE, ACCELERATION = (0.4, -0.7, 0.9), (3.0, 2.0, -5.0)

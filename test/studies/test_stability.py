@@ -12,7 +12,6 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
 from sst_ros.plot.style import save_figure
 from sst_ros.studies import stability_limits
-from sst_ros.studies.extreme_results import evaluate_case
 from sst_ros.studies.results import table
 from sst_ros.studies.stability_limits import (
     LONGEST_S,
@@ -24,8 +23,9 @@ from sst_ros.studies.stability_limits import (
     regions,
     stability_function,
 )
-from sst_ros.studies.stability_page import faults, limits_of_theory, lines, page
-from sst_ros.studies.stability_report import catalogue
+from studies.extreme import catalogue
+from studies.extreme_results import evaluate_case
+from studies.stability_page import faults, limits_of_theory, lines, page
 
 CASES = catalogue()
 

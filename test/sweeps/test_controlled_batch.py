@@ -12,11 +12,11 @@ from sst_ros.control.controller import MODES, Controller, Measurement
 from sst_ros.control.controller_settings import ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.studies.control_loop import Channel, ChannelState, ControlLoop, run_loop
 from sst_ros.sweeps.counter_noise import gaussian
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
+from studies.control_loop import Channel, ChannelState, ControlLoop, run_loop
 
 for module in ("numba", "dask", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")

@@ -8,8 +8,10 @@ motion with either model.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy as np
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
+from sst_ros.host.output import require_free
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA
@@ -27,6 +30,7 @@ from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
 from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.yaml_document import dump
+from studies import parser, run
 
 SHARE = 0.2
 """Part by which the inertia of each kind of body differs from the model."""
@@ -134,3 +138,20 @@ def _follow(out: Path, model: str, folder: str) -> None:
     bag = empty_bag(out / folder)
     print(f"{folder}: following for {seconds:g} s", flush=True)
     follow(str(out / "plant.yaml"), bag, MODE, seconds, model=str(path))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the demo from the command line."""
+    what = "A model identified from a recorded motion, and the tracking error before and after."
+    arguments = parser("identification", what, Path("demo_out/identify"))
+    arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
+
+    def study(options: argparse.Namespace) -> bool:
+        out = require_free(options.out, "identification", force=options.force)
+        return identification(out) == 0
+
+    return run(study, arguments, words)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

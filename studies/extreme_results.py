@@ -19,8 +19,8 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies.extreme_cases import Case, CaseRun, run, run_through_loop
-from sst_ros.studies.extreme_scenes import apart
+from studies.extreme_cases import Case, CaseRun, run, run_through_loop
+from studies.extreme_scenes import apart
 
 LOOSER = 1e-4
 """Tolerance at which the error estimate is checked where LOOSE resolves no error."""

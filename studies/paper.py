@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import html
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 
 from sst_ros import demo
 from sst_ros.extras import MissingDependency
-from sst_ros.host.output import writing
+from sst_ros.host.output import require_free, writing
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array
@@ -25,7 +26,8 @@ from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.studies.pinocchio_motion import PinocchioMotion
+from studies import parser, run
+from studies.pinocchio_motion import PinocchioMotion
 
 NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
 """Largest differences that are expected: of angles [rad], and of torques [N m]."""
@@ -200,3 +202,19 @@ def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
         "known to us, only their captions.</p>"
         f"<h2>Largest differences</h2><ul>{text}</ul>{pictures}</body></html>\n"
     )
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Draw the figures from the command line."""
+    arguments = parser("paper", "Figs. 8 to 14 of the paper.", Path("paper_out"))
+    arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
+
+    def study(options: argparse.Namespace) -> bool:
+        out = require_free(options.out, "paper", force=options.force)
+        return all(each.within for each in paper(out))
+
+    return run(study, arguments, words)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
-from sst_ros.studies import geometry_cases, load_cases, scaling_cases
-from sst_ros.studies.extreme_batches import batch_groups, run_batch
-from sst_ros.studies.extreme_cases import Case
-from sst_ros.studies.extreme_results import CaseResult, evaluate_case
 from sst_ros.studies.results import provenance, records, table, write
 from sst_ros.studies.stability_limits import LONGEST_S, largest_steps, regions, scene_points
-from sst_ros.studies.stability_page import case_table, faults, lines, page
 from sst_ros.sweeps.job_list import run_jobs
+from studies import DOCS, geometry_cases, load_cases, parser, run, scaling_cases
+from studies.extreme_batches import batch_groups, run_batch
+from studies.extreme_cases import Case
+from studies.extreme_results import CaseResult, evaluate_case
+from studies.stability_page import case_table, faults, lines, page
 
 
 def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool:
@@ -109,3 +109,19 @@ def with_batches(cases: Sequence[CaseResult], workers: int | None) -> list[CaseR
 
 def _batched(group: tuple[int, ...]) -> list[tuple[str, bool]]:
     return run_batch([catalogue()[number] for number in group])
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the catalogue from the command line."""
+    arguments = parser("extreme", "Stiff and extreme cases, and largest stable steps.", DOCS)
+    arguments.add_argument("--long", action="store_true", help="the cases that take minutes, too")
+    arguments.add_argument("--workers", type=int, help="processes; default: one a core")
+    return run(
+        lambda options: report(options.out, workers=options.workers, long=options.long),
+        arguments,
+        words,
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -15,7 +15,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.studies.model_errors import heavier, scaled
+from studies.model_errors import heavier, scaled
 
 Triple = tuple[float, float, float]
 

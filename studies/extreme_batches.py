@@ -25,8 +25,8 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, specs
 from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.studies.extreme_cases import Case, CaseRun, run
-from sst_ros.studies.extreme_scenes import Triple
+from studies.extreme_cases import Case, CaseRun, run
+from studies.extreme_scenes import Triple
 
 TOLERANCE = 1e-10
 """Local error estimate of a step up to which the end is that of a simulation: its default."""

@@ -23,8 +23,8 @@ from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial, Workspace
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import Case
+from studies import extreme_scenes as extremes
+from studies.extreme_cases import Case
 
 REST = extremes.REST
 POSE = (0.7, 0.8, 0.75)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from sst_ros.errors import SstError
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.studies.extreme_scenes import Triple
-from sst_ros.studies.loop_runs import run_in_loop
+from studies.extreme_scenes import Triple
+from studies.loop_runs import run_in_loop
 
 Deviation = Callable[[Simulation], float]
 
@@ -38,7 +38,7 @@ class Case:
         group: heading on the page.
         integrator: method.
         feedback: `torque` takes the simulation too.
-        compiled_only: too long for plain Python; run by `report stability --long` alone.
+        compiled_only: too long for plain Python; run by `studies.extreme --long` alone.
         loose: tolerance at which the error estimate is checked; None where it cannot be.
         estimate: why `loose` is not LOOSE; empty where it is.
 

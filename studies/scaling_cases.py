@@ -16,10 +16,10 @@ from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import Case
-from sst_ros.studies.extreme_scenes import REST, Triple
-from sst_ros.studies.model_errors import scaled
+from studies import extreme_scenes as extremes
+from studies.extreme_cases import Case
+from studies.extreme_scenes import REST, Triple
+from studies.model_errors import scaled
 
 RIGHT = math.pi / 2
 MS = 1_000_000

@@ -14,10 +14,10 @@ import numpy as np
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies import extreme_scenes as extremes
-from sst_ros.studies.extreme_cases import LOOSE, Case
-from sst_ros.studies.extreme_scenes import REST, Triple
-from sst_ros.studies.sampled_data import pole
+from studies import extreme_scenes as extremes
+from studies.extreme_cases import LOOSE, Case
+from studies.extreme_scenes import REST, Triple
+from studies.sampled_data import pole
 
 QUARTER = math.pi / 4
 

@@ -10,7 +10,7 @@ from functools import partial
 
 from sst_ros.scene.bodies import Inertia, Link
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.control_loop import Channel
+from studies.control_loop import Channel
 
 SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""

@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sst_ros.integration.methods import METHODS, RODAS4
-from sst_ros.studies.extreme_batches import SAME_ORIENTATION, TOLERANCE
-from sst_ros.studies.extreme_cases import LOOSE
-from sst_ros.studies.extreme_results import FACTOR, LOOSER, CaseResult
 from sst_ros.studies.results import markdown, provenance, table
 from sst_ros.studies.stability_limits import (
     FAR,
@@ -22,6 +19,9 @@ from sst_ros.studies.stability_limits import (
     method_faults,
     stability_function,
 )
+from studies.extreme_batches import SAME_ORIENTATION, TOLERANCE
+from studies.extreme_cases import LOOSE
+from studies.extreme_results import FACTOR, LOOSER, CaseResult
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 INTRODUCTION = f"""\
 # Stability
 
-Written by `python -m sst_ros report stability --long`; all figures are from the machine and the
+Written by `python -m studies.extreme --long`; all figures are from the machine and the
 date below. Without `--long` the cases of 1e5 s and of a thousand contacts are left out.
 
 Each case is run by `Simulation` interpreted, a control period a call; through the run loop of the
