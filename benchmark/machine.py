@@ -8,7 +8,7 @@ import os
 import platform
 from importlib import metadata
 
-from sst_ros.report.summary import processor
+from sst_ros.report.results import processor
 
 
 def described(*packages: str) -> dict[str, str]:

@@ -30,14 +30,14 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.work_precision import draw_control_rates
 from sst_ros.recording import recording
-from sst_ros.report.states import recorded as recorded_states
+from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.states import of_samples
 from sst_ros.runtime.run_types import Phase
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.reference_solution import ReferenceSolution, solve_reference
-from sst_ros.studies.results import markdown, provenance, records, table, write
 from studies import DOCS, parser, run
 from studies.loop_runs import run_in_loop
 from studies.sampled_data import ORDERS, slope
@@ -332,7 +332,7 @@ def recorded_run(bag: Path, rate: int, hold: str) -> ControlRun:
     reported = run.diagnostics
     return ControlRun(
         rate, reported.get("integrator", "auto"), hold, run.time_ns,
-        recorded_states(Geometry.of(run.scene), run, slice(None))[:, :7],
+        of_samples(Geometry.of(run.scene), run, slice(None))[:, :7],
         float(reported.get("error_estimate", "nan")), 1e-6 * float(reported["step_mean_us"]),
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
-from sst_ros.studies.results import provenance, records, table, write
+from sst_ros.report.results import provenance, records, table, write
 from sst_ros.studies.stability_limits import LONGEST_S, largest_steps, regions, scene_points
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, geometry_cases, load_cases, parser, run, scaling_cases

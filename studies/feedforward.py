@@ -38,9 +38,9 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array
+from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.studies.results import markdown, provenance, records, table, write
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies.bandwidth_limits import bandwidth_in_theory, bandwidth_limit, ideal_plant

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sst_ros.integration.methods import METHODS, RODAS4
-from sst_ros.studies.results import markdown, provenance, table
+from sst_ros.report.results import markdown, provenance, table
 from sst_ros.studies.stability_limits import (
     FAR,
     LONGEST_S,

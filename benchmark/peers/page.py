@@ -11,7 +11,7 @@ from benchmark import machine
 from benchmark.peers import results as tables
 from benchmark.peers.results import Results
 from benchmark.peers.study import TARGETS
-from sst_ros.studies.results import markdown
+from sst_ros.report.results import markdown
 
 TEXT = """\
 # Speed and accuracy compared with MuJoCo, Pinocchio, Drake, Exudyn and SciPy

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.plot import sphere
-from sst_ros.plot.joints import applied
+from sst_ros.plot import workspace
+from sst_ros.plot.motion import applied
 from sst_ros.plot.pictures import known, save
 from sst_ros.plot.style import LINES, legend, positive, stack, styled, three
 from sst_ros.recording.signals import Signals
@@ -124,9 +124,9 @@ def _difference(_: Overlay, runs: Drawn) -> Figure:
 def _sphere(_: Overlay, runs: Drawn) -> Figure:
     scene = runs[0][0].scene
     assert scene is not None
-    figure, axes, view = sphere.ground(scene)
+    figure, axes, view = workspace.ground(scene)
     for run, label, style in runs:
-        axes.plot(*view.flat(sphere.directions(run)), label=label, **style)
+        axes.plot(*view.flat(workspace.directions(run)), label=label, **style)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     return figure
 

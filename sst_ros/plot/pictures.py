@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import writing
-from sst_ros.plot import energy, joints, paper_figures, sphere
-from sst_ros.plot.downsampling import envelope
+from sst_ros.plot import motion, paper_figures, workspace
 from sst_ros.plot.paper_figures import Solution
-from sst_ros.plot.style import save_figure, styled
+from sst_ros.plot.style import envelope, save_figure, styled
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
@@ -64,20 +63,20 @@ PICTURES = {
     "theta": Picture("The angle θ", (ORIENTATION,), _angle(0)),
     "phi": Picture("The angle φ", (ORIENTATION,), _angle(1)),
     "psi": Picture("The angle ψ", (ORIENTATION,), _angle(2)),
-    "tracking": Picture("Desired and measured angles", (JOINTS, "reference"), joints.tracking),
-    "tracking_error": Picture("Tracking error", ("tracking_error",), joints.tracking_error),
+    "tracking": Picture("Desired and measured angles", (JOINTS, "reference"), motion.tracking),
+    "tracking_error": Picture("Tracking error", ("tracking_error",), motion.tracking_error),
     "control_torques": Picture(
-        "Torques of the controller", ("reference", "tracking_error"), joints.control_torques
+        "Torques of the controller", ("reference", "tracking_error"), motion.control_torques
     ),
-    "torques": Picture("Torques", (TICKS,), joints.applied_and_commanded),
-    "power": Picture("Power of the actuators", (JOINTS,), energy.power),
-    "work": Picture("Work of the actuators", (JOINTS, TICKS), energy.actuator_work),
-    "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), energy.energy),
-    "joint_angles": Picture("Joint angles", (JOINTS,), joints.joint_angles),
-    "joint_rates": Picture("Joint rates", (JOINTS,), joints.joint_rates),
-    "phase": Picture("Phase portraits of the actuators", (JOINTS,), joints.phase),
-    "margins": Picture("Distance to the limits", (JOINTS, S), joints.margins),
-    "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), sphere.sphere),
+    "torques": Picture("Torques", (TICKS,), motion.applied_and_commanded),
+    "power": Picture("Power of the actuators", (JOINTS,), motion.power),
+    "work": Picture("Work of the actuators", (JOINTS, TICKS), motion.actuator_work),
+    "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), motion.energy),
+    "joint_angles": Picture("Joint angles", (JOINTS,), motion.joint_angles),
+    "joint_rates": Picture("Joint rates", (JOINTS,), motion.joint_rates),
+    "phase": Picture("Phase portraits of the actuators", (JOINTS,), motion.phase),
+    "margins": Picture("Distance to the limits", (JOINTS, S), motion.margins),
+    "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), workspace.sphere),
 }  # fmt: skip
 
 

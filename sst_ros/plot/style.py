@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `styled` gives it the style.
+A function that draws takes data and returns a `Figure`; `styled` gives it the style. Long curves
+are drawn with few points: of every stretch the least and the largest value stay. No spike is lost,
+and a gap (nan) stays a gap; what is left out no picture could show.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -20,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array
+from sst_ros.recording.time_series import Integers
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
@@ -174,3 +177,33 @@ def scaled(values: Array) -> tuple[Array, str]:
 def positive(values: Array) -> Array:
     """Return values for a logarithmic axis: nan for what lies below SMALLEST_SHOWN."""
     return np.asarray(np.where(values > SMALLEST_SHOWN, values, np.nan))
+
+
+STRETCHES = 700
+"""Each gives two points or more: a picture is about a thousand pixels wide."""
+
+
+def envelope(curves: Iterable[Array], count: int) -> Integers:
+    """Rows that stay of curves of `count` values each: ascending, the first and the last in it."""
+    size = -(-count // STRETCHES)
+    if size <= 4:
+        return np.arange(count)
+    stay = np.zeros(count, dtype=bool)
+    stay[[0, -1]] = True
+    begins = np.arange(0, count, size)
+    for curve in curves:
+        padded = np.full(len(begins) * size, np.nan)
+        padded[:count] = curve
+        stretches = padded.reshape(-1, size)
+        lost = np.isnan(stretches)
+        for filled in (np.where(lost, -np.inf, stretches), -np.where(lost, np.inf, stretches)):
+            stay[np.minimum(begins + filled.argmax(axis=1), count - 1)] = True
+        gaps = lost.any(axis=1)
+        stay[np.minimum(begins + lost.argmax(axis=1), count - 1)[gaps]] = True
+    return np.flatnonzero(stay)
+
+
+def few(seconds: Array, values: Array) -> tuple[Array, Array]:
+    """Return times (m,) and values (m,) or (m, k) with no more points than can be seen."""
+    rows = envelope(values.T if values.ndim > 1 else [values], len(values))
+    return seconds[rows], values[rows]

@@ -99,7 +99,7 @@ def integration(recording: Recording) -> Comparison:
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
         return Comparison(Deviation.none(count), Deviation.none(count), (), 0, (reason,))
     start = states.initial(recording.scene) if states.begins(recording) else None
-    ticks = recorded_ticks(recording)
+    ticks = ticks_of(recording)
     motion = TickPropagator(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
     return _Reference(recording, motion, ticks).compare(start, restart=True)
 
@@ -126,7 +126,7 @@ def ideal(recording: Recording) -> Comparison | None:
     return reference.compare(states.initial(recording.scene), restart=False)
 
 
-def recorded_ticks(recording: Recording) -> TickSequence:
+def ticks_of(recording: Recording) -> TickSequence:
     """Return the recorded ticks."""
     ticks, torque = recording.ticks, recording.ticks.torque
     if Dynamics.of(recording.scene).moved and ticks.moment is not None:
@@ -204,7 +204,7 @@ class _Reference:
             return None
         tick = int(usable[0])
         geometry = Geometry.of(recording.scene)
-        state = states.recorded(geometry, recording, [int(at[tick])])[0]
+        state = states.of_samples(geometry, recording, [int(at[tick])])[0]
         return first + tick, tuple(state.tolist())
 
     def _integrate(self, start: Vector, first: int, stop: int) -> int:

@@ -7,6 +7,8 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from sst_ros.report.results import made_line
+
 ERROR_LIMIT_RAD = 1e-9
 """Integration error above which a run is warned of, where its tolerance was not recorded."""
 ANSWERED_PERCENT = 90.0
@@ -171,22 +173,6 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield from (f"Not known: {words}." for words in summary["unknown"])
     yield ""
     yield from textwrap.wrap(made_line(summary["report"]), 110, break_on_hyphens=False)
-
-
-def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:
-    """Return versions, machine and date of a report in one line.
-
-    Args:
-        made: as in `summary.made_on`.
-        compiled: whether numba was used; None for wherever it is installed.
-
-    """
-    used = bool(made["numba"]) if compiled is None else compiled
-    numba = f", numba {made['numba']}" if used else ", plain Python"
-    return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}{numba}, NumPy {made['numpy']}, "
-        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
-    )
 
 
 def _row(label: str, value: Any, form: str = "", unit: str = "") -> str:

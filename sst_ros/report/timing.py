@@ -3,27 +3,52 @@
 
 Periods are between the receptions of consecutive samples by the recorder, so that they hold the
 jitter of simulator, transport and recorder together.
+
+A command is paired with the first tick that applies its values. Two delays are measured:
+
+- By the recorder's clock, from the reception of the command to the step. The simulator begins the
+  step of a tick when the tick ends, with the newest command that it has; when that was is read from
+  the receptions of the samples, at the tick's end between two of them. This holds at any pace and
+  with any clock in the stamps, and includes the transport of the samples to the recorder.
+- By stamps, from that of a command, which is that of the sample it answers, to the beginning of the
+  tick: simulated time between what was measured and what was done about it.
+
+The balance of energy is what the samples have, less the work put in between.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.mechanism.geometry import Array
+from sst_ros.dynamics import energy
+from sst_ros.dynamics.expression import Program, trace
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.host.output import slices
+from sst_ros.integration import codegen
+from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.time_series import NANOSECONDS
-from sst_ros.report import energy_balance
-from sst_ros.report.latency import Latency, latency
+from sst_ros.recording.time_series import NANOSECONDS, Integers
+from sst_ros.report import states
+from sst_ros.report.reference import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 
 REPORTED = (
     "ticks_missed", "ticks", "step_mean_us", "error_estimate", "hold_error_start",
     "hold_error_middle",
 )  # fmt: skip
 """Numbers of the diagnostics that are shown over the run."""
+
+STATISTICS: dict[str, Callable[[Array], Any]] = {
+    "min": np.min,
+    "mean": np.mean,
+    "p99": lambda values: np.percentile(values, 99.0),
+    "p99_9": lambda values: np.percentile(values, 99.9),
+    "max": np.max,
+}
 
 
 @dataclass(frozen=True)
@@ -60,7 +85,7 @@ class Timing:
     missing: tuple[str, ...]
 
 
-def timing(recording: Recording) -> Timing:
+def measure(recording: Recording) -> Timing:
     """Measure a recording."""
     missing: list[str] = []
     spacing, period = np.diff(recording.time_ns), recording.period_ns
@@ -82,7 +107,7 @@ def timing(recording: Recording) -> Timing:
         received, period / 1e3,
         np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
         gaps / NANOSECONDS, pace_s, pace, (late - late.min()) / 1e3, _reported(recording),
-        latency(recording, missing), energy_balance.residual(recording, missing),
+        pair_commands(recording, missing), energy_residual(recording, missing),
         tuple(missing),
     )  # fmt: skip
 
@@ -112,15 +137,6 @@ def numbers(timing: Timing) -> dict[str, Any]:
     }
 
 
-STATISTICS: dict[str, Callable[[Array], Any]] = {
-    "min": np.min,
-    "mean": np.mean,
-    "p99": lambda values: np.percentile(values, 99.0),
-    "p99_9": lambda values: np.percentile(values, 99.9),
-    "max": np.max,
-}
-
-
 def _pace(recording: Recording) -> tuple[Array, Array]:
     """Return times, and simulated time per received time over pieces of the run."""
     pieces = min(60, len(recording.time_ns) - 1)
@@ -142,3 +158,181 @@ def _reported(recording: Recording) -> Array:
     since = (recording.received_ns - recording.received_ns[0]).astype(float)
     reported[:, 0] = np.interp(reported[:, 0], since, recording.seconds)
     return reported
+
+
+class Latency(NamedTuple):
+    """Delays of commands that were followed.
+
+    Attributes:
+        time_s: beginning of the ticks that applied them [s], shape (f,).
+        received_us: from the reception of the command to the step [us], shape (f,).
+        stamped_us: from the stamp of the command to the beginning of the tick [us], shape (f,);
+            nan where commands have no stamp.
+        answered: share of the samples after which a new command was received, None without any.
+        age_s: mean time for which ticks have held their command [s], None without any.
+
+    """
+
+    time_s: Array
+    received_us: Array
+    stamped_us: Array
+    answered: float | None = None
+    age_s: float | None = None
+
+
+def pair_commands(recording: Recording, missing: list[str]) -> Latency:
+    """Pair commands with ticks, by their values; `missing` gets a line where there are none."""
+    commands, ticks = recording.commands, recording.ticks
+    if not len(commands.torque):
+        missing.append("no commands are recorded: their latency is not known")
+        return Latency(*np.empty((3, 0)))
+    limit = recording.scene.actuators.torque_limit if recording.scene.actuators else None
+    asked, applied = _digest(commands.torque, limit), _digest(ticks.torque, limit)
+    new, changed = _changes(asked), _changes(applied)
+    step_ns = _received(recording, ticks.end_ns[changed])
+    # The recorder may have received a command a little later than the simulator.
+    earliest_ns = commands.received_ns[new] - ticks.period_ns
+    command, tick = _pairs(asked[new], earliest_ns, applied[changed], step_ns)
+    if not len(command):
+        missing.append("no recorded command is found among the applied torques")
+        return Latency(*np.empty((3, 0)))
+    stamps = commands.stamp_ns[new][command]
+    begins = ticks.start_ns[changed][tick]
+    answered = np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan)
+    passed = (step_ns[tick] - commands.received_ns[new][command]) / 1e3
+    # A torque that is commanded once and for all answers no samples.
+    share, age = _answered(recording, begins) if len(begins) > 1 else (None, None)
+    return Latency(begins / NANOSECONDS, passed, answered, share, age)
+
+
+def _answered(recording: Recording, begins: Integers) -> tuple[float, float]:
+    """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
+    received, commands = recording.received_ns, recording.commands
+    if commands.stamp_ns.any():
+        answered = np.isin(recording.time_ns + recording.start_ns, commands.stamp_ns)
+    else:
+        counts = np.searchsorted(commands.received_ns, received, side="left")
+        answered = np.append(np.diff(counts), 0) > 0
+    ticks = np.searchsorted(begins, recording.ticks.start_ns, side="right") - 1
+    held = recording.ticks.start_ns[ticks >= 0] - np.sort(begins)[ticks[ticks >= 0]]
+    # The last sample is the end of the run, which nothing answers.
+    share = float(np.mean(answered[:-1]))
+    return share, float(held.mean() / NANOSECONDS) if len(held) else 0.0
+
+
+def _received(recording: Recording, time_ns: Integers) -> Integers:
+    """Return when times of the run were received [ns], interpolated between samples."""
+    first = recording.received_ns[0]
+    since = (recording.received_ns - first).astype(float)
+    return np.asarray(first + np.interp(time_ns, recording.time_ns, since).astype(np.int64))
+
+
+def _changes(digest: Integers) -> Integers:
+    """Rows that are not the same as the row before, and the first."""
+    return np.flatnonzero(np.diff(digest, prepend=~digest[:1]))
+
+
+def _digest(torque: Array, limit: float | None) -> Integers:
+    """One number for three: equal for equal torques within the limit, hardly ever for others."""
+    digest = np.zeros(len(torque), dtype=np.uint64)
+    for column in torque.T:
+        held = column if limit is None else np.clip(column, -limit, limit)
+        digest ^= (held + 0.0).view(np.uint64)  # -0.0 becomes 0.0
+        digest *= np.uint64(0x9E3779B97F4A7C15)
+        digest ^= digest >> np.uint64(29)
+    return digest.view(np.int64)
+
+
+def _pairs(
+    asked: Integers, earliest_ns: Integers, applied: Integers, applied_ns: Integers
+) -> tuple[Integers, Integers]:
+    """Find for each command the first tick of its values from `earliest` on."""
+    _, kinds = np.unique(np.concatenate([asked, applied]), return_inverse=True)
+    asked_kind, applied_kind = kinds[: len(asked)], kinds[len(asked) :]
+    order = np.lexsort((applied_ns, applied_kind))
+    # One ascending number of kind and time, so that one search finds the tick of the kind.
+    start = min(int(earliest_ns.min()), int(applied_ns.min()))
+    span = max(int(earliest_ns.max()), int(applied_ns.max())) + 1 - start
+    keys = 2.0 * applied_kind[order] + (applied_ns[order] - start) / span
+    sought = 2.0 * asked_kind + (earliest_ns - start) / span
+    at = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
+    found = order[at]
+    good = (keys[at] >= sought) & (applied_kind[found] == asked_kind)
+    command, tick = np.flatnonzero(good), found[good]
+    # Commands are in order of reception: the last of those that share a tick is the one it took.
+    last = len(tick) - 1 - np.unique(tick[::-1], return_index=True)[1]
+    last.sort()
+    return command[last], tick[last]
+
+
+def energy_residual(recording: Recording, missing: list[str]) -> Array | None:
+    """Return the energy balance residual since the start [J], shape (n,).
+
+    Args:
+        recording: a run.
+        missing: gets a line for all that is not known.
+
+    Returns:
+        nan where it is not known, None where it cannot be known. Where ticks are lost, the balance
+        goes on without them.
+
+    """
+    moment = recording.scene.moment
+    if moment and moment.topic and recording.ticks.moment is None:
+        missing.append("the moment on the star is not recorded: no energy residual")
+        return None
+    ticks = ticks_of(recording)
+    many = len(ticks.start_ns) > COMPILED_FROM
+    count = len(recording.time_ns)
+    if many and codegen.numba_version() is None:
+        count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
+        until = recording.seconds[count - 1]
+        missing.append(f"energy after {until:g} s: there is no numba to balance it")
+    stored, work = np.full((2, len(recording.time_ns)), np.nan)
+    geometry, energies = Geometry.of(recording.scene), _energy(recording)
+    motion = TickPropagator(recording.scene, None, compiled=many)
+    for part in slices(count, CHUNK, "energy", shown=False):
+        rows = slice(part.start, min(part.stop + 1, count))
+        state = states.of_samples(geometry, recording, rows)
+        stored[rows] = states.by_columns(energies, state)[:, 0]
+        work[rows.start : rows.stop - 1] = _work(motion, ticks, state, recording.time_ns[rows])
+    change = np.zeros(len(stored))
+    change[1:] = np.diff(stored) - work[:-1]
+    change[~np.isfinite(change)] = 0.0
+    return np.asarray(np.where(np.isfinite(stored), np.cumsum(change), np.nan))
+
+
+def _energy(recording: Recording) -> Program:
+    """Kinetic and potential energy [J] of a state."""
+    dynamics = Dynamics.of(recording.scene)
+
+    def stored(*state: Any) -> tuple[Any]:
+        return (energy.kinetic(dynamics.model, state) + energy.potential(dynamics.model, state),)
+
+    return trace(stored, dynamics.state)
+
+
+def _work(motion: TickPropagator, every: TickSequence, state: Array, time: Integers) -> Array:
+    """Work from each of n samples to the next [J], shape (n - 1,).
+
+    It is nan where ticks or states are lost.
+    """
+    places = np.searchsorted(every.start_ns, time)
+    ticks = every.part(slice(places[0], places[-1]))
+    if not len(ticks.start_ns):
+        return np.full(len(state) - 1, np.nan)
+    places -= places[0]
+    # The ticks of a sample are all there if they follow each other from its time to the next.
+    breaks = np.concatenate([[0], np.cumsum(ticks.start_ns[1:] != ticks.end_ns[:-1])])
+    first, last = np.minimum(places[:-1], len(breaks) - 1), np.maximum(places[1:] - 1, 0)
+    whole = (first <= last) & (breaks[first] == breaks[last])
+    whole &= (ticks.start_ns[first] == time[:-1]) & (ticks.end_ns[last] == time[1:])
+    whole &= np.isfinite(state[:-1]).all(axis=1)
+    if not whole.any():
+        return np.full(len(state) - 1, np.nan)
+    starts = np.full((len(ticks.start_ns), state.shape[1]), np.nan)
+    starts[first[whole]] = state[:-1][whole]
+    begin = int(first[whole][0])
+    reached = np.full(len(starts), np.nan)
+    reached[begin:] = motion.follow(ticks.part(slice(begin, None)), starts[begin:])[:, 0, -1]
+    return np.where(whole, reached[last], np.nan)

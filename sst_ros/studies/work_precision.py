@@ -16,11 +16,11 @@ from sst_ros.errors import SstError
 from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.geometry import Array
-from sst_ros.report import formulation
+from sst_ros.report import states
+from sst_ros.report.results import table
 from sst_ros.scene.scene import Scene
 from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.reference_solution import EXTENDED, ReferenceSolution, solve_reference
-from sst_ros.studies.results import table
 from sst_ros.studies.solver_grid import (
     ABOVE_REFERENCE,
     COLUMNS,
@@ -138,7 +138,7 @@ def work_precision(
     instants = (k * target.interval for k in range(len(truth.states)))
     torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
     along = zip(truth.states.astype(float), torques, strict=True)
-    difference, _ = formulation.compare(scene, along)
+    difference, _ = states.compare_with_paper(scene, along)
     advice = step_advice(scene)
     return WorkPrecision(
         scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS), advice,

@@ -9,10 +9,10 @@ import pytest
 from matplotlib import image
 
 from sst_ros import __main__ as cli
-from sst_ros.plot import energy, pictures
+from sst_ros.plot import motion, pictures
 from sst_ros.plot.pictures import PICTURES, draw
 from sst_ros.recording import recording, signals
-from sst_ros.report import energy_balance
+from sst_ros.report import timing
 from sst_ros.scene import scene
 from sst_ros.simulation.simulation import Simulation
 
@@ -93,7 +93,7 @@ def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
 
 def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
     """The states of the bag are exact; the cubic between 2 ms samples errs by h^4."""
-    kinetic, potential = energy.energies(run, run.scene)
+    kinetic, potential = motion.energies(run, run.scene)
     simulation = Simulation(run.scene)
     zero = (0.0, 0.0, 0.0)
     for tick in range(300):
@@ -104,16 +104,16 @@ def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
             parts = simulation.dynamics.energies(*state.quaternion, *state.body_rate, *zero)
             assert kinetic[sample] == pytest.approx(parts[0], rel=1e-12)
             assert potential[sample] == parts[1] == 0.0
-    left = kinetic - kinetic[0] - energy.work(run).sum(axis=1)
+    left = kinetic - kinetic[0] - motion.work(run).sum(axis=1)
     assert np.abs(left).max() < 1e-9 * kinetic.max()
-    assert energy.work(run)[0].tolist() == [0.0, 0.0, 0.0]
+    assert motion.work(run)[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
     loaded = scene.load("friction")
     run = signals.read(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
-    kinetic, potential = energy.energies(run, loaded)
-    left = kinetic + potential - kinetic[0] - potential[0] - energy.work(run).sum(axis=1)
+    kinetic, potential = motion.energies(run, loaded)
+    left = kinetic + potential - kinetic[0] - potential[0] - motion.work(run).sum(axis=1)
     assert left[-1] < -1e-3 * kinetic.max()
     assert (np.diff(left) < 1e-9).all()
 
@@ -121,7 +121,7 @@ def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
 def test_work_is_not_known_beyond_a_lost_torque(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.APPLIED, 80)]
     run = signals.read(bags.write(tmp_path / "bag", kept))
-    known = np.isfinite(energy.work(run)).all(axis=1)
+    known = np.isfinite(motion.work(run)).all(axis=1)
     assert known[:80].all() and not known[80:].any()
 
 
@@ -129,8 +129,8 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
     """As where a recorder hears joint_states first: SciPy refuses quaternions of nan."""
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
-    assert np.flatnonzero(np.isnan(energy.energies(*whole(bag))[0])).tolist() == [60]
-    left = energy_balance.residual(recording.read(bag), [])
+    assert np.flatnonzero(np.isnan(motion.energies(*whole(bag))[0])).tolist() == [60]
+    left = timing.energy_residual(recording.read(bag), [])
     assert np.flatnonzero(np.isnan(left)).tolist() == [60]
     assert np.nanmax(np.abs(left)) < 1e-9
 

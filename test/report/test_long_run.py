@@ -10,7 +10,7 @@ import pytest
 
 from sst_ros.integration.tick_propagator import TickPropagator
 from sst_ros.recording import recording
-from sst_ros.report import energy_balance, reference
+from sst_ros.report import reference, timing
 from sst_ros.report.run import report
 
 ROOT = str(Path(__file__).parents[2])
@@ -43,7 +43,7 @@ def test_a_long_run_is_integrated_compiled(written, monkeypatch):
     assert len(run.time_ns) == 10_001 and len(run.ticks.start_ns) == 20_000
     monkeypatch.setattr(TickPropagator, "follow", counted)
     integration, ideal = reference.integration(run), reference.ideal(run)
-    energy = energy_balance.residual(run, [])
+    energy = timing.energy_residual(run, [])
     assert calls == 3  # both references and the energy, in one call each
     assert integration.compared == 10_001 and integration.error.gamma.max() < 1e-12
     assert integration.own.gamma.max() < 1e-13 and ideal.error.gamma.max() < 1e-2
@@ -52,12 +52,12 @@ def test_a_long_run_is_integrated_compiled(written, monkeypatch):
 
 def test_compiled_and_plain_tell_the_same(written, monkeypatch):
     run = recording.read(written)
-    compiled = reference.integration(run), energy_balance.residual(run, [])
+    compiled = reference.integration(run), timing.energy_residual(run, [])
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
     monkeypatch.setattr(reference, "PLAIN_TICKS", 400)
-    monkeypatch.setattr(energy_balance, "PLAIN_TICKS", 400)
+    monkeypatch.setattr(timing, "PLAIN_TICKS", 400)
     missing = []
-    plain = reference.integration(run), energy_balance.residual(run, missing)
+    plain = reference.integration(run), timing.energy_residual(run, missing)
     assert plain[0].compared == 201
     assert plain[0].reasons == ("only the first 0.4 s are compared: there is no numba for more",)
     assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201

@@ -40,7 +40,7 @@ def lively(bags, example2):
 
 
 def _timing(bags, folder, entries):
-    return timing.timing(recording.read(bags.write(folder / "bag", entries)))
+    return timing.measure(recording.read(bags.write(folder / "bag", entries)))
 
 
 def test_periods_and_latency_are_what_they_were_made(tmp_path, bags, lively):
@@ -77,7 +77,7 @@ def test_a_dropped_tick_shows(tmp_path, bags, example2):
 
     entries = bags.edited(example2, bags.APPLIED, 75, shortened)
     run = recording.read(bags.write(tmp_path / "bag", entries))
-    assert timing.timing(run).gaps_s == pytest.approx([0.149])
+    assert timing.measure(run).gaps_s == pytest.approx([0.149])
     assert reference.integration(run).restarts_ns == (150_000_000,)
 
 
@@ -93,7 +93,7 @@ def test_an_altered_effort_shows_when_it_was(tmp_path, bags, example2):
     run = recording.read(bags.write(tmp_path / "bag", entries))
     error = reference.integration(run).error.gamma_dot
     assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
-    energy = np.abs(timing.timing(run).energy)
+    energy = np.abs(timing.measure(run).energy)
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 

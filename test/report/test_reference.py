@@ -11,7 +11,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.recording import recording
-from sst_ros.report import formulation, reference, states
+from sst_ros.report import reference, states
 from sst_ros.scene import scene
 
 
@@ -123,7 +123,7 @@ def test_a_wrong_start_is_an_error(run):
 def test_states_of_samples_are_whole(run):
     model = kernel.model_of(run.scene)
     for sample in (0, 75, 150):
-        y = states.recorded(Geometry.of(run.scene), run, [sample])[0].tolist()
+        y = states.of_samples(Geometry.of(run.scene), run, [sample])[0].tolist()
         joints = kernel.joints(model, y)
         for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"):
             assert np.allclose(getattr(joints, name), getattr(run, name)[sample], atol=1e-13)
@@ -157,10 +157,10 @@ def test_long_ticks_are_cut_into_short_steps(run):
 
 
 def test_the_formulations_agree_and_a_wrong_kernel_is_seen(run, wrong_kernel):
-    difference, states = formulation.check(run)
-    assert states == 20 and difference < 1e-12
+    difference, count = states.check_with_paper(run)
+    assert count == 20 and difference < 1e-12
     wrong_kernel(lambda right: [1.0000001 * x for x in right])
-    assert 5e-8 < formulation.check(run)[0] < 2e-7
+    assert 5e-8 < states.check_with_paper(run)[0] < 2e-7
 
 
 def test_a_kernel_that_is_wrong_shows_in_the_integration_too(run, wrong_kernel):
@@ -172,4 +172,4 @@ def test_example_1_keeps_to_its_centre(tmp_path, bags):
     run = recording.read(bags.write(tmp_path / "bag", bags.simulated(scene.load("example1"), 0.1)))
     found = reference.integration(run)
     assert np.max(found.error.orientation) < 1e-11
-    assert formulation.check(run)[0] < 1e-12
+    assert states.check_with_paper(run)[0] < 1e-12

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sst_ros.recording import recording
-from sst_ros.report import formulation, reference, summary
+from sst_ros.report import reference, states
+from sst_ros.report.run import summarise
 from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Moment, Spring
 
@@ -18,7 +19,7 @@ EXAMPLE2 = scene.load("example2")
 def judged(run):
     """The comparisons and the notes of a report."""
     integration, ideal = reference.integration(run), reference.ideal(run)
-    said = summary.summarise(run, integration, ideal, formulation.check(run))
+    said = summarise(run, integration, ideal, states.check_with_paper(run))
     return integration, ideal, " ".join(said["notes"])
 
 

@@ -13,8 +13,8 @@ from matplotlib import image
 from sst_ros.control.controller_settings import MODES, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
+from sst_ros.report.results import write
 from sst_ros.scene.scene import load
-from sst_ros.studies.results import write
 from studies import bandwidth_limits, feedforward
 from studies.bandwidth_limits import (
     bandwidth_in_theory,

@@ -11,8 +11,8 @@ from matplotlib import image
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.stability import draw_largest_steps, draw_regions
 from sst_ros.plot.style import save_figure
+from sst_ros.report.results import table
 from sst_ros.studies import stability_limits
-from sst_ros.studies.results import table
 from sst_ros.studies.stability_limits import (
     LONGEST_S,
     LargestStep,

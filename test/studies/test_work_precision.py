@@ -14,6 +14,7 @@ from matplotlib import image
 from sst_ros.errors import InputError
 from sst_ros.plot.style import save_figure
 from sst_ros.plot.work_precision import draw_summary
+from sst_ros.report.results import table, write
 from sst_ros.scene import scene
 from sst_ros.scene.bodies import Inertia
 from sst_ros.studies.accuracy_report import (
@@ -29,7 +30,6 @@ from sst_ros.studies.accuracy_report import (
 )
 from sst_ros.studies.initial_value_problem import InitialValueProblem
 from sst_ros.studies.reference_solution import EXTENDED, MPMATH, HighPrecisionDop853
-from sst_ros.studies.results import table, write
 from sst_ros.studies.scene_summary import summary
 from sst_ros.studies.solver_grid import ABOVE_REFERENCE, COLUMNS, ERROR, FIXED, TOLERANCE
 from sst_ros.studies.term_costs import cost_table, operations

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import os
+import platform
 from collections.abc import Iterable, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_ros.extras import require
 from sst_ros.host.output import writing
+from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.style import save_figure
-from sst_ros.report.summary import made_on
-from sst_ros.report.text import made_line
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,16 +52,6 @@ def markdown(frame: DataFrame) -> str:
     return "\n".join(lines)
 
 
-def provenance(*, compiled: bool | None = None) -> str:
-    """Return versions, machine and date in one line.
-
-    Args:
-        compiled: whether numba was used; None for wherever it is installed.
-
-    """
-    return made_line(made_on(), compiled=compiled)
-
-
 def write(
     out: Path,
     name: str,
@@ -82,3 +75,58 @@ def write(
         (out / f"{name}.md").write_text(page, encoding="utf-8")
         for stem, figure in figures.items():
             save_figure(figure, out / f"{stem}.png")
+
+
+def provenance(*, compiled: bool | None = None) -> str:
+    """Return versions, machine and date in one line.
+
+    Args:
+        compiled: whether numba was used; None for wherever it is installed.
+
+    """
+    return made_line(made_on(), compiled=compiled)
+
+
+def made_on() -> dict[str, Any]:
+    """Return versions, machine and date of a report."""
+    versions = {name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")}
+    try:
+        own = metadata.version("sst_ros")
+    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+        own = "not installed"
+    return {
+        "sst_ros": own,
+        "python": platform.python_version(),
+        **versions,
+        "numba": numba_version(),
+        "processor": processor(),
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8") as file:
+            names = (line.partition(":")[2] for line in file if line.startswith("model name"))
+            return next(names, "").strip() or platform.machine()
+    except OSError:
+        return platform.machine()
+
+
+def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:
+    """Return versions, machine and date of a report in one line.
+
+    Args:
+        made: as in `summary.made_on`.
+        compiled: whether numba was used; None for wherever it is installed.
+
+    """
+    used = bool(made["numba"]) if compiled is None else compiled
+    numba = f", numba {made['numba']}" if used else ", plain Python"
+    return (
+        f"sst_ros {made['sst_ros']}, Python {made['python']}{numba}, NumPy {made['numpy']}, "
+        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
+    )
