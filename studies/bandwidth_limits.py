@@ -10,9 +10,9 @@ import numpy as np
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.studies.stability_limits import largest_stable
 from studies.control_loop import ControlLoop, run_loop
 from studies.sampled_data import stability_limit
+from studies.stability_limits import largest_stable
 
 OFFSET = 1e-8
 """Error at the start [rad]: so small that the plant is linear around it."""

@@ -9,14 +9,15 @@ from functools import lru_cache
 from pathlib import Path
 
 from sst_ros.integration.codegen import numba_version
-from sst_ros.plot.stability import draw_largest_steps, draw_regions
+from sst_ros.plot.methods import draw_regions
 from sst_ros.report.results import provenance, records, table, write
-from sst_ros.studies.stability_limits import LONGEST_S, largest_steps, regions, scene_points
+from sst_ros.report.stability import regions
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, geometry_cases, load_cases, parser, run, scaling_cases
 from studies.extreme_batches import batch_groups, run_batch
 from studies.extreme_cases import Case
 from studies.extreme_results import CaseResult, evaluate_case
+from studies.stability_limits import LONGEST_S, draw_largest_steps, largest_steps, scene_points
 from studies.stability_page import case_table, faults, lines, page
 
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics
@@ -24,8 +25,8 @@ from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA
 from sst_ros.identification.scene_numbers import value_of
-from sst_ros.plot.identification import draw_tracking_errors
-from sst_ros.plot.style import save_figure
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
 from sst_ros.scene.scene import Scene, load
@@ -155,3 +156,31 @@ def main(words: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     raise SystemExit(main())
+
+
+COLOURS = (VERMILION, BLUE)
+
+
+@styled
+def draw_tracking_errors(runs: Mapping[str, tuple[Array, Array]], title: str) -> Figure:
+    """Draw the largest tracking error of the three joints over time, a curve for each run.
+
+    Args:
+        runs: times [s], shape (n,), and errors of gamma [rad], shape (n, 3), by label.
+        title: of the figure.
+
+    """
+    figure = Figure(figsize=(7.0, 3.6))
+    axes = figure.subplots()
+    for (label, (time, error)), colour in zip(runs.items(), COLOURS, strict=False):
+        worst = np.maximum(np.abs(error).max(axis=1), SMALLEST_SHOWN)
+        axes.semilogy(time, worst, color=colour, linewidth=1.6, label=label)
+    drawn = [np.abs(error).max(axis=1) for _, error in runs.values()]
+    axes.set_ylim(min(float(np.quantile(one, 0.05)) for one in drawn) / 3.0,
+                  max(float(one.max()) for one in drawn) * 2.0)  # fmt: skip
+    axes.set_xlabel("time t [s]")
+    axes.set_ylabel("largest error of γ [rad]")
+    axes.set_title(title, pad=22)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=2, frameon=False, fontsize=9,
+                borderaxespad=0.1)  # fmt: skip
+    return figure

@@ -18,8 +18,8 @@ from sst_ros.host.output import require_free, writing
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot import paper_figures
-from sst_ros.plot.paper_figures import NUMBERS, Solution
+from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
+from sst_ros.plot.motion import path as path_of_e
 from sst_ros.plot.pictures import PICTURES, save
 from sst_ros.plot.style import BLUE, VERMILION, positive, styled
 from sst_ros.recording import recording
@@ -130,15 +130,15 @@ def _difference(
 def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
     drawn = {
-        "path_of_E": lambda: paper_figures.path(scene, solutions),
-        "position_of_E": lambda: paper_figures.position_of_e(scene, solutions),
-        "theta": lambda: paper_figures.angle(solutions, 0),
-        "phi": lambda: paper_figures.angle(solutions, 1),
-        "psi": lambda: paper_figures.angle(solutions, 2),
+        "path_of_E": lambda: path_of_e(scene, solutions),
+        "position_of_E": lambda: position_of_e(scene, solutions),
+        "theta": lambda: angle(solutions, 0),
+        "phi": lambda: angle(solutions, 1),
+        "psi": lambda: angle(solutions, 2),
     }
     paths: list[Path] = []
     for name in NUMBERS[scene.name]:
-        stem, title = paper_figures.caption(name, PICTURES[name].title, scene.name)
+        stem, title = caption(name, PICTURES[name].title, scene.name)
         paths += save(drawn[name](), title, out, stem, ["png"])
     return paths
 
@@ -180,8 +180,7 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     below.set_ylabel("largest difference\nof three actuators [N m]")
     below.set_xlabel("time t [s]")
     title = (
-        "Inverse dynamics of Example 1, the check that the paper's text describes\n"
-        f"{paper_figures.ASSUMPTION}"
+        f"Inverse dynamics of Example 1, the check that the paper's text describes\n{ASSUMPTION}"
     )
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
     what = "torques by inverse dynamics against 1.13 sin 12t"
@@ -198,7 +197,7 @@ def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>Figs. 8 to 14</title>"
         "<style>body{font-family:sans-serif;max-width:60em;margin:2em auto}img{max-width:100%}"
         "</style></head><body><h1>Figs. 8 to 14 of the paper</h1>"
-        f"<p>{html.escape(paper_figures.ASSUMPTION.capitalize())}. The paper's own figures are not "
+        f"<p>{html.escape(ASSUMPTION.capitalize())}. The paper's own figures are not "
         "known to us, only their captions.</p>"
         f"<h2>Largest differences</h2><ul>{text}</ul>{pictures}</body></html>\n"
     )

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sst_ros.studies.stability_limits import largest_stable
+from studies.stability_limits import largest_stable
 
 ORDERS = {"start": 1, "middle": 2}
 """Power of the period with which the error of feedforward alone falls, by the instant held."""

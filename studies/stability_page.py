@@ -12,16 +12,15 @@ import numpy as np
 
 from sst_ros.integration.methods import METHODS, RODAS4
 from sst_ros.report.results import markdown, provenance, table
-from sst_ros.studies.stability_limits import (
-    FAR,
-    LONGEST_S,
-    LargestStep,
-    method_faults,
-    stability_function,
-)
+from sst_ros.report.stability import FAR, stability_function
 from studies.extreme_batches import SAME_ORIENTATION, TOLERANCE
 from studies.extreme_cases import LOOSE
 from studies.extreme_results import FACTOR, LOOSER, CaseResult
+from studies.stability_limits import (
+    LONGEST_S,
+    LargestStep,
+    method_faults,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -25,7 +25,7 @@ FLOORS = (
     {"plot", "view"},
     {"report"},
     {"runtime"},
-    {"studies", "identification", "sweeps"},
+    {"identification", "sweeps"},
     {"nodes"},
     {"demo", "launch_parts"},
     {"cli"},

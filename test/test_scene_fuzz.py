@@ -17,9 +17,9 @@ from trees import changed
 
 from sst_ros.cli.scene import check
 from sst_ros.errors import InputError
+from sst_ros.report.scene_summary import summary
 from sst_ros.scene.scene import Scene, names
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.studies.scene_summary import summary
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
 SOURCES = {name: (FOLDER / f"{name}.yaml").read_text(encoding="utf-8") for name in names()}

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from sst_ros.identification.readings import readings
 from sst_ros.identification.scene_numbers import value_of
 from sst_ros.identification.sensitivities import Sensitivities
 from sst_ros.identification.simulation_fit import combination
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.identification import draw_determined
-from sst_ros.plot.style import save_figure
+from sst_ros.plot.style import BLUE, GREY, INK, save_figure, styled
 from sst_ros.scene.scene import load
 
 ERROR = math.radians(1.0)
@@ -40,6 +41,8 @@ PANELS = (
     ("Figs. 12 to 14: θ, φ, ψ of Example 2", "example2", ("theta", "phi", "psi"), False),
     ("Figs. 10, 11: position of E in Example 2", "example2", ("x", "y", "z"), False),
 )
+LEAST, MOST = 1e-3, 1e2
+"""Range of the relative standard deviations that are shown."""
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
@@ -63,6 +66,47 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     labels = (combination(row, tuple(words.values())) for row in rows)
     powers = [re.sub(r"(\S+)\^([+-][\d.]+)", r"$\1^{\2}$", label) for label in labels]
     return powers, relative
+
+
+@styled
+def draw_determined(
+    panels: Sequence[tuple[str, Sequence[str], Array]], title: str, error: str
+) -> Figure:
+    """Draw how well readings determine combinations of parameters, a panel for each figure read.
+
+    Args:
+        panels: title, labels of the combinations, and their relative standard deviations, rising.
+            Those beyond MOST are counted below the others.
+        title: of the figure.
+        error: of the readings, for the axis.
+
+    """
+    known = [int(np.sum(deviations < MOST)) for _, _, deviations in panels]
+    rows = [
+        count + (count < len(labels)) for count, (_, labels, _) in zip(known, panels, strict=True)
+    ]
+    figure = Figure(figsize=(8.2, 1.2 + 0.3 * sum(rows) + 0.45 * len(rows)))
+    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=rows)[:, 0]
+    for axes, count, size, (name, labels, deviations) in zip(
+        grid, known, rows, panels, strict=True
+    ):
+        places, shown = np.arange(count), deviations[:count]
+        colours = [BLUE if value < 1.0 else GREY for value in shown]
+        axes.barh(places, shown - LEAST, left=LEAST, height=0.62, log=True, color=colours)
+        for place, value in zip(places.tolist(), shown.tolist(), strict=True):
+            text = f"{value:.1%}" if value < 1.0 else "open"
+            white = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
+            axes.text(1.15 * value, place, text, va="center", fontsize=8, bbox=white)
+        axes.axvline(1.0, color=INK, linewidth=0.9, linestyle="--", zorder=0)
+        rest = f"{len(labels) - count} more combinations: not determined at all"
+        axes.set_yticks(range(size), [*labels[:count], rest][:size], fontsize=8)
+        axes.set_ylim(size - 0.5, -0.5)
+        axes.grid(axis="y", visible=False)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlim(LEAST, MOST)
+    grid[-1].set_xlabel(f"relative standard deviation ({error})")
+    figure.suptitle(title, fontsize=11)
+    return figure
 
 
 def main() -> None:

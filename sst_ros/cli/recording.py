@@ -75,9 +75,9 @@ def _report(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     out = free_out(options, "accuracy_out")
+    from sst_ros.report.accuracy import report
+    from sst_ros.report.reference_solution import EXTENDED, MPMATH
     from sst_ros.scene.scene import names
-    from sst_ros.studies.accuracy_report import report
-    from sst_ros.studies.reference_solution import EXTENDED, MPMATH
 
     kind = MPMATH if options.mpmath else EXTENDED
     report(names() if options.all else options.scene or names(), out, kind=kind)

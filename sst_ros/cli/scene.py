@@ -68,8 +68,8 @@ def _list(_: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace) -> None:
+    from sst_ros.report.scene_summary import summary
     from sst_ros.scene.scene import load
-    from sst_ros.studies.scene_summary import summary
 
     print(summary(load(options.scene)), end="")
 

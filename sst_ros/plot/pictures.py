@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import writing
-from sst_ros.plot import motion, paper_figures, workspace
-from sst_ros.plot.paper_figures import Solution
+from sst_ros.plot import motion, workspace
+from sst_ros.plot.motion import Solution
 from sst_ros.plot.style import envelope, save_figure, styled
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -47,18 +47,18 @@ def solution(run: Signals) -> Solution:
 
 
 def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
-    return lambda run, _: paper_figures.angle([solution(run)], which)
+    return lambda run, _: motion.angle([solution(run)], which)
 
 
 JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
 PICTURES = {
     "path_of_E": Picture(
         "Path of point E", (ORIENTATION, S),
-        lambda run, scene: paper_figures.path(scene, [solution(run)]),
+        lambda run, scene: motion.path(scene, [solution(run)]),
     ),
     "position_of_E": Picture(
         "Position of point E", (ORIENTATION, S),
-        lambda run, scene: paper_figures.position_of_e(scene, [solution(run)]),
+        lambda run, scene: motion.position_of_e(scene, [solution(run)]),
     ),
     "theta": Picture("The angle θ", (ORIENTATION,), _angle(0)),
     "phi": Picture("The angle φ", (ORIENTATION,), _angle(1)),
@@ -107,7 +107,7 @@ def draw(
             missing[name] = "the bag has no " + ", no ".join(absent)
             continue
         scene = run.scene.name if run.scene else None
-        stem, title = paper_figures.caption(name, picture.title, scene)
+        stem, title = motion.caption(name, picture.title, scene)
         figure = picture.make(run, run.scene)  # type: ignore[arg-type]
         paths += save(figure, title, out, stem, formats)
     return paths, missing

@@ -3,20 +3,93 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from sst_ros.extras import require
 from sst_ros.host.output import writing
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot import sweep
-from sst_ros.plot.style import save_figure
+from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
 from sst_ros.sweeps.sweep_summary import early_end_correlations, output_columns
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+COLUMNS = 4
+MOST_POINTS = 2000
+"""Of all runs in a scatter plot; the worst are drawn over them."""
+
+Series = Mapping[str, Array]
+
+
+@styled
+def distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
+    """Histograms of the outputs of the runs that reached the end."""
+    rows = max(1, math.ceil(len(outputs) / COLUMNS))
+    figure = Figure(figsize=(3.0 * COLUMNS, 2.2 * rows))
+    for i, (name, values) in enumerate(outputs.items()):
+        axes = figure.add_subplot(rows, COLUMNS, i + 1)
+        finite = values[np.isfinite(values)]
+        axes.hist(finite, 60, color=BLUE)
+        axes.set_title(f"{name} [{units.get(name, '1')}]")
+        axes.set_yticks([])
+    return figure
+
+
+@styled
+def early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> Figure:
+    """Rank correlation of each input with an early end, and how runs ended."""
+    figure = Figure(figsize=(11.0, 1.2 + 0.3 * max(len(correlations), len(counts), 4)))
+    left, right = figure.subplots(1, 2)
+    names = list(correlations)[::-1]
+    left.barh(names, [correlations[name] for name in names], color=VERMILION)
+    left.set_xlim(-1.0, 1.0)
+    left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+    left.set_title("Rank correlation of inputs with an early end")
+    reasons = list(counts)[::-1]
+    right.barh(reasons, [counts[reason] for reason in reasons], color=GREY)
+    right.set_title("Runs by how they ended")
+    right.set_xscale("symlog")
+    return figure
+
+
+@styled
+def worst_runs(inputs: Series, worst: NDArray[np.intp], title: str) -> Figure:
+    """Scatter matrix of inputs: a sample of all runs, and the worst over it.
+
+    Args:
+        inputs: columns of all runs.
+        worst: indices of the worst runs.
+        title: what worst means.
+
+    """
+    names: Sequence[str] = list(inputs)
+    size = max(len(names), 1)
+    figure = Figure(figsize=(1.2 + 1.8 * size, 1.2 + 1.8 * size))
+    some = slice(None, None, max(1, len(next(iter(inputs.values()), [])) // MOST_POINTS))
+    for row, vertical in enumerate(names):
+        for column, horizontal in enumerate(names):
+            axes = figure.add_subplot(size, size, row * size + column + 1)
+            x, y = inputs[horizontal], inputs[vertical]
+            if row == column:
+                for values, colour in ((x[some], GREY), (x[worst], VERMILION)):
+                    axes.hist(values, 30, color=colour, alpha=0.6, density=True)
+            else:
+                axes.plot(x[some], y[some], ".", color=GREY, markersize=1)
+                axes.plot(x[worst], y[worst], ".", color=VERMILION, markersize=3)
+            axes.set_xlabel(horizontal if row == size - 1 else "", fontsize=7)
+            axes.set_ylabel("" if column else vertical, fontsize=7)
+            axes.tick_params(labelsize=6)
+    figure.suptitle(title)
+    return figure
+
 
 MOST_INPUTS, WORST = 6, 200
 
@@ -30,11 +103,11 @@ def draw(table: pd.DataFrame, out: Path) -> list[Path]:
     outputs = output_columns(table)
     ended = table["status"].to_numpy() != 0
     complete = {name: table[name].to_numpy()[~ended] for name in outputs}
-    figures = {"distributions": sweep.distributions(complete, table.attrs["units"])}
+    figures = {"distributions": distributions(complete, table.attrs["units"])}
     correlations = early_end_correlations(table)
     counts = {str(reason): int(count) for reason, count in table["reason"].value_counts().items()}
     if ended.any():
-        figures["early_ends"] = sweep.early_ends(dict(correlations), counts)
+        figures["early_ends"] = early_ends(dict(correlations), counts)
     score, title = _badness(table, outputs)
     worst = np.argsort(score)[-min(WORST, len(score)) :]
     inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
@@ -43,7 +116,7 @@ def draw(table: pd.DataFrame, out: Path) -> list[Path]:
     shown = list(strength.sort_values(ascending=False).index[:MOST_INPUTS])
     if shown:
         columns = {name: table[name].to_numpy() for name in shown}
-        figures["worst"] = sweep.worst_runs(columns, worst, title)
+        figures["worst"] = worst_runs(columns, worst, title)
     with writing(out, "sweep plot"):
         for name, figure in figures.items():
             save_figure(figure, out / f"{name}.png")

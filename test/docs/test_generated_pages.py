@@ -8,8 +8,8 @@ import re
 import pytest
 from docs.blocks import ROOT
 
+from sst_ros.report import accuracy
 from sst_ros.scene import scene as scenes
-from sst_ros.studies import accuracy_report
 from studies import control_rate, extreme, stability_page
 
 
@@ -27,9 +27,9 @@ def stale(name, page, table):
         if not all(row["check"] for row in rows):
             yield "an error estimate that is neither checked nor explained"
     elif name == "accuracy":
-        introduction, wanted = accuracy_report.INTRODUCTION, set(scenes.names())
+        introduction, wanted = accuracy.INTRODUCTION, set(scenes.names())
         found = {row["scene"] for row in rows}
-        if accuracy_report.TERMS_INTRODUCTION not in page:
+        if accuracy.TERMS_INTRODUCTION not in page:
             yield "the introduction of the costs of terms"
         absent = re.findall(r"\| absent: \d+ terms \| (\d+) \|", page)
         if absent != ["0"] * len(wanted):

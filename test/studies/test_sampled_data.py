@@ -6,8 +6,8 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from sst_ros.studies.stability_limits import largest_stable
 from studies.sampled_data import pole, slope, stability_limit
+from studies.stability_limits import largest_stable
 
 
 def matrix(product, damping, delay):

@@ -9,22 +9,22 @@ import pytest
 from matplotlib import image
 
 from sst_ros.integration.methods import METHODS
-from sst_ros.plot.stability import draw_largest_steps, draw_regions
+from sst_ros.plot.methods import draw_regions
 from sst_ros.plot.style import save_figure
 from sst_ros.report.results import table
-from sst_ros.studies import stability_limits
-from sst_ros.studies.stability_limits import (
+from sst_ros.report.stability import regions, stability_function
+from studies import stability_limits
+from studies.extreme import catalogue
+from studies.extreme_results import evaluate_case
+from studies.stability_limits import (
     LONGEST_S,
     LargestStep,
     bisect_step,
+    draw_largest_steps,
     eigenvalues,
     largest_step,
     oscillating,
-    regions,
-    stability_function,
 )
-from studies.extreme import catalogue
-from studies.extreme_results import evaluate_case
 from studies.stability_page import faults, limits_of_theory, lines, page
 
 CASES = catalogue()

@@ -12,12 +12,9 @@ import pytest
 from matplotlib import image
 
 from sst_ros.errors import InputError
+from sst_ros.plot.methods import draw_summary
 from sst_ros.plot.style import save_figure
-from sst_ros.plot.work_precision import draw_summary
-from sst_ros.report.results import table, write
-from sst_ros.scene import scene
-from sst_ros.scene.bodies import Inertia
-from sst_ros.studies.accuracy_report import (
+from sst_ros.report.accuracy import (
     documents,
     fastest,
     figure,
@@ -25,15 +22,27 @@ from sst_ros.studies.accuracy_report import (
     page,
     text,
 )
-from sst_ros.studies.accuracy_report import (
+from sst_ros.report.accuracy import (
     summary as summary_of,
 )
-from sst_ros.studies.initial_value_problem import InitialValueProblem
-from sst_ros.studies.reference_solution import EXTENDED, MPMATH, HighPrecisionDop853
-from sst_ros.studies.scene_summary import summary
-from sst_ros.studies.solver_grid import ABOVE_REFERENCE, COLUMNS, ERROR, FIXED, TOLERANCE
-from sst_ros.studies.term_costs import cost_table, operations
-from sst_ros.studies.work_precision import work_precision
+from sst_ros.report.reference_solution import (
+    EXTENDED,
+    MPMATH,
+    HighPrecisionDop853,
+    InitialValueProblem,
+)
+from sst_ros.report.results import table, write
+from sst_ros.report.scene_summary import cost_table, operations, summary
+from sst_ros.report.work_precision import (
+    ABOVE_REFERENCE,
+    COLUMNS,
+    ERROR,
+    FIXED,
+    TOLERANCE,
+    work_precision,
+)
+from sst_ros.scene import scene
+from sst_ros.scene.bodies import Inertia
 
 SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)

@@ -10,11 +10,20 @@ imaginary.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+
+from sst_ros.plot.methods import MARKERS
+from sst_ros.plot.style import free_figure, note, styled
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +32,12 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, Rosenbrock
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report.stability import FAR, stability_function
+from sst_ros.report.step_advice import eigenvalues, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
-from sst_ros.studies.step_advice import eigenvalues, step_advice
 from sst_ros.sweeps.job_list import run_jobs
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
@@ -42,8 +52,6 @@ LONGEST_S = 1.0
 AMPLITUDE = 1e-4
 """Distance of the springs' start from their rest [rad]: so small that the motion is linear."""
 
-FAR = -1e12
-"""Where the stability function of an L-stable method has vanished."""
 
 WRONG_ORDER, CONDITION, ROUNDING = 0.04, 1e-12, 1e-13
 """Faults: difference from the order, relative, and from a condition; errors of R(z) by rounding."""
@@ -69,20 +77,6 @@ class LargestStep:
     coefficient: float
     rate: float
     step: float
-
-
-def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Evaluate R(z) of a method from its coefficients, for any shape of z."""
-    stages: list[Any] = []
-    one = np.ones_like(z)
-    if isinstance(method, Rosenbrock):
-        for a, c in zip(method.a, method.c, strict=True):
-            at = one + _weighted(a, stages)
-            stages.append((z * at + _weighted(c, stages)) / (4.0 - z))
-        return np.asarray(at + stages[-1])
-    for row in method.a:
-        stages.append(one + z * _weighted(row, stages))
-    return np.asarray(one + z * _weighted(method.b, stages))
 
 
 def method_faults(method: Method) -> Iterator[str]:
@@ -127,10 +121,6 @@ def observed_order(method: Method) -> float:
         last = np.flatnonzero(errors > ROUNDING)[-1]
         orders.append(math.log2(errors[last - 1] / errors[last]) - 1.0)
     return max(orders, key=lambda order: abs(order - method.order))
-
-
-def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:
-    return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)
 
 
 def damped(coefficient: float) -> Scene:
@@ -229,11 +219,41 @@ def scene_points() -> dict[str, NDArray[np.complex128]]:
     return found
 
 
-def regions(
-    x: tuple[float, float] = (-8.0, 2.0), y: tuple[float, float] = (-6.0, 6.0), points: int = 401
-) -> tuple[Array, Array, dict[str, Array]]:
-    """Return a grid of z, shapes (points,), and abs(R) of every method on it."""
-    real, imaginary = np.linspace(*x, points), np.linspace(*y, points)
-    z = real[None, :] + 1j * imaginary[:, None]
-    found = {name: np.abs(stability_function(method, z)) for name, method in METHODS.items()}
-    return real, imaginary, found
+TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: springs"}
+
+
+@styled
+def draw_largest_steps(steps: DataFrame, longest: float, footnote: str) -> Figure:
+    """Draw the largest stable step over the fastest rate, a panel for each family.
+
+    Args:
+        steps: family, method, rate [1/s] and step [s].
+        longest: the longest step that was tried [s].
+        footnote: small print.
+
+    """
+    families = list(steps.family.unique())
+    figure = free_figure(6.2 * len(families) + 0.6, 6.0)
+    panels = figure.subplots(1, len(families), squeeze=False)[0]
+    figure.subplots_adjust(left=0.07, right=0.985, top=0.91, bottom=0.16, wspace=0.18)
+    for axes, family in zip(panels, families, strict=True):
+        own = steps[steps.family == family]
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for name, rows in own.groupby("method", sort=False):
+            colour, marker = MARKERS[name]
+            x, y = rows.rate.to_numpy(), rows.step.to_numpy()
+            reached = f"every step tried, up to {longest:g} s"
+            if not (y >= longest).all():
+                reached = f"step × rate ≤ {x[-1] * y[-1]:.2f}"
+                axes.fill_between(x, 1e-12, y, color=colour, alpha=0.10, linewidth=0.0)
+            axes.plot(x, y, color=colour, marker=marker, linewidth=2.0, markersize=7,
+                      clip_on=False, zorder=4, label=f"{name}: {reached}")  # fmt: skip
+        axes.set_ylim(0.3 * own.step.min(), 2.0 * longest)
+        axes.set_xlim(own.rate.min(), own.rate.max())
+        axes.set_xlabel("largest |λ| of the family [1/s]")
+        axes.set_title(TITLES.get(family, family))
+        axes.legend(loc="lower left", fontsize=9)
+    panels[0].set_ylabel("step [s]; a method is stable below its line")
+    note(figure, footnote, 60 + 80 * len(families))
+    return figure

@@ -9,9 +9,9 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.report import states
+from sst_ros.report.step_advice import step_advice
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.studies.step_advice import step_advice
 
 
 def test_a_stiff_scene_is_left_to_auto_which_changes_to_rodas4():

@@ -8,13 +8,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.plot.work_precision import draw_summary, draw_work_precision
+from sst_ros.plot.methods import draw_summary, draw_work_precision
+from sst_ros.report.reference_solution import EXTENDED
 from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.scene_summary import cost_table
+from sst_ros.report.work_precision import (
+    ABOVE_REFERENCE,
+    ERROR,
+    TOLERANCE,
+    WorkPrecision,
+    work_precision,
+)
 from sst_ros.scene import scene
-from sst_ros.studies.reference_solution import EXTENDED
-from sst_ros.studies.solver_grid import ABOVE_REFERENCE, ERROR, TOLERANCE
-from sst_ros.studies.term_costs import cost_table
-from sst_ros.studies.work_precision import WorkPrecision, work_precision
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

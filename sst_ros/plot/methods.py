@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of errors against their cost: work-precision diagrams, and control rates."""
+"""Figures of the methods: errors against their cost, regions of absolute stability."""
 
 from __future__ import annotations
 
@@ -12,11 +12,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
 
-from sst_ros.plot.style import BLUE, GREEN, INK, PURPLE, VERMILION, free_figure, note, styled
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    free_figure,
+    note,
+    styled,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
 
 MARKERS = {
     "rk4": (BLUE, "o"), "dopri5": (VERMILION, "s"), "dop853": (GREEN, "^"), "rodas4": (PURPLE, "D"),
@@ -24,14 +37,6 @@ MARKERS = {
 """Colour and marker of each method; steps are solid and full, tolerances dashed and hollow."""
 
 FIXED = "fixed steps"
-
-HOLD_COLOURS = {"start": VERMILION, "middle": BLUE, "exact": GREEN}
-HOLD_NAMES = {
-    "start": "torque at the start of the hold",
-    "middle": "torque at the middle of the hold",
-    "exact": "exact profile, nothing held",
-}
-NODES = "nodes"
 
 
 @styled
@@ -115,62 +120,6 @@ def draw_summary(rows: DataFrame, footnote: str) -> Figure:
     return figure
 
 
-@styled
-def draw_control_rates(
-    rows: DataFrame, orders: Mapping[str, float], title: str, footnote: str
-) -> Figure:
-    """Draw the largest error over the control period and over the share of a core.
-
-    Args:
-        rows: rate_Hz, method, hold, largest_rad, core_share, by.
-        orders: power of the period by hold, as found.
-        title: two lines.
-        footnote: small print.
-
-    """
-    figure = free_figure(12.0, 6.6)
-    left, right = figure.subplots(1, 2, sharey=True)
-    figure.subplots_adjust(left=0.075, right=0.985, top=0.87, bottom=0.235, wspace=0.06)
-    loop, nodes = rows[rows.by != NODES], rows[rows.by == NODES]
-    for (hold, method), group in loop.groupby(["hold", "method"], sort=False):
-        marker, colour = MARKERS[method][1], HOLD_COLOURS[hold]
-        group = group.sort_values("rate_Hz")
-        error = np.maximum(group.largest_rad.to_numpy(), 1e-17)
-        given = {"color": colour, "marker": marker, "markerfacecolor": "none", "linewidth": 1.0}
-        left.plot(1e3 / group.rate_Hz, error, markersize=5 + 2.5 * list(MARKERS).index(method),
-                  **{**given, "linewidth": 0.0 if hold != "exact" else 1.0})  # fmt: skip
-        right.plot(100.0 * group.core_share, error, markersize=7, **given)
-    left.plot(1e3 / nodes.rate_Hz, nodes.largest_rad, "*", color=INK, markersize=9)
-    for hold, power in (("start", 1), ("middle", 2)):
-        group = loop[loop.hold == hold].sort_values("rate_Hz")
-        period = 1e3 / group.rate_Hz.to_numpy()
-        line = group.largest_rad.to_numpy()[0] * (period / period[0]) ** power
-        left.plot(period, line, color=HOLD_COLOURS[hold], linewidth=1.6, zorder=1)
-        k = len(period) // 2
-        left.annotate(f"slope {power} (found {orders[hold]:.3f})", (period[k], line[k]), (8, -14),
-                      textcoords="offset points", color=HOLD_COLOURS[hold], fontsize=9)  # fmt: skip
-    for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-    left.set_xlabel("control period [ms]")
-    left.set_ylabel("largest error of the orientation [rad]")
-    right.set_xlabel("processor time of the run loop, share of a core [%]")
-    handles = [
-        Line2D([], [], color=HOLD_COLOURS[hold], label=HOLD_NAMES[hold]) for hold in HOLD_COLOURS
-    ]
-    handles += [
-        Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="none",
-               markerfacecolor="none", label=method) for method in loop.method.unique()
-    ]  # fmt: skip
-    if len(nodes):
-        handles.append(Line2D([], [], color=INK, marker="*", linestyle="none", label="ROS nodes"))
-    figure.legend(handles=handles, loc="center", bbox_to_anchor=(0.5, 0.12), ncol=4, fontsize=9,
-                  frameon=False)  # fmt: skip
-    figure.suptitle(title, fontsize=12)
-    note(figure, footnote, 200)
-    return figure
-
-
 def _panel(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -226,3 +175,67 @@ def _legend(rows: DataFrame, target: float | None) -> list[Line2D]:
                               markerfacecolor="none", label=f"fastest for {target:g} rad")
                        )  # fmt: skip
     return handles
+
+
+@styled
+def draw_regions(
+    x: Array,
+    y: Array,
+    growth: Mapping[str, Array],
+    points: Mapping[str, NDArray[np.complex128]],
+    footnote: str,
+) -> Figure:
+    """Draw regions of absolute stability with the eigenvalues of scenes times their steps in them.
+
+    Args:
+        x: real part of z = h lambda, shape (n,).
+        y: imaginary part, shape (m,).
+        growth: modulus of the stability function by method, shape (m, n).
+        points: eigenvalues times steps by scene.
+        footnote: small print.
+
+    """
+    figure = free_figure(13.0, 8.6)
+    grid = figure.add_gridspec(2, 2, left=0.05, right=0.63, top=0.95, bottom=0.1, hspace=0.14,
+                               wspace=0.08)  # fmt: skip
+    panels: Any = grid.subplots(sharex=True, sharey=True)
+    near = figure.add_axes((0.69, 0.53, 0.3, 0.42))
+    for axes, (method, modulus) in zip(panels.flat, growth.items(), strict=True):
+        colour = MARKERS[method][0]
+        axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
+        axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
+        axes.set_title(f"{method}: stable where coloured")
+    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
+              for name, z in points.items()}  # fmt: skip
+    shown = [z[inside[name]] for name, z in points.items()]
+    colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK)
+    looks: list[dict[str, Any]] = [
+        {"marker": "osD^v<>phX*P"[k % 12], "color": colours[(k + k // 12) % 6],
+         "linestyle": "none", "markersize": 6, "markerfacecolor": "none"}
+        for k in range(len(points))
+    ]  # fmt: skip
+    for axes in (*panels.flat, near):
+        for z, look in zip(shown, looks, strict=True):
+            axes.plot(z.real, z.imag, **look)
+        axes.axhline(0.0, color=INK, linewidth=0.6)
+        axes.axvline(0.0, color=INK, linewidth=0.6)
+    reach = 1.1 * max((float(np.abs(z).max()) for z in shown if len(z)), default=1.0)
+    near.set_xlim(-reach, reach)
+    near.set_ylim(-reach, reach)
+    near.set_title("Near the origin")
+    near.set_xlabel("Re hλ")
+    for axes in panels[1]:
+        axes.set_xlabel("Re hλ")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("Im hλ")
+    handles = [
+        Line2D(
+            [], [], **look, label=name if inside[name].all() else f"{name} (some beyond the axes)"
+        )
+        for name, look in zip(points, looks, strict=True)
+    ]
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.68, 0.46), fontsize=8.5,
+                  frameon=False, ncol=2, title="hλ of the scenes at their start, step h as advised",
+                  title_fontsize=9)  # fmt: skip
+    note(figure, footnote, 170)
+    return figure

@@ -12,6 +12,17 @@ from mechanism.bare_kernel import program_of
 from sst_ros import __main__ as cli
 from sst_ros.dynamics import loads
 from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
+from sst_ros.report.scene_summary import (
+    TERMS,
+    WIDTH,
+    costs,
+    has,
+    operations,
+    operations_by_term,
+    summary,
+    without,
+)
+from sst_ros.report.step_advice import step_advice
 from sst_ros.scene.loads import (
     Actuators,
     Friction,
@@ -21,9 +32,6 @@ from sst_ros.scene.loads import (
     Stroke,
 )
 from sst_ros.scene.scene import Scene, load, names
-from sst_ros.studies.scene_summary import WIDTH, summary
-from sst_ros.studies.step_advice import step_advice
-from sst_ros.studies.term_costs import TERMS, costs, has, operations, operations_by_term, without
 
 EXAMPLE2 = load("example2_heavy")
 QUICK = ("elastic_stops", "friction", "general")

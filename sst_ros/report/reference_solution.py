@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene as an initial value problem, and its reference solution, with the error of that.
+
+Torques are continuous functions of time, not held over control periods: zero where the scene has
+none. The span ends at the first limit that stops the run. Compliant stops and torque limits have
+kinks; there `Simulation`, which locates them, is the reference. Elsewhere the step size is halved
+in double precision until the solution stops improving; then DOP853 solves with that step in
+extended precision. The reference's own error is twice the difference of two step sizes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
+from sst_ros.errors import InputError, Problem, RunStopped
+from sst_ros.extras import require
+from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.methods import DOP853
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.report import states
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import TorqueFunction, Vector3
+
+LongArray: TypeAlias = NDArray[np.longdouble]
+EXTENDED, MPMATH = "long double", "mpmath"
+
+DIGITS = 30
+"""Decimal digits of mpmath's numbers."""
+
+LONGEST_S = 20.0
+"""The reference stays in double precision where extended precision would take more than this [s]:
+a work-precision study of one scene then stays below a minute."""
+
+_MOST_STEPS = 200_000
+
+INTERVALS = 20
+"""Solutions are compared at this many instants or more."""
+
+WHOLE_RUN_S = 1.0
+"""Time span of a scene that names no duration [s]."""
+
+
+@dataclass(frozen=True)
+class StateError:
+    """Distance from the reference: orientation [rad], gamma [rad], gamma_dot [rad/s]."""
+
+    orientation: float
+    gamma: float
+    gamma_dot: float
+
+
+class InitialValueProblem:
+    """A scene as an initial value problem.
+
+    Args:
+        scene: the scene.
+        like: a problem whose instants of comparison are taken.
+
+    Attributes:
+        system: right-hand side, torques and work included.
+        drive: its constant inputs, all zero.
+        start: state at time zero, shape (n,).
+        interval_ns: time between the instants of comparison [ns].
+        count: number of intervals.
+        ends: why the span ends before the scene's duration; empty where it does not.
+        clamped: the torques exceed the limit of the actuators.
+        kinked: the right-hand side has kinks.
+
+    Raises:
+        AssemblyError: the initial gamma has no unique admissible assembly.
+        InputError: the scene cannot start, or stops at once.
+
+    """
+
+    def __init__(self, scene: Scene, like: InitialValueProblem | None = None) -> None:
+        self.scene = scene
+        self.geometry = Geometry.of(scene)
+        self.dynamics = Dynamics.of(scene)
+        self.system = ODE(self.dynamics, scene.torque, work=True)
+        self.drive = (0.0,) * len(self.system.drive)
+        self.start = (*states.initial(scene), 0.0)
+        self.torque: Vector3 | TorqueFunction = scene.torque.at if scene.torque else (0.0, 0.0, 0.0)
+        limit = scene.actuators.torque_limit if scene.actuators else None
+        largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
+        self.clamped = limit is not None and largest > limit
+        self.kinked = self.clamped or scene.stroke.at_end == "elastic"
+        horizon = self._horizon() if like is None else (like.interval_ns, like.count, like.ends)
+        self.interval_ns: int = horizon[0]
+        self.count: int = horizon[1]
+        self.ends: str = horizon[2]
+
+    @property
+    def interval(self) -> float:
+        """Time between the instants of comparison [s]."""
+        return self.interval_ns / NANOSECONDS
+
+    @property
+    def seconds(self) -> float:
+        """Time span [s]."""
+        return self.count * self.interval_ns / NANOSECONDS
+
+    def errors(
+        self, solution: Array | NDArray[np.longdouble], reference: NDArray[np.longdouble]
+    ) -> tuple[StateError, StateError]:
+        """Distances of states (count + 1, n) at the end, and the largest; nan where unknown."""
+        chord = np.minimum(
+            np.linalg.norm(solution[:, :4] - reference[:, :4], axis=1),
+            np.linalg.norm(solution[:, :4] + reference[:, :4], axis=1),
+        )
+        angle = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
+        joints = np.abs(self.joints(solution) - self.joints(reference))
+        gamma, rate = joints[:, :3].max(axis=1), joints[:, 9:12].max(axis=1)
+        whole = tuple(float(values.max()) for values in (angle, gamma, rate))
+        return StateError(float(angle[-1]), float(gamma[-1]), float(rate[-1])), StateError(*whole)
+
+    def joints(self, solution: Array | NDArray[np.longdouble]) -> Array:
+        """Nine angles [rad] and nine rates [rad/s] of states, shape (n, 18)."""
+        result = np.full((len(solution), 18), np.nan)
+        for row, y in enumerate(solution[:, :7].astype(float).tolist()):
+            if all(map(math.isfinite, y)):
+                with contextlib.suppress(ArithmeticError, ValueError):
+                    result[row] = self.dynamics.joints(*y)
+        return result
+
+    def residuals(self, y: Array) -> tuple[float, float]:
+        """Energy residual [J] and the largest abs(r_k . t_k) at a final state, shape (n,)."""
+        size, zero = len(self.dynamics.state), (0.0,) * len(self.dynamics.drive)
+        before, after = (
+            sum(self.dynamics.energies(*state[:size], *zero)[:2])
+            for state in (self.start, y.tolist())
+        )
+        r = kinematics.carriage_directions(self.geometry, self.joints(y[None])[0, :3])
+        t = self.geometry.e @ rotation_matrix(y[:4]).T
+        closure = float(np.abs(np.sum(r * t, axis=1)).max())
+        return float(after - before - y[-1]), closure
+
+    def fixed_steps(self, machine: CompiledMethod, steps: int) -> Array:
+        """States at the instants with `steps` steps an interval; nan after the last finite one."""
+        result = np.full((self.count + 1, len(self.start)), np.nan)
+        y = list(self.start)
+        result[0] = y
+        h = self.interval / steps
+        with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
+            for k in range(self.count):
+                y = machine.step_fixed(k * self.interval, h, steps, y, self.drive)
+                result[k + 1] = y
+        return result
+
+    def simulated(self, method: str, tolerance: float, substeps: int = 1) -> Array:
+        """States at the instants from `Simulation` with `substeps` control periods an interval.
+
+        Raises:
+            RunStopped: a limit is met.
+
+        """
+        simulation = Simulation(
+            self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
+        )
+        rows = [np.array(self.start)]
+        padding = (math.nan,) * (len(self.start) - 7)
+        for k in range(self.count):
+            for part in range(substeps):
+                begin, end = (self.interval_ns * (part + n) // substeps for n in (0, 1))
+                simulation.step(self.torque, end - begin)
+            assert simulation.time_ns == (k + 1) * self.interval_ns
+            state = simulation.state
+            rows.append(np.array([*state.quaternion, *state.body_rate, *padding]))
+        return np.array(rows)
+
+    def _horizon(self) -> tuple[int, int, str]:
+        whole = self.scene.duration or WHOLE_RUN_S
+        simulation = Simulation(self.scene, tolerance=1e-9, step_budget=WHOLE_MOTION_BUDGET)
+        ends = ""
+        try:
+            for _ in range(100):
+                simulation.step(self.torque, round(whole / 100 * NANOSECONDS))
+        except RunStopped as stopped:
+            ends = f"stop at {stopped.time:.6f} s, {stopped.reason}"
+            whole = stopped.time
+        if whole * NANOSECONDS < 1000 * INTERVALS:
+            allowed = f"the run is over before it can be studied: {ends or f'{whole} s'}"
+            raise InputError(self.scene.name, [Problem("initial", whole, allowed)])
+        interval = 10.0 ** math.floor(math.log10(whole / INTERVALS) + 1e-9)
+        interval *= max(f for f in (1, 2, 5) if f * interval * INTERVALS <= whole * (1 + 1e-9))
+        interval_ns = round(interval * NANOSECONDS)
+        return interval_ns, math.floor(whole * NANOSECONDS * (1 + 1e-9) / interval_ns), ends
+
+
+@dataclass(frozen=True)
+class ReferenceSolution:
+    """States at the instants of comparison, their own error, and how they were found."""
+
+    states: LongArray
+    own: StateError
+    how: str
+
+
+def solve_reference(
+    problem: InitialValueProblem, kind: str = EXTENDED, *, compiled: bool
+) -> ReferenceSolution:
+    """Solve a problem as accurately as possible.
+
+    Args:
+        problem: what is solved.
+        kind: EXTENDED or MPMATH.
+        compiled: search for the step size under numba.
+
+    Raises:
+        InputError: there is no finite motion, or mpmath is asked for and not installed.
+
+    """
+    if problem.kinked:
+        rough, fine = (
+            problem.simulated("dop853", tolerance).astype(np.longdouble)
+            for tolerance in (1e-13, 1e-14)
+        )
+        how = "Simulation, dop853, tolerance 1e-14"
+        return ReferenceSolution(fine, _own(problem, rough, fine), how)
+    machine = CompiledMethod(problem.system, DOP853, compiled=compiled)
+    best, solution = _finest(problem, machine)
+    solver = HighPrecisionDop853(problem.system.program, kind, problem.drive)
+    began = time.perf_counter()
+    for _ in range(3):
+        solver.evaluate(problem.start)
+    seconds = (time.perf_counter() - began) / 3 * 1.5 * 12 * problem.count
+    steps = (3 * best // 2, 2 * best)
+    if kind != EXTENDED or seconds * sum(steps) < LONGEST_S:
+        rough, fine = (
+            solver.solve(problem.start, problem.interval, problem.count, n) for n in steps
+        )
+        how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers}"
+    else:
+        fine = solution.astype(np.longdouble)
+        rough = problem.fixed_steps(machine, best // 2).astype(np.longdouble)
+        how = f"DOP853, {problem.interval / best:.3g} s steps, double precision"
+    return ReferenceSolution(fine, _own(problem, rough, fine), how)
+
+
+def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int, Array]:
+    """Halve the step until rounding dominates; return steps an interval, and the solution."""
+    found: list[tuple[float, int, Array]] = []
+    before = problem.fixed_steps(machine, 1)
+    for power in range(1, 14):
+        after = problem.fixed_steps(machine, 2**power)
+        change = problem.errors(before, after.astype(np.longdouble))[1].orientation
+        if math.isfinite(change):
+            found.append((change, 2**power, after))
+        converged = len(found) > 1 and (change < 1e-13 or change > found[-2][0] < 1e-9)
+        if converged or problem.count * 2**power > _MOST_STEPS:
+            break
+        before = after
+    if not found:
+        problems = [Problem("duration", problem.scene.duration, "the reference is not finite")]
+        raise InputError(problem.scene.name, problems)
+    _, steps, solution = min(found, key=lambda row: row[0])
+    return steps, solution
+
+
+def _own(problem: InitialValueProblem, rough: LongArray, fine: LongArray) -> StateError:
+    """Return twice the difference of two step sizes, but not less than doubles resolve."""
+    change, joints = problem.errors(rough, fine)[1], np.abs(problem.joints(fine))
+    gamma, rate = (2.3e-16 * float(joints[:, i : i + 3].max()) for i in (0, 9))
+    return StateError(
+        max(2.0 * change.orientation, 1e-17),
+        max(2.0 * change.gamma, gamma),
+        max(2.0 * change.gamma_dot, rate),
+    )
+
+
+class HighPrecisionDop853:
+    """DOP853 with fixed steps on a number type: the integration package runs on doubles only.
+
+    It evaluates the same traced program, so that it solves what the methods solve to the last bit.
+
+    Args:
+        program: derivative with the inputs t, state, drive.
+        kind: EXTENDED or MPMATH.
+        drive: constant inputs.
+
+    Attributes:
+        numbers: which numbers it calculates with, for reports.
+
+    Raises:
+        MissingDependency: mpmath is asked for and not installed.
+
+    """
+
+    def __init__(self, program: Program, kind: str, drive: Sequence[float]) -> None:
+        names = ("sqrt", "sin", "cos", "tanh", "exp")
+        if kind == EXTENDED:
+            self.numbers = f"{np.finfo(np.longdouble).precision}-digit floats"
+            namespace = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
+            self._number: Any = np.longdouble
+            self._long: Callable[[Any], np.longdouble] = np.longdouble
+        else:
+            mpmath = require("mpmath")
+            context = mpmath.mp.clone()
+            context.dps = DIGITS
+            self.numbers = f"mpmath, {DIGITS} digits"
+            namespace = {each: getattr(context, each) for each in (*names, "atan2")}
+            self._number = context.mpf
+            self._long = lambda x: np.longdouble(mpmath.nstr(x, DIGITS))
+        exec(program.source("rhs"), namespace)
+        self._rhs: Callable[..., tuple[Any, ...]] = namespace["rhs"]
+        self._sqrt: Callable[[Any], Any] = namespace["sqrt"]
+        number = self._number
+        self._drive = tuple(map(number, drive))
+        self._a = [[(i, number(w)) for i, w in enumerate(row) if w] for row in DOP853.a]
+        weights = [number(w) for w in DOP853.b]
+        # As doubles they do not quite add up to 1, which no step size would show.
+        weights[-1] = number(1) - sum(weights[:-1], number(0))
+        self._b = [(i, w) for i, w in enumerate(weights) if DOP853.b[i]]
+        self._c = [number(c) for c in DOP853.c]
+
+    def solve(self, start: Sequence[float], interval: float, count: int, steps: int) -> LongArray:
+        """Return states at k * interval [s], k = 0 .. count, shape (count + 1, len(start)).
+
+        The first four numbers are a quaternion, which is kept at length 1. A row of nan stands
+        where there is no finite state.
+        """
+        number = self._number
+        result = np.full((count + 1, len(start)), np.nan, dtype=np.longdouble)
+        y = [number(x) for x in start]
+        h = number(interval) / steps
+        result[0] = [self._long(x) for x in y]
+        with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
+            for k in range(count):
+                for step in range(steps):
+                    y = self._step((k * steps + step) * h, y, h)
+                result[k + 1] = [self._long(x) for x in y]
+        return result
+
+    def evaluate(self, start: Sequence[float]) -> tuple[Any, ...]:
+        """Evaluate the derivative once, at time zero, to measure its computing time."""
+        number = self._number
+        return self._rhs(number(0), *map(number, start), *self._drive)
+
+    def _step(self, t: Any, y: list[Any], h: Any) -> list[Any]:
+        slopes: list[tuple[Any, ...]] = []
+        for row, node in zip(self._a, self._c, strict=True):
+            at = [x + h * sum(w * slopes[i][j] for i, w in row) for j, x in enumerate(y)]
+            slopes.append(self._rhs(t + node * h, *at, *self._drive))
+        new = [x + h * sum(w * slopes[i][j] for i, w in self._b) for j, x in enumerate(y)]
+        length = self._sqrt(sum(x * x for x in new[:4]))
+        return [x / length for x in new[:4]] + new[4:]
