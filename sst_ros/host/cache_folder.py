@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of compiled code: numba unpickles its files, so no other user may write into it.
+"""The folder of compiled code: numba unpickles its files, so it is for the user alone (mode 700).
 
-The rules are those of StrictModes of OpenSSH: the folder and all folders above it belong to the
-user or to root, and no other user can write into them. A folder above it may be writable where its
-sticky bit keeps others from replacing what is not theirs, as /tmp is, and a group may write whose
-only member is the user.
+Nobody else may put another folder in its place either: as with StrictModes of OpenSSH all folders
+above it belong to the user or to root, and no other user can write into them. One of them may be
+writable where its sticky bit keeps others from replacing what is not theirs, as /tmp is, and a
+group may write whose only member is the user.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import grp
 import importlib.util
 import os
-import pickletools
 import pwd
 import shutil
 import stat
@@ -30,8 +30,8 @@ from typing import Any
 def cache_folder() -> Path:
     """Return the folder of compiled code, made if it was not there.
 
-    It is SST_ROS_CACHE, or sst_ros in the user's cache folder. If somebody else could write into
-    that, it is a private temporary folder, and a warning is given.
+    It is SST_ROS_CACHE, or sst_ros in the user's cache folder. Where that is not for the user
+    alone, it is a private temporary folder, and a warning is given.
 
     Raises:
         OSError: it cannot be made.
@@ -60,112 +60,27 @@ def configured_folder() -> Path | None:
 def objection(folder: Path) -> str | None:
     """Return why code in a folder is not trusted; None where it is."""
     # The path as it is written may lead through links, which must be safe, too.
-    for path in {folder.absolute(), folder.resolve()}:
-        for place in (path / "__pycache__", path, *path.parents):
-            if reason := _objection(place, above=place in path.parents):
-                return reason
+    for whole in {folder.absolute(), folder.resolve()}:
+        for path in (whole, *whole.parents):
+            status = path.lstat()
+            mode = stat.S_IMODE(status.st_mode)
+            if _is_foreign(status):
+                return f"{path} belongs to another user (uid {status.st_uid})"
+            if stat.S_ISLNK(status.st_mode):
+                continue  # its own mode means nothing; what it leads to is looked at, too
+            if path == whole and mode & 0o077:
+                return f"{path} has mode {mode:o} and must have 700"
+            if mode & stat.S_ISVTX:
+                continue
+            if mode & stat.S_IWOTH:
+                return f"{path} can be written by every user"
+            if mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
+                return f"{path} can be written by its group (gid {status.st_gid})"
     return None
 
 
-def store(files: Mapping[str, bytes]) -> None:
-    """Write files of compiled code, by their names in the cache folder, where they are missing."""
-    folder = cache_folder()
-    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
-    for name, data in files.items():
-        if not (folder / name).exists():
-            _write(folder / name, data)
-
-
-def imported(name: str, text: str) -> ModuleType | None:
-    """Import a module of the cache folder, written if it is not there; None if it cannot be."""
-    try:
-        path, data = cache_folder() / f"{name}.py", text.encode()
-        if not path.exists() or not is_safe_file(path) or path.read_bytes() != data:
-            _write(path, data)
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass  # numba can write there, too
-    except OSError:
-        return None
-    known = sys.modules.get(name)
-    if known is not None and known.__file__ == str(path):
-        return known
-    drop_damaged(path)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # numba finds the module again when it loads from its cache.
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    for function in vars(module).values():
-        warn_if_not_kept(function)
-    return module
-
-
-def is_safe_file(path: Path) -> bool:
-    """Return whether a file belongs to the user or root, and no other user can write it."""
-    return _objection(path, above=False) is None
-
-
-def warn_if_not_kept(function: Any) -> None:
-    """Have a compiled function warn, and run, where numba cannot write it to its cache."""
-    cache = getattr(function, "_cache", None)  # numba has no public name for it
-    save = getattr(cache, "save_overload", None)
-    if cache is None or save is None:
-        return
-
-    def save_or_warn(signature: Any, result: Any) -> None:
-        try:
-            save(signature, result)
-        except OSError as error:
-            warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)
-            cache.disable()
-
-    cache.save_overload = save_or_warn
-
-
-def drop_damaged(path: Path) -> None:
-    """Remove what numba has cached for a module if any of it is cut off or of another user."""
-    cached = list((path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"))
-    if not all(map(is_safe_file, cached)):
-        for file in cached:
-            file.unlink(missing_ok=True)
-        return
-    try:
-        for file in cached:
-            with file.open("rb") as stream:
-                # An index is two pickles. Read, not run: they need modules that are not there yet.
-                for _ in range(2 if file.suffix == ".nbi" else 1):
-                    for _ in pickletools.genops(stream):
-                        pass
-    except Exception:  # what is damaged may raise anything
-        for file in cached:
-            file.unlink(missing_ok=True)
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file as a whole: two processes may do so at once, each its own, then a rename."""
-    with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
-        file.write(data)
-    os.utime(file.name, (0, 0))  # numba's stamp is this time: the same for all, as the text is
-    Path(file.name).replace(path)
-
-
-def _objection(path: Path, *, above: bool) -> str | None:
-    try:
-        status = path.lstat()
-    except FileNotFoundError:
-        return None
-    if status.st_uid not in (0, os.geteuid()):
-        return f"{path} belongs to another user (uid {status.st_uid})"
-    if stat.S_ISLNK(status.st_mode):
-        return None  # its own mode means nothing; what it leads to is looked at, too
-    if above and status.st_mode & stat.S_ISVTX:
-        return None
-    if status.st_mode & stat.S_IWOTH:
-        return f"{path} can be written by every user"
-    if status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
-        return f"{path} can be written by its group (gid {status.st_gid})"
-    return None
+def _is_foreign(status: os.stat_result) -> bool:
+    return status.st_uid not in (0, os.geteuid())
 
 
 def _is_private_group(gid: int) -> bool:
@@ -177,6 +92,80 @@ def _is_private_group(gid: int) -> bool:
     return (gid, group.gr_name) == (user.pw_gid, user.pw_name) and {user.pw_name}.issuperset(
         group.gr_mem
     )
+
+
+def store(files: Mapping[str, bytes]) -> None:
+    """Write files of compiled code, by their names in the cache folder, where they are missing."""
+    folder = cache_folder()
+    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
+    for name, data in files.items():
+        if not (folder / name).exists():
+            _write(folder / name, data)
+
+
+def import_text(name: str, text: str) -> ModuleType | None:
+    """Import a module of the cache folder, written if it is not there; None if it cannot be."""
+    try:
+        path, data = cache_folder() / f"{name}.py", text.encode()
+        # A folder that was open to others once may have files of theirs.
+        for file in (path, *(path.parent / "__pycache__").glob(f"{name}.*.nb[ic]")):
+            with contextlib.suppress(FileNotFoundError):
+                if _is_foreign(file.lstat()):
+                    file.unlink()
+        if not path.exists() or path.read_bytes() != data:
+            _write(path, data)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass  # numba can write there, too
+    except OSError:
+        return None
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(path):
+        return known
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # numba finds the module again when it loads from its cache.
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    for function in vars(module).values():
+        _bear_a_bad_cache(function)
+    return module
+
+
+def _bear_a_bad_cache(function: Any) -> None:
+    """Have a function compile anew where its file is damaged, and warn where none can be written.
+
+    numba raises an error in both cases.
+    """
+    cache = getattr(function, "_cache", None)  # numba has no public name for it
+    load, save = (getattr(cache, f"{verb}_overload", None) for verb in ("load", "save"))
+    if cache is None or load is None or save is None:
+        return
+
+    def load_or_none(signature: Any, target: Any) -> Any:
+        try:
+            return load(signature, target)
+        except Exception:  # what is damaged, by a crash of the machine, may raise anything
+            with contextlib.suppress(OSError):
+                cache.flush()
+            return None
+
+    def save_or_warn(signature: Any, result: Any) -> None:
+        try:
+            save(signature, result)
+        except OSError as error:
+            warnings.warn(f"compiled code is not kept: {error}", RuntimeWarning, stacklevel=2)
+            cache.disable()
+
+    cache.load_overload, cache.save_overload = load_or_none, save_or_warn
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file as a whole: two processes may do so at once, each its own, then a rename."""
+    with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
+        file.write(data)
+    os.utime(file.name, (0, 0))  # numba's stamp is this time: the same for all, as the text is
+    Path(file.name).replace(path)
 
 
 def _make(folder: Path) -> None:

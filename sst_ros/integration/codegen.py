@@ -17,7 +17,7 @@ from functools import lru_cache
 from types import CodeType, ModuleType
 from typing import Any
 
-from sst_ros.host.cache_folder import cache_folder, imported
+from sst_ros.host.cache_folder import cache_folder, import_text
 from sst_ros.integration.methods import Tableau
 
 _PLAIN = """\
@@ -137,7 +137,7 @@ def load(
         return _executed("\n".join([_PLAIN, _named(constants), *texts]), "sst_ros_plain")
     more = "" if rounding else _FREE_ROUNDING
     text = _for_numba(texts, constants, nogil=nogil, more=more)
-    module = imported(_name_of(text), text)
+    module = import_text(_name_of(text), text)
     if module is not None:
         return module
     return _executed(text.replace("cache=True", "cache=False", 1), "sst_ros_compiled")

@@ -51,15 +51,16 @@ def test_a_folder_of_the_user_is_trusted(folder):
 @pytest.mark.parametrize(
     ("place", "mode", "said"),
     [
-        ("", 0o777, "every user"),
-        ("", 0o1777, "every user"),
+        ("", 0o777, "mode 777 and must have 700"),
+        ("", 0o1777, "must have 700"),
+        ("", 0o755, "must have 700"),
+        ("", 0o770, "must have 700"),
         ("..", 0o777, "every user"),
         ("..", 0o1777, None),
-        ("__pycache__", 0o777, "every user"),
-        ("", 0o755, None),
+        ("__pycache__", 0o777, None),  # nobody else gets there
     ],
 )
-def test_a_folder_that_others_can_write_is_not(place, mode, said, folder):
+def test_a_folder_that_is_not_for_the_user_alone_is_not(place, mode, said, folder):
     (folder / place).resolve().chmod(mode)
     reason = objection(folder)
     assert reason is None if said is None else said in reason
@@ -67,7 +68,7 @@ def test_a_folder_that_others_can_write_is_not(place, mode, said, folder):
 
 @pytest.mark.parametrize("private", [True, False])
 def test_a_group_may_write_that_has_no_other_member(private, folder, monkeypatch):
-    folder.chmod(0o770)
+    folder.parent.chmod(0o770)
     monkeypatch.setattr(module, "_is_private_group", lambda gid: private)
     assert (objection(folder) is None) == private
 
@@ -91,7 +92,7 @@ def test_a_link_is_followed(folder, tmp_path):
     link.symlink_to(folder)
     assert objection(link) is None
     folder.chmod(0o777)
-    assert "every user" in objection(link)
+    assert "must have 700" in objection(link)
 
 
 def test_what_belongs_to_another_user_is_not_trusted(folder, monkeypatch):
