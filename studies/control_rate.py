@@ -39,7 +39,7 @@ from sst_ros.report.reference_solution import (
 )
 from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.report.states import of_samples
-from sst_ros.runtime.run_types import Phase
+from sst_ros.runtime.run_loop import Phase
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation

@@ -9,14 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import HasState
-from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.torque_input import HasState, TorqueInput
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
 
@@ -24,16 +22,6 @@ TorqueOf = Callable[[Any], Any]
 """Torques of the tick that begins now [N m], constant or a `SineTorque`, from the simulation."""
 
 _LONGEST_S = 120.0
-
-
-class _Parameters(SimulatorParameters):
-    """Parameters with a control period of any whole number of nanoseconds."""
-
-    period = 0
-
-    @property
-    def period_ns(self) -> int:
-        return self.period
 
 
 class _NoMessages:
@@ -46,8 +34,8 @@ class _NoMessages:
 class FunctionInput(TorqueInput):
     """Torque input that calls a function at every tick."""
 
-    def __init__(self, owner: Any, scene: Scene, torque: TorqueOf) -> None:
-        super().__init__(owner, scene.actuators, _NoMessages(), _NoMessages())
+    def __init__(self, run: RunSettings, scene: Scene, torque: TorqueOf) -> None:
+        super().__init__(run, scene.actuators, _NoMessages(), _NoMessages())
         self._torque_of = torque
 
     def torque(self, simulation: Any, now_ns: int) -> Any:
@@ -103,15 +91,9 @@ def run_in_loop(
         The loop, finished or with a fault, and what it has published.
 
     """
-    # Only the number of ticks follows from rate and duration.
-    given = _Parameters(
-        scene=scene.name, rate=1, publish_rate=1, duration=float(ticks), real_time_factor=0.0
-    )
-    object.__setattr__(given, "period", period_ns)
-    owner: Any = SimpleNamespace(parameters=given)
-    output = LoopOutput()
+    run, output = RunSettings(period_ns, last_tick=ticks), LoopOutput()
     pacer = Pacer(period_ns, 0.0, SteadyTime())
-    loop = RunLoop(scene, build, owner, FunctionInput(owner, scene, torque), pacer, output)
+    loop = RunLoop(scene, build, run, FunctionInput(run, scene, torque), pacer, output)
     thread = threading.Thread(target=loop.run, daemon=True)
     thread.start()
     thread.join(_LONGEST_S)

@@ -27,9 +27,8 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.clocks import PublishedClock
 from sst_ros.nodes.graph import COUNT_NS
 from sst_ros.nodes.messages import NotFinite, Numbers, StateMessages, TorqueLog, finite, stamp
-from sst_ros.runtime.run_types import HasState
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO
+from sst_ros.runtime.torque_input import ZERO, HasState
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump

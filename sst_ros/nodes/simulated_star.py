@@ -22,8 +22,7 @@ from sst_ros.errors import AssemblyError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Reply
+from sst_ros.runtime.run_loop import Reply, RunLoop
 
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)

@@ -18,8 +18,7 @@ from rclpy.node import Node
 from sst_ros.nodes import topics
 from sst_ros.nodes.action_goal import ActionGoal
 from sst_ros.nodes.simulated_star import OK, UNSUPPORTED, SimulatedStar, answer, replied
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Phase, Reply
+from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 
 try:
     from simulation_interfaces import action, srv

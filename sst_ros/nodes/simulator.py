@@ -21,8 +21,7 @@ from sst_ros.nodes.publications import SimulatorTopics
 from sst_ros.nodes.services import Services
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Phase, Reply
+from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene import scene
@@ -46,14 +45,17 @@ class Simulator:
         )
         simulated = scene.load(given.scene)
         self._topics = SimulatorTopics(self.node, simulated, given)
-        self._input = TorqueInput(self, simulated.actuators, *self._readers(simulated))
+        self._run = given.run
+        self._input = TorqueInput(self._run, simulated.actuators, *self._readers(simulated))
         self._pacer = self._create_pacer()
         traced = given.equations == "quaternion"
         self._code = (
             CodeCompiler(self.node, simulated, given) if given.compiled and traced else None
         )
         self._latency = scheduling.CpuDmaLatency()
-        self._loop = RunLoop(simulated, self._build, self, self._input, self._pacer, self._topics)
+        self._loop = RunLoop(
+            simulated, self._build, self._run, self._input, self._pacer, self._topics
+        )
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         Services(self.node, self._loop)
@@ -130,7 +132,9 @@ class Simulator:
 
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
-        before, self.parameters = self.parameters, changed
+        before, self.parameters, run = self.parameters, changed, changed.run
+        self._run.command_timeout_ns = run.command_timeout_ns
+        self._run.lockstep_timeout = run.lockstep_timeout
         if changed.real_time_factor != before.real_time_factor:
             self._loop.post(self._change_speed)
 

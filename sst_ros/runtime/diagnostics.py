@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 from sst_ros.dynamics.limits import limits_of
 from sst_ros.host import scheduling
-from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Phase
+from sst_ros.runtime.run_loop import Phase, RunLoop
+from sst_ros.runtime.tick_loop import HeldTorques
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.simulation.simulation import Simulation
 

@@ -14,13 +14,14 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable
+from enum import Enum
+from typing import NamedTuple
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.run_types import PendingReply, Phase, Reply, RunOutput
-from sst_ros.runtime.tick_loop import Counters, NoAnswer, TickLoop
-from sst_ros.runtime.torque_input import HasParameters, TorqueInput
+from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.tick_loop import Counters, HeldTorques, NoAnswer, RunOutput, TickLoop
+from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation.simulation import Simulation, Triple
 
@@ -29,6 +30,31 @@ _POLL_S = 0.001
 _REPLY_S = 30.0
 _STUCK_S = 0.4
 """Processor time after which a step in progress is a fault; a step's budget ends it before."""
+
+
+class Phase(str, Enum):
+    """Phase of a run."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    PAUSED = "paused"
+    FAULT = "fault"
+    FINISHED = "finished"
+
+
+class Reply(NamedTuple):
+    """Answer to a request."""
+
+    success: bool
+    message: str
+
+
+class PendingReply:
+    """Reply that the thread of the run will give; `done` is set when `reply` is valid."""
+
+    def __init__(self) -> None:
+        self.done = threading.Event()
+        self.reply = Reply(False, "not done: the run has ended or failed")
 
 
 class NoSubscribers(SstError):
@@ -49,16 +75,16 @@ class RunLoop:
         self,
         scene: Scene,
         build: Callable[[Scene], Simulation],
-        owner: HasParameters,
+        run: RunSettings,
         torque_input: TorqueInput,
         pacer: Pacer,
         output: RunOutput,
     ) -> None:
         self.phase, self.fault, self.failed = Phase.WAITING, "", False
-        self._build, self._owner = build, owner
+        self._build, self._run = build, run
         self._input, self._output = torque_input, output
         self._original = build(scene)
-        self._ticks = TickLoop(self._original, owner, torque_input, pacer, output)
+        self._ticks = TickLoop(self._original, run, torque_input, pacer, output)
         self._requests: deque[tuple[Callable[[], Reply], PendingReply]] = deque()
         self._changing = threading.RLock()
         self._thread: threading.Thread | None = None
@@ -251,8 +277,7 @@ class RunLoop:
 
     def _start(self) -> bool:
         """Start the run, unless it has to wait; return whether it runs."""
-        by_itself = not self._owner.parameters.waits
-        if not (self._recorded() and (by_itself or self._input.starts_run())):
+        if not (self._recorded() and (not self._run.waits or self._input.starts_run())):
             return False
         if not self._ticks.begin():
             return False
@@ -264,7 +289,7 @@ class RunLoop:
         if self._awaited_since is None:
             return True
         missing = self._output.missing_subscribers()
-        timeout = self._owner.parameters.subscriber_timeout
+        timeout = self._run.subscriber_timeout
         if not missing:
             self._awaited_since = None
         elif time.monotonic() - self._awaited_since > timeout:
@@ -314,7 +339,7 @@ class RunLoop:
                 self.counters.hold()
             if self.fault:
                 phase = Phase.FAULT
-                self.failed = self.failed or self._owner.parameters.duration > 0.0
+                self.failed = self.failed or self._run.ends
             if phase is not self.phase:
                 self.phase = phase
                 self._publish_phase()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -23,10 +25,41 @@ def _rate(doc: str, default: int) -> Any:
 
 
 def _tolerance(doc: str, unit: str, default: float) -> Any:
-    return number(
-        f"{doc}, where the goal does not give it; 0 for none", unit, default=default, least=0.0,
-        most=1e6,
-    )  # fmt: skip
+    text = f"{doc}, where the goal does not give it; 0 for none"
+    return number(text, unit, default=default, least=0.0, most=1e6)
+
+
+@dataclass
+class RunSettings:
+    """What a run takes from the parameters of its node; the times may change between two ticks.
+
+    Attributes:
+        period_ns: length of a tick [ns].
+        ticks_per_sample: ticks between two published samples; this is the control period.
+        last_tick: tick after which the run ends; sys.maxsize for no end.
+        lockstep: each sample is answered before the next tick.
+        waits: a command starts the run.
+        partial_commands: an effort that is nan means zero torque.
+        command_timeout_ns: age at which a command is no longer held [ns]; 0 for never.
+        lockstep_timeout: longest wait for the answer to a sample [s]; 0 for no end.
+        subscriber_timeout: longest wait for subscribers [s].
+
+    """
+
+    period_ns: int
+    ticks_per_sample: int = 1
+    last_tick: int = sys.maxsize
+    lockstep: bool = False
+    waits: bool = False
+    partial_commands: bool = False
+    command_timeout_ns: float = 0.0
+    lockstep_timeout: float = 0.0
+    subscriber_timeout: float = 0.0
+
+    @property
+    def ends(self) -> bool:
+        """Whether the run has a last tick."""
+        return self.last_tick < sys.maxsize
 
 
 @dataclass(frozen=True)
@@ -140,13 +173,24 @@ class SimulatorParameters(Section):
 
     @property
     def ticks_per_sample(self) -> int:
-        """Steps between two published samples; this is the control period."""
+        """Steps between two published samples."""
         return self.rate // self.publish_rate
 
     @property
-    def waits(self) -> bool:
-        """Whether a command starts the run."""
-        return self.wait_for_command or self.sync == "lockstep"
+    def run(self) -> RunSettings:
+        """Return what the run takes from them."""
+        lockstep = self.sync == "lockstep"
+        return RunSettings(
+            self.period_ns,
+            self.ticks_per_sample,
+            math.ceil(self.duration * self.rate - 1e-6) or sys.maxsize,
+            lockstep,
+            self.wait_for_command or lockstep,
+            self.partial_commands,
+            self.command_timeout * NANOSECONDS,
+            self.lockstep_timeout,
+            self.subscriber_timeout,
+        )
 
 
 @dataclass(frozen=True)

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 import threading
 import time
+from typing import Protocol
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.hold_error import HeldTorques
 from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.run_types import RunOutput
-from sst_ros.runtime.torque_input import ZERO, HasParameters, TorqueInput
-from sst_ros.simulation.simulation import Simulation, Triple
+from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.torque_input import ZERO, HasState, TorqueInput
+from sst_ros.scene.loads import SineTorque
+from sst_ros.simulation.simulation import Simulation, State, Triple
 
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
@@ -23,6 +23,38 @@ _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.advance`, after which requests are served."""
 _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
+
+
+class RunOutput(Protocol):
+    """Where a run publishes: the topics of the node."""
+
+    def now_ns(self) -> int:
+        """Return the ROS time [ns]; 0 as long as a followed clock has none."""
+
+    def missing_subscribers(self) -> list[str]:
+        """Return the topics whose subscribers the run has to wait for."""
+
+    @property
+    def unread(self) -> bool:
+        """Whether nothing receives samples, so that only the last of several has to be made."""
+
+    def start(self) -> None:
+        """Forget the torques of the run before."""
+
+    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+        """Log the torque [N m] and external moment [N m] of some ticks."""
+
+    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+        """Publish a sample of the run, and from time to time the torques logged up to it."""
+
+    def flush(self) -> None:
+        """Publish the torques that are logged and not published."""
+
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+        """Publish a state that is no sample; `at_rest` with zero rates and efforts."""
+
+    def phase_changed(self, phase: str) -> None:
+        """Publish the phase, with the reason of a fault."""
 
 
 class Counters:
@@ -88,6 +120,82 @@ class Counters:
         return mean, math.sqrt(variance), self._late_max
 
 
+class HeldTorques:
+    """Error of the orientation that comes from holding torques, estimated from how they change.
+
+    A torque tau(t_k) held over a period T acts, on average, T / 2 late: the angular acceleration
+    lacks A tau' T / 2, where A turns torques into body accelerations. Integrated twice with the
+    present A, the orientation is off by A (T / 2) times the integral of tau - tau(0). Of the torque
+    of the middle of the hold the second order is left: the rate lacks T^2 tau'' / 24 a period, and
+    the orientation moves T^3 tau' / 12 too little in each of 1 / T periods, together
+    A (T^2 / 24) (tau - tau(0) + t tau'(0)). Both leave out that A changes and that the motion
+    responds to its own error: they are estimates of the size.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the torques."""
+        self._first: Triple | None = None
+        self._second: Triple | None = None
+        self._last: Triple | None = None
+        self._impulse = [0.0, 0.0, 0.0]
+        self._seconds = self._held = 0.0
+        self._changes = 0
+
+    def add(self, torque: Triple | SineTorque, seconds: float) -> None:
+        """Add torques [N m] that were held for some time [s]; a sine is not held."""
+        if torque is not self._last and torque != self._last:
+            if isinstance(torque, SineTorque):
+                return
+            self._sum()
+            self._changes += 1
+            self._last = torque
+            if self._first is None:
+                self._first = torque
+            elif self._second is None:
+                self._second = torque
+        self._held += seconds
+
+    def _sum(self) -> None:
+        """Add what the last torque has done."""
+        if self._last is not None:
+            self._seconds += self._held
+            self._impulse = [
+                p + torque * self._held for p, torque in zip(self._impulse, self._last, strict=True)
+            ]
+            self._held = 0.0
+
+    def errors(self, simulation: Simulation) -> tuple[float, float] | None:
+        """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
+
+        None where fewer than two torques were held, or where the torques of the actuators lag.
+        """
+        self._sum()
+        first, second, last = self._first, self._second, self._last
+        lags = len(simulation.dynamics.state) > 7
+        if first is None or second is None or last is None or lags:
+            return None
+        period = self._seconds / self._changes
+        count = self._seconds / period
+        late = [p - a * self._seconds for p, a in zip(self._impulse, first, strict=True)]
+        lost = [c - a + count * (b - a) for a, b, c in zip(first, second, last, strict=True)]
+        return (
+            0.5 * period * _acceleration(simulation, late),
+            period**2 / 24.0 * _acceleration(simulation, lost),
+        )
+
+
+def _acceleration(simulation: Simulation, torque: list[float]) -> float:
+    """Norm of the change of the body acceleration by a change of the torques."""
+    state, dynamics = simulation.state, simulation.dynamics
+    y, rest = (*state.quaternion, *state.body_rate), (0.0,) * (len(dynamics.drive) - 3)
+    with_torque = dynamics.derivative(*y, *torque, *rest)[4:7]
+    without = dynamics.derivative(*y, 0.0, 0.0, 0.0, *rest)[4:7]
+    return math.dist(with_torque, without)
+
+
 class NoAnswer(SstError):
     """No command answered a sample in lockstep."""
 
@@ -108,20 +216,18 @@ class TickLoop:
     def __init__(
         self,
         simulation: Simulation,
-        owner: HasParameters,
+        run: RunSettings,
         torque_input: TorqueInput,
         pacer: Pacer,
         output: RunOutput,
     ) -> None:
-        given = owner.parameters
         self.simulation, self.begun, self.counters = simulation, False, Counters()
         self.held = HeldTorques()
         self.requested, self.stopped = threading.Event(), threading.Event()
         self.step_since = 0.0
-        self._owner, self._input, self._pacer, self._output = owner, torque_input, pacer, output
-        self._lockstep = given.sync == "lockstep"
-        self._period_ns, self._ticks_per_sample = given.period_ns, given.ticks_per_sample
-        self._last_tick = math.ceil(given.duration * given.rate - 1e-6) or sys.maxsize
+        self._run, self._input, self._pacer, self._output = run, torque_input, pacer, output
+        self._lockstep, self._last_tick = run.lockstep, run.last_tick
+        self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
         self._kept: Triple | None = None  # in lockstep, an answer whose deadline has not come
         self._awaited_since = self._waits_since = time.monotonic()
@@ -275,7 +381,7 @@ class TickLoop:
             if self.stopped.is_set() or (paced and self.requested.is_set()):
                 return None
             waited = time.monotonic() - self._awaited_since
-            timeout = self._owner.parameters.lockstep_timeout or math.inf
+            timeout = self._run.lockstep_timeout or math.inf
             timeout = timeout if paced else min(timeout, _STEP_ANSWER_S)
             if waited > timeout:
                 raise NoAnswer(

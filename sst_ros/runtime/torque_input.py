@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from sst_ros.description.headers import nanoseconds
-from sst_ros.runtime.run_types import HasState
-from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.settings import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.state import NANOSECONDS, Vector3, clamped, finite_vector
+from sst_ros.state import NANOSECONDS, State, Vector3, clamped, finite_vector
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
@@ -34,10 +33,16 @@ class Arrivals(Protocol):
         """Return the next messages that arrived until this monotonic time [ns], within bounds."""
 
 
-class HasParameters(Protocol):
-    """Owner of the parameters, which may change between two ticks."""
+class HasState(Protocol):
+    """A simulation, as far as its state is read."""
 
-    parameters: SimulatorParameters
+    @property
+    def state(self) -> State:
+        """Present state; built when it is read."""
+
+    @property
+    def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
+        """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
 
 
 class MessageRefused(Exception):
@@ -63,17 +68,16 @@ class TorqueInput:
 
     def __init__(
         self,
-        owner: HasParameters,
+        run: RunSettings,
         actuators: Actuators | None,
         commands: Arrivals,
         stamped: Arrivals,
         moments: Arrivals | None = None,
     ) -> None:
-        self._owner = owner
+        self._run = run
         self._limit = actuators.torque_limit if actuators else None
         self._damping = actuators.idle_damping if actuators else 0.0
         self._commands, self._stamped, self._moments = commands, stamped, moments
-        self._lockstep = owner.parameters.sync == "lockstep"
         self.received = self.dropped = self.clamped = self.timeouts = 0
         self.reasons: dict[str, int] = {}
         self._forget()
@@ -107,12 +111,10 @@ class TorqueInput:
         moments = self._moments
         if self._commands.waiting or self._stamped.waiting or (moments and moments.waiting):
             return False
-        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
-        expires = (
-            (self.begun and not self.stale and until_ns - self._since > timeout_ns)
-            or (self.moment != ZERO and until_ns - self._moment_since > timeout_ns)
-        )  # fmt: skip
-        return not (expires and timeout_ns)
+        timeout_ns = self._run.command_timeout_ns
+        if self.begun and not self.stale and 0.0 < timeout_ns < until_ns - self._since:
+            return False
+        return self.moment == ZERO or not 0.0 < timeout_ns < until_ns - self._moment_since
 
     def idle_shown(self, stamp_ns: int) -> None:
         """Accept answers to a state that was published with this stamp before the run."""
@@ -120,7 +122,7 @@ class TorqueInput:
 
     def starts_run(self) -> bool:
         """Take the messages that arrived before the run; return whether a command starts it."""
-        if self._lockstep:
+        if self._run.lockstep:
             self.answer(None)
         else:
             self._take(time.monotonic_ns())
@@ -171,7 +173,7 @@ class TorqueInput:
 
     def _commanded(self, found: Sequence[Any]) -> Sequence[Any]:
         """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""
-        if not self._owner.parameters.partial_commands:
+        if not self._run.partial_commands:
             return found
         given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
         for message in given:
@@ -181,15 +183,15 @@ class TorqueInput:
     def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
             return
-        for message in self._moments.arrived(math.inf if self._lockstep else now_ns):
+        for message in self._moments.arrived(math.inf if self._run.lockstep else now_ns):
             vector = message.wrench.torque
             try:
                 self.moment = three((vector.x, vector.y, vector.z), "moments [N m]")
                 self._moment_since = now_ns
             except MessageRefused as refused:
                 self._drop(refused)
-        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
-        if timeout_ns and not self._lockstep and now_ns - self._moment_since > timeout_ns:
+        timeout_ns = self._run.command_timeout_ns
+        if timeout_ns and not self._run.lockstep and now_ns - self._moment_since > timeout_ns:
             self.moment = ZERO
 
     def _use(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> None:
@@ -211,7 +213,7 @@ class TorqueInput:
         self.last_refusal = str(refused)
 
     def _expired(self, now_ns: int) -> bool:
-        timeout_ns = self._owner.parameters.command_timeout * NANOSECONDS
+        timeout_ns = self._run.command_timeout_ns
         old = self.begun and 0.0 < timeout_ns < now_ns - self._since
         self.timeouts += old and not self.stale
         self.stale = old

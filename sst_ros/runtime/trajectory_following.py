@@ -22,8 +22,8 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.runtime import joint_trajectory
 from sst_ros.runtime.settings import ControllerNodeParameters
+from sst_ros.runtime.trajectory_goal import motion_of
 from sst_ros.scene.scene import Actuators, Scene
 from sst_ros.simulation.simulation import NANOSECONDS
 
@@ -97,7 +97,7 @@ class TrajectoryFollower:
             # The check takes longer than a control period; in lockstep the plant waits.
             allowed = "must come when the motion has ended, outside lockstep"
             raise InputError("joint_trajectory", [Problem("points", "", allowed)])
-        motion = joint_trajectory.motion_of(message, self._geometry, begin)
+        motion = motion_of(message, self._geometry, begin)
         check(motion, self._model)
         if self._last is None:
             self._prepare(motion)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One goal of control_msgs/action/FollowJointTrajectory: its tolerances and its outcome.
+"""A JointTrajectory as a desired motion, and a goal of FollowJointTrajectory: or why it is refused.
 
-The rules are those of ros2_controllers' joint_trajectory_controller: tolerances of the path hold
+The rules of goals are those of ros2_controllers' joint_trajectory_controller: tolerances of the path hold
 until the time of the last point, those of the goal from then on.
 """
 
@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 from sst_ros.control.controller import Measurement
-from sst_ros.control.reference import Reference
+from sst_ros.control.reference import Reference, ReferenceMotion
+from sst_ros.control.waypoints import waypoints
 from sst_ros.description.headers import nanoseconds
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import axpy
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.state import NANOSECONDS
@@ -26,6 +28,58 @@ NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""
 
 _QUANTITIES = (("position", "rad"), ("velocity", "rad/s"))
+
+
+def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
+    """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
+
+    It begins immediately and continues the reference, which may be moving.
+
+    Args:
+        message: the trajectory; positions are needed, velocities and accelerations may be left
+            out.
+        geometry: of the manipulator.
+        begin: the reference now.
+
+    Raises:
+        InputError: lists every fault.
+        SingularConfiguration: the path crosses a parallel singularity.
+
+    """
+    if problems := [*_trajectory_faults(message, begin)]:
+        raise InputError("joint_trajectory", problems)
+    places = [list(message.joint_names).index(name) for name in ACTUATORS]
+    points = message.points
+    return waypoints(
+        geometry,
+        begin.quaternion,
+        [nanoseconds(point.time_from_start) / NANOSECONDS for point in points],
+        [_by_leg(point.positions, places) for point in points],
+        [_by_leg(point.velocities, places) for point in points],
+        [_by_leg(point.accelerations, places) for point in points],
+        begin=(begin.gamma_dot, begin.gamma_ddot),
+    )
+
+
+def _trajectory_faults(message: Any, begin: Reference) -> Iterator[Problem]:
+    names = list(message.joint_names)
+    if sorted(names) != list(ACTUATORS):
+        yield Problem("joint_names", names, f"must be {', '.join(ACTUATORS)}, each once")
+    if stamp := nanoseconds(message.header.stamp):
+        yield Problem("header.stamp", stamp, "must be zero: a trajectory begins immediately")
+    for index, point in enumerate(message.points):
+        if len(point.effort):
+            allowed = "must be left out: it is computed"
+            yield Problem(f"points[{index}].effort", list(point.effort), allowed)
+    first = message.points[0] if any(begin.gamma_dot) and message.points else None
+    if first is not None and not nanoseconds(first.time_from_start):
+        allowed = "must be > 0 s while the reference is moving"
+        yield Problem("points[0].time_from_start", 0.0, allowed)
+
+
+def _by_leg(values: Sequence[float], places: Sequence[int]) -> list[float]:
+    """Sort by leg what is whole; what is not is refused as it is."""
+    return [float(values[k]) for k in places] if len(values) == len(places) else list(values)
 
 
 class ErrorCode(IntEnum):

@@ -15,8 +15,7 @@ from sst_ros.errors import RunStopped
 from sst_ros.integration import codegen
 from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
 from sst_ros.runtime.pacing import Pacer, SteadyTime
-from sst_ros.runtime.run_loop import RunLoop
-from sst_ros.runtime.run_types import Phase, Reply
+from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import MOST_WAITING, ZERO, TorqueInput
 from sst_ros.simulation.simulation import Simulation
@@ -79,11 +78,12 @@ class Queue(list):
 
 class Bench:
     def __init__(self, scene="example1", build=Simulation, **given):
-        self.parameters = SimulatorParameters(scene=scene, **{"real_time_factor": 0.0, **given})
+        parameters = SimulatorParameters(scene=scene, **{"real_time_factor": 0.0, **given})
+        run = parameters.run
         self.queue, self.stamped, self.output = Queue(), Queue(), Output()
-        self.input = TorqueInput(self, None, self.queue, self.stamped)
-        pacer = Pacer(self.parameters.period_ns, self.parameters.real_time_factor, SteadyTime())
-        self.loop = RunLoop(load_scene(scene), build, self, self.input, pacer, self.output)
+        self.input = TorqueInput(run, None, self.queue, self.stamped)
+        pacer = Pacer(run.period_ns, parameters.real_time_factor, SteadyTime())
+        self.loop = RunLoop(load_scene(scene), build, run, self.input, pacer, self.output)
         self.thread = threading.Thread(target=self.loop.run, daemon=True)
 
     @contextlib.contextmanager

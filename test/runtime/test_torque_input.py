@@ -43,9 +43,9 @@ class Queue(list):
 
 class Bench:
     def __init__(self, actuators=None, commands=(), **given):
-        self.parameters = SimulatorParameters(**given)
         self.commands, self.stamped, self.moments = Queue(commands), Queue(), Queue()
-        self.board = TorqueInput(self, actuators, self.commands, self.stamped, self.moments)
+        run = SimulatorParameters(**given).run
+        self.board = TorqueInput(run, actuators, self.commands, self.stamped, self.moments)
         self.moving = Simulation(load_scene("example1"))
 
     def torque(self):
