@@ -8,7 +8,6 @@ an executor, measured in two processes at once.
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import threading
 import time
@@ -43,9 +42,6 @@ _DEPTH = 10000
 _TAKE_PERIOD_S = 0.02
 _LOOK_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
-_MMAP_THRESHOLD, _MMAP_BYTES = -3, 1 << 17
-"""Option of mallopt, and its value in bytes. Chunks of the bag are larger: each gets pages of its
-own and gives them back. Otherwise glibc raises the threshold and the chunks scatter the heap."""
 
 
 def _last(name: str) -> str:
@@ -104,8 +100,6 @@ class Recorder:
     def __init__(self) -> None:
         self.node = Node("sst_recorder")
         self.done = threading.Event()
-        if hasattr(libc := ctypes.CDLL(None), "mallopt"):
-            libc.mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
         given = parameters.declare(self.node, RecorderParameters)
         self._wanted = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
         self._foreign = {topic for topic in self._wanted if _last(topic) not in _DECLARED}

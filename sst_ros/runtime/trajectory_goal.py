@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A JointTrajectory as a desired motion, and a goal of FollowJointTrajectory: or why it is refused.
 
-The rules of goals are those of ros2_controllers' joint_trajectory_controller: tolerances of the path hold
-until the time of the last point, those of the goal from then on.
+The rules of goals are those of ros2_controllers' joint_trajectory_controller: tolerances of the
+path hold until the time of the last point, those of the goal from then on.
 """
 
 from __future__ import annotations
