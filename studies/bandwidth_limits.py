@@ -11,8 +11,7 @@ from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS
 from studies.control_loop import ControlLoop, run_loop
-from studies.sampled_data import stability_limit
-from studies.stability_limits import largest_stable
+from studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
 """Error at the start [rad]: so small that the plant is linear around it."""

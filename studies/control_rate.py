@@ -24,7 +24,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from sst_ros import demo
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
@@ -39,7 +39,6 @@ from sst_ros.report.reference_solution import (
 )
 from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.report.states import of_samples
-from sst_ros.runtime.run_loop import Phase
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
@@ -114,16 +113,12 @@ def run_controlled(
         compiled: under numba, where it is installed.
 
     Raises:
-        SstError: the run stopped early; says why.
+        RunStopped: the run stopped early.
 
     """
     assert scene.torque is not None
     profile, period_ns = scene.torque, NANOSECONDS // rate
     shift_ns = period_ns // 2 if hold == MIDDLE else 0
-
-    def build(built: Scene) -> Simulation:
-        fast = compiled and numba_version() is not None
-        return Simulation(built, method, tolerance=TOLERANCE, compiled=fast)
 
     def torque(simulation: Simulation) -> Any:
         if hold == EXACT:
@@ -131,13 +126,13 @@ def run_controlled(
         return profile.at((simulation.time_ns + shift_ns) / NANOSECONDS)
 
     ticks = math.ceil(seconds * rate - 1e-6)
-    loop, output = run_in_loop(scene, build, torque, period_ns, ticks)
-    if loop.phase is not Phase.FINISHED:
-        raise SstError(f"{scene.name} at {rate} Hz: {loop.fault or 'the run takes too long'}")
-    rows = [(*state.quaternion, *state.body_rate) for state in output.states]
+    fast = compiled and numba_version() is not None
+    simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
+    samples = run_in_loop(simulation, torque, period_ns, ticks)
+    rows = [(*state.quaternion, *state.body_rate) for state in samples.states]
     return ControlRun(
-        rate, method, hold, np.array([state.time_ns for state in output.states]), np.array(rows),
-        loop.simulation.error_estimate, float(np.median(np.diff(output.times))),
+        rate, method, hold, np.array([state.time_ns for state in samples.states]), np.array(rows),
+        simulation.error_estimate, float(np.median(np.diff(samples.times))),
     )  # fmt: skip
 
 
@@ -209,7 +204,7 @@ def control_study(
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
-        SstError: a run stopped early.
+        RunStopped: a run stopped early.
 
     """
     if scene.torque is None:

@@ -23,11 +23,10 @@ T^3 / 12 times tau' in each of 1 / T periods: the error falls as T^2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
-
-from studies.stability_limits import largest_stable
 
 ORDERS = {"start": 1, "middle": 2}
 """Power of the period with which the error of feedforward alone falls, by the instant held."""
@@ -54,6 +53,27 @@ def pole(product: float, damping: float, delay: int) -> float:
 def stability_limit(damping: float, delay: int) -> float:
     """Largest bandwidth times period [rad] below which every loop is stable."""
     return largest_stable(lambda product: pole(product, damping, delay) < 1.0, _FINEST, 1.02)
+
+
+def largest_stable(
+    stable: Callable[[float], bool], start: float, factor: float, to: float = 1e-6
+) -> float:
+    """Go up from `start` by factors until it is not stable; bisect the last one.
+
+    Returns:
+        The limit, to the relative accuracy `to`; nan where the start is not stable.
+
+    """
+    if not stable(start):
+        return math.nan
+    low = start
+    while stable(low * factor):
+        low *= factor
+    high = low * factor
+    while high > low * (1.0 + to):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
 
 
 def slope(periods: Sequence[float], errors: Sequence[float]) -> float:

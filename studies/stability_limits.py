@@ -1,29 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Absolute stability of the methods: stability functions, and the largest stable steps found.
+"""Absolute stability of the methods: their coefficients, and the largest stable steps found.
 
-Applied to y' = lambda y with steps h, a method multiplies y by its stability function R(z),
-z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and
-IV.3). The largest stable step is found by bisection on two families of scenes: `stiff` with other
-viscous coefficients, whose fastest eigenvalue is real, and a star on springs, whose eigenvalues are
+A method multiplies the solution of y' = lambda y by its stability function R(h lambda) a step; it
+is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and IV.3). The largest
+stable step is found by bisection on two families of scenes: `stiff` with other viscous
+coefficients, whose fastest eigenvalue is real, and a star on springs, whose eigenvalues are
 imaginary.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from matplotlib.figure import Figure
-
-from sst_ros.plot.methods import MARKERS
-from sst_ros.plot.style import free_figure, note, styled
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +21,22 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod, Method
-from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.integration.methods import METHODS, RODAS4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.plot.methods import MARKERS
+from sst_ros.plot.style import free_figure, note, styled
+from sst_ros.report.results import table
 from sst_ros.report.stability import FAR, stability_function
 from sst_ros.report.step_advice import eigenvalues, step_advice
 from sst_ros.scene import scene as scenes
-from sst_ros.scene.loads import Friction, Initial, JointFriction, Spring, Stroke, Workspace
 from sst_ros.scene.scene import Scene
 from sst_ros.sweeps.job_list import run_jobs
+from studies.extreme_scenes import FREE, POSE, changed, start
+from studies.sampled_data import largest_stable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 VISCOSITIES = tuple(10.0**n for n in range(6))
 """Viscous coefficients of the damped family [N m s/rad]."""
@@ -52,31 +50,16 @@ LONGEST_S = 1.0
 AMPLITUDE = 1e-4
 """Distance of the springs' start from their rest [rad]: so small that the motion is linear."""
 
-
 WRONG_ORDER, CONDITION, ROUNDING = 0.04, 1e-12, 1e-13
 """Faults: difference from the order, relative, and from a condition; errors of R(z) by rounding."""
 
 _SHORTEST_S, _STEPS, _GROWTH = 1e-9, 400, 10.0
 
 
-@dataclass(frozen=True)
-class LargestStep:
-    """Largest stable step of a method; LONGEST_S where every step was stable.
-
-    Attributes:
-        family: decay or oscillation.
-        method: its name.
-        coefficient: viscous coefficient [N m s/rad] or stiffness [N m/rad].
-        rate: largest modulus of the eigenvalues at the start [1/s].
-        step: the step [s]; nan where the shortest was unstable.
-
-    """
-
-    family: str
-    method: str
-    coefficient: float
-    rate: float
-    step: float
+def faults() -> Iterator[str]:
+    """Yield what is wrong with the coefficients of the methods."""
+    for name, method in METHODS.items():
+        yield from (f"WARNING: {name}: {fault}" for fault in method_faults(method))
 
 
 def method_faults(method: Method) -> Iterator[str]:
@@ -123,21 +106,62 @@ def observed_order(method: Method) -> float:
     return max(orders, key=lambda order: abs(order - method.order))
 
 
+def limits_of_theory() -> Iterator[str]:
+    """Yield where each method is stable on the axes, from its stability function."""
+    for name, method in METHODS.items():
+        if method is RODAS4:
+            z = np.asarray(1j * np.geomspace(1e-3, 1e9, 100_000), dtype=np.complex128)
+            on_axis = float(np.abs(stability_function(method, z)).max())
+            far = abs(stability_function(method, np.array([FAR + 0j]))[0])
+            yield (
+                f"{name}: A-stable and L-stable; abs(R) is at most {on_axis:.15g} on the imaginary "
+                f"axis, all poles lie at z = 4, and abs(R({FAR:g})) = {far:.0e}"
+            )
+            continue
+        reach = []
+        for direction in (-1.0, 1j):
+            z = np.asarray(direction * np.linspace(0.0, 10.0, 100_001), dtype=np.complex128)
+            modulus = np.abs(stability_function(method, z))
+            outside = np.flatnonzero(modulus > 1.0 + 1e-9)
+            reach.append(1e-4 * (outside[0] - 1) if len(outside) else math.inf)
+        yield (
+            f"{name}: stable for h lambda from -{reach[0]:.3f} to 0, and up to {reach[1]:.3f} i on "
+            "the imaginary axis"
+        )
+
+
+@dataclass(frozen=True)
+class LargestStep:
+    """Largest stable step of a method; LONGEST_S where every step was stable.
+
+    Attributes:
+        family: decay or oscillation.
+        method: its name.
+        coefficient: viscous coefficient [N m s/rad] or stiffness [N m/rad].
+        rate: largest modulus of the eigenvalues at the start [1/s].
+        step: the step [s]; nan where the shortest was unstable.
+
+    """
+
+    family: str
+    method: str
+    coefficient: float
+    rate: float
+    step: float
+
+
 def damped(coefficient: float) -> Scene:
     """Return the scene `stiff` with another viscous coefficient of the actuators [N m s/rad]."""
-    friction = JointFriction(gamma=Friction(viscous=coefficient))
-    return dataclasses.replace(scenes.load("stiff"), friction=friction)
+    return changed({"friction": {"gamma": {"viscous": coefficient}}}, "stiff")
 
 
 def oscillating(stiffness: float) -> Scene:
     """Return the star of example2_heavy on springs [N m/rad], close to their rest."""
-    start = (0.7, 0.8, 0.75)
-    springs = tuple(Spring(joint=f"gamma_{k + 1}", stiffness=stiffness, rest=rest - AMPLITUDE)
-                    for k, rest in enumerate(start))  # fmt: skip
-    return dataclasses.replace(
-        scenes.load("example2_heavy"), springs=springs, initial=Initial(gamma=start), torque=None,
-        stroke=Stroke(at_end="ignore"), workspace=Workspace(at_edge="ignore"),
-    )  # fmt: skip
+    springs = [
+        {"joint": f"gamma_{k + 1}", "stiffness": stiffness, "rest": angle - AMPLITUDE}
+        for k, angle in enumerate(POSE)
+    ]
+    return changed({**FREE, **start(POSE), "springs": springs, "torque": None})
 
 
 FAMILIES: dict[str, tuple[Callable[[float], Scene], tuple[float, ...]]] = {
@@ -173,27 +197,6 @@ def bisect_step(stable: Callable[[float], bool]) -> float:
     return LONGEST_S if stable(LONGEST_S) else largest_stable(stable, _SHORTEST_S, 1e3, 0.01)
 
 
-def largest_stable(
-    stable: Callable[[float], bool], start: float, factor: float, to: float = 1e-6
-) -> float:
-    """Go up from `start` by factors until it is not stable; bisect the last one.
-
-    Returns:
-        The limit, to the relative accuracy `to`; nan where the start is not stable.
-
-    """
-    if not stable(start):
-        return math.nan
-    low = start
-    while stable(low * factor):
-        low *= factor
-    high = low * factor
-    while high > low * (1.0 + to):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
-
-
 def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:
     """Find the largest stable step of every method in both families."""
     jobs = [
@@ -217,6 +220,20 @@ def scene_points() -> dict[str, NDArray[np.complex128]]:
         if step is not None:
             found[name] = step * eigenvalues(scenes.load(name))
     return found
+
+
+def step_table(steps: Sequence[LargestStep], family: str) -> DataFrame:
+    """Return the largest stable steps of a family as texts: step [ms], step times abs(lambda)."""
+    rows: dict[float, dict[str, str]] = {}
+    for each in (step for step in steps if step.family == family):
+        row = rows.setdefault(each.coefficient, {
+            "coefficient": f"{each.coefficient:g}", "largest abs(lambda) [1/s]": f"{each.rate:.4g}",
+        })  # fmt: skip
+        row[each.method] = (
+            f">= {1e3 * LONGEST_S:g}" if each.step >= LONGEST_S
+            else f"{1e3 * each.step:.3g} ({each.step * each.rate:.2f})"
+        )  # fmt: skip
+    return table(rows.values())
 
 
 TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: springs"}

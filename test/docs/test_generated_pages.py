@@ -10,15 +10,15 @@ from docs.blocks import ROOT
 
 from sst_ros.report import accuracy
 from sst_ros.scene import scene as scenes
-from studies import control_rate, extreme, stability_page
+from studies import control_rate, extreme, extreme_cases
 
 
 def stale(name, page, table):
     """What in a page, or in the table beside it, is not of this program."""
     rows = list(csv.DictReader(io.StringIO(table)))
     if name == "stability":
-        introduction = stability_page.INTRODUCTION
-        wanted = {case.name for case in extreme.catalogue()}
+        introduction = extreme.INTRODUCTION
+        wanted = {case.name for case in extreme_cases.catalogue()}
         found = {row["name"] for row in rows}
         if any(row["passed"] != "True" for row in rows):
             yield "a case failed"

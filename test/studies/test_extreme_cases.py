@@ -14,22 +14,24 @@ from loaded_scenes import REST
 from models import inertia_of
 
 from sst_ros.dynamics import kernel
-from sst_ros.errors import (
-    AssemblyError,
-    RunStopped,
-    SingularConfiguration,
-    SstError,
-)
-from sst_ros.mechanism import kinematics
+from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, SstError
+from sst_ros.integration.batch import Batch
 from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation.simulation import Simulation
-from studies import extreme_batches, extreme_cases, extreme_results, geometry_cases, load_cases
-from studies import extreme_scenes as extremes
-from studies.extreme import catalogue
-from studies.extreme_cases import LOOSE
-from studies.extreme_results import FACTOR
+from studies import extreme_runs
+from studies.extreme_cases import LOOSE, Case, apart, catalogue, tight_end
+from studies.extreme_runs import (
+    FACTOR,
+    batch_groups,
+    compare_row,
+    estimate_check,
+    evaluate_case,
+    run,
+    run_batch,
+    run_through_loop,
+)
+from studies.extreme_scenes import about_e, bouncing_thrice, changed, posed, singular_pose
 
 CASES = [case for case in catalogue() if not case.compiled_only]
 EXAMPLE2 = load("example2_heavy")
@@ -51,7 +53,7 @@ def finite(state):
 )
 def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     began = time.perf_counter()
-    done = extreme_cases.run(case)
+    done = run(case)
     assert time.perf_counter() - began < LONGEST
     if done.simulation is not None:
         assert finite(done.simulation.state)
@@ -59,12 +61,12 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
         assert math.isfinite(done.simulation.error_estimate)
     assert type(done.error).__name__ == (case.refusal or "NoneType"), str(done.error)
     if case.deviation is not None:
-        assert case.deviation(done.simulation) < case.bound
-    check = extreme_results.estimate_check(case, done)
+        assert case.deviation(case, done.simulation) < case.bound
+    check = estimate_check(case, done)
     assert check.holds, check.verdict
     if check.true is None:
         assert check.verdict.startswith("none: ")
-    elif check.true >= extreme_results.ROUNDING:
+    elif check.true >= extreme_runs.ROUNDING:
         assert check.true / FACTOR <= check.estimate <= FACTOR * check.true
     if isinstance(done.error, RunStopped):
         assert done.error.state is done.simulation.state
@@ -81,37 +83,40 @@ def test_a_tolerance_of_its_own_is_needed_where_it_is_given(case):
     """At LOOSE the estimate is off by more than the factor, as the reason states."""
     case = named(case)
     at_loose = replace(case, loose=LOOSE)
-    assert not extreme_results.estimate_check(at_loose, extreme_cases.run(case)).holds
+    assert not estimate_check(at_loose, run(case)).holds
 
 
 def test_forty_contacts_multiply_differences():
     """The reason why their error estimate is not checked: 5e5 times in half of the run."""
-    scene = load_cases.bounce(1e4, 20.0)
-    first, second, third = scene.initial.gamma
-    other = replace(scene, initial=replace(scene.initial, gamma=(first + 1e-10, second, third)))
-    ends = [extremes.ended(each, REST, 5, 100_000_000) for each in (scene, other)]
-    assert extremes.apart(*ends) > 1e5 * 1e-10
+    changes = bouncing_thrice(1e4, 20.0)
+    first, second, third = changes["initial"]["gamma"]
+    other = {**changes["initial"], "gamma": (first + 1e-10, second, third)}
+    ends = [
+        tight_end(Case("", {**changes, "initial": initial}, REST, 5, 100_000_000))
+        for initial in (changes["initial"], other)
+    ]
+    assert apart(*ends) > 1e5 * 1e-10
 
 
 def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
     case = named("time x 10")
-    good = extreme_results.evaluate_case(case, compiled=False)
+    good = evaluate_case(case, compiled=False)
     assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
-    distance = extreme_results.apart
+    distance = extreme_runs.apart
     for factor in (0.01, 100.0):
-        monkeypatch.setattr(extreme_results, "apart", lambda *ends, f=factor: f * distance(*ends))
-        bad = extreme_results.evaluate_case(case, compiled=False)
+        monkeypatch.setattr(extreme_runs, "apart", lambda *ends, f=factor: f * distance(*ends))
+        bad = evaluate_case(case, compiled=False)
         assert not bad.passed and "of the true error" in bad.result
 
 
 def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
     case = named("base triangle of 0.1 rad")
-    done = extreme_cases.run(case)
-    assert extreme_results.estimate_check(case, done).holds
+    done = run(case)
+    assert estimate_check(case, done).holds
     monkeypatch.setattr(Simulation, "error_estimate", 1e-9)
-    monkeypatch.setattr(extreme_results, "ROUNDING", 1e-11)
+    monkeypatch.setattr(extreme_runs, "ROUNDING", 1e-11)
     done = replace(done, simulation=Accurate(done.simulation))
-    assert not extreme_results.estimate_check(case, done).holds
+    assert not estimate_check(case, done).holds
 
 
 class Accurate:
@@ -132,7 +137,7 @@ LOOPED = (
 
 @pytest.mark.parametrize("name", LOOPED)
 def test_the_run_loop_ends_in_the_same_bits(name):
-    direct, looped = extreme_cases.run(named(name)), extreme_cases.run_through_loop(named(name))
+    direct, looped = run(named(name)), run_through_loop(named(name))
     assert looped.simulation.state == direct.simulation.state
     assert str(looped.error) == str(direct.error)
 
@@ -140,13 +145,13 @@ def test_the_run_loop_ends_in_the_same_bits(name):
 def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
     case = named("control period of 333333 ns")
     shorter = replace(case, steps=case.steps - 1)
-    looped = extreme_cases.run_through_loop(shorter)
-    monkeypatch.setattr(extreme_results, "run_through_loop", lambda _: looped)
-    bad = extreme_results.evaluate_case(case, compiled=False)
+    looped = run_through_loop(shorter)
+    monkeypatch.setattr(extreme_runs, "run_through_loop", lambda _: looped)
+    bad = evaluate_case(case, compiled=False)
     assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
 
 
-GROUPS = extreme_batches.batch_groups(CASES)
+GROUPS = batch_groups(CASES)
 
 
 def test_all_cases_can_be_a_batch_but_those_that_read_the_state_or_are_refused():
@@ -160,7 +165,7 @@ def test_all_cases_can_be_a_batch_but_those_that_read_the_state_or_are_refused()
 @pytest.mark.parametrize("group", GROUPS, ids=[CASES[group[0]].name for group in GROUPS])
 def test_cases_as_scenarios_of_a_batch(group):
     pytest.importorskip("numba")
-    found = extreme_batches.run_batch([CASES[number] for number in group])
+    found = run_batch([CASES[number] for number in group])
     assert [words for words, agrees in found if not agrees] == []
 
 
@@ -168,12 +173,12 @@ def test_cases_as_scenarios_of_a_batch(group):
 def test_a_batch_of_another_motion_is_seen():
     pytest.importorskip("numba")
     case = named("actuator lag of 0.001 s")
-    assert extreme_batches.run_batch([case]) == [("bits", True)]
-    batch = extreme_batches.Batch(case.scene())
+    assert run_batch([case]) == [("bits", True)]
+    batch = Batch(case.scene())
     other = replace(case, torque=tuple(x * (1.0 + 1e-15) for x in case.torque))
-    assert extreme_batches.compared(batch, 0, other, 1)[1]
-    scene = replace(case.scene(), actuators=replace(case.scene().actuators, time_constant=1.1e-3))
-    assert not extreme_batches.compared(batch, 0, replace(case, scene=lambda: scene), 1)[1]
+    assert compare_row(batch, 0, other, 1)[1]
+    later = {**case.changes, "actuators": {"time_constant": 1.1e-3}}
+    assert not compare_row(batch, 0, replace(case, changes=later), 1)[1]
 
 
 def test_names_of_cases_are_distinct():
@@ -198,64 +203,42 @@ def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
     np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
 
 
-@pytest.fixture(scope="module")
-def singular():
-    rotation = geometry_cases.singular_pose()
-    return Geometry.of(geometry_cases.singular_scene()), rotation
+def started(angle, spin):
+    """Start about E beside a singular pose, with an angular velocity about E [rad/s]."""
+    return Simulation(changed(posed(singular_pose() @ about_e(angle), spin)))
 
 
-def about_e(angle):
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def started(geometry, rotation, spin):
-    """Start at a pose with the angular velocity `spin` about E [rad/s]."""
-    gamma, _, _ = kinematics.inverse(geometry, rotation)
-    scene = geometry_cases.singular_scene()
-    quaternion = tuple(quaternion_of(rotation).tolist())
-    state = (*quaternion, 0.0, 0.0, spin)
-    rates = kernel.joints(kernel.model_of(scene), state).gamma_dot
-    initial = Initial(gamma=tuple(gamma), gamma_dot=tuple(rates), orientation=quaternion)
-    return Simulation(replace(scene, initial=initial))
-
-
-def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays(singular):
+def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
     """There gamma tells the pose to the root of rounding only, for two assemblies meet."""
-    geometry, rotation = singular
-    simulation = started(geometry, rotation, 0.0)
+    simulation = started(0.0, 0.0)
     assert abs(simulation.conditioning["det_j2"]) < 1e-7
-    apart = np.abs(np.array(simulation.state.quaternion) - quaternion_of(rotation)).max()
-    assert apart < 1e-7
+    at = quaternion_of(singular_pose())
+    assert np.abs(np.array(simulation.state.quaternion) - at).max() < 1e-7
     for _ in range(10):
         simulation.step(REST, 1_000_000)
     assert simulation.state.body_rate == REST
 
 
-def test_a_moving_start_exactly_at_a_parallel_singularity_is_refused(singular):
+def test_a_moving_start_exactly_at_a_parallel_singularity_is_refused():
     """From gamma_dot alone the body rate came out as (1, -2.3, 1.9) rad/s, not (0, 0, 1)."""
-    geometry, rotation = singular
     with pytest.raises(SingularConfiguration, match="does not determine the body rate") as caught:
-        started(geometry, rotation, 1.0)
+        started(0.0, 1.0)
     assert abs(caught.value.measure) < 1e-7
 
 
 @pytest.mark.parametrize("distance", [-0.03, 0.08, 0.2])
-def test_a_moving_start_that_is_taken_has_the_rate_that_is_meant(singular, distance):
-    geometry, rotation = singular
-    simulation = started(geometry, rotation @ about_e(distance), 1.0)
-    np.testing.assert_allclose(simulation.state.body_rate, (0.0, 0.0, 1.0), rtol=0, atol=1e-6)
+def test_a_moving_start_that_is_taken_has_the_rate_that_is_meant(distance):
+    rate = started(distance, 1.0).state.body_rate
+    np.testing.assert_allclose(rate, (0.0, 0.0, 1.0), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
-def test_starts_near_a_parallel_singularity_are_right_or_refused_by_name(singular, distance):
-    geometry, rotation = singular
-    pose = rotation @ about_e(distance)
+def test_starts_near_a_parallel_singularity_are_right_or_refused_by_name(distance):
     try:
-        simulation = started(geometry, pose, 0.0)
+        simulation = started(distance, 0.0)
     except SstError as error:
         assert isinstance(error, AssemblyError)
         return
     # gamma determines the pose to rounding / distance there.
-    apart = np.abs(np.array(simulation.state.quaternion) - quaternion_of(pose)).max()
-    assert apart < 1e-14 / distance
+    at = quaternion_of(singular_pose() @ about_e(distance))
+    assert np.abs(np.array(simulation.state.quaternion) - at).max() < 1e-14 / distance

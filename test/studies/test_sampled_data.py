@@ -6,8 +6,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from studies.sampled_data import pole, slope, stability_limit
-from studies.stability_limits import largest_stable
+from studies.sampled_data import largest_stable, pole, slope, stability_limit
 
 
 def matrix(product, damping, delay):

@@ -14,18 +14,20 @@ from sst_ros.plot.style import save_figure
 from sst_ros.report.results import table
 from sst_ros.report.stability import regions, stability_function
 from studies import stability_limits
-from studies.extreme import catalogue
-from studies.extreme_results import evaluate_case
+from studies.extreme import lines, page
+from studies.extreme_cases import catalogue
+from studies.extreme_runs import evaluate_case
 from studies.stability_limits import (
     LONGEST_S,
     LargestStep,
     bisect_step,
     draw_largest_steps,
     eigenvalues,
+    faults,
     largest_step,
+    limits_of_theory,
     oscillating,
 )
-from studies.stability_page import faults, limits_of_theory, lines, page
 
 CASES = catalogue()
 
@@ -101,7 +103,7 @@ def test_right_and_wrong_results_are_distinguished():
     good = evaluate_case(case, compiled=False)
     assert good.passed and good.deviation <= case.bound and good.closure < 1e-12
     bad = evaluate_case(
-        dataclasses.replace(case, deviation=lambda _: 2.0 * case.bound), compiled=False
+        dataclasses.replace(case, deviation=lambda *_: 2.0 * case.bound), compiled=False
     )
     assert not bad.passed
     for run in ("same_bits", "run_loop"):
