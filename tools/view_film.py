@@ -16,7 +16,7 @@ from datetime import date
 from pathlib import Path
 
 from sst_ros.errors import SstError
-from sst_ros.view.live import simulator
+from sst_ros.view.source import simulator
 from tools.browser import Browser, browse
 
 SCENE = "swing"

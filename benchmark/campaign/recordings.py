@@ -18,7 +18,7 @@ import numpy as np
 from benchmark.campaign.ledger import Budget, Ledger
 from benchmark.campaign.processes import domain, ended, start
 from sst_ros.errors import SstError
-from sst_ros.recording import recovery
+from sst_ros.recording import bag_writer
 from sst_ros.recording.recording import Recording, read
 
 SAMPLE_NS = 2_000_000
@@ -80,7 +80,7 @@ def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: R
     saved = bag.with_name("bag_recovered")
     shutil.rmtree(saved, ignore_errors=True)
     with ledger.case(f"recover, {name}", (SstError,), bound=10.0):
-        result = recovery.recover(bag)
+        result = bag_writer.recover(bag)
         again = read(result.bag)
         # What was saved has to be a part of what was recorded, bit by bit. Times of a recording
         # count from its first sample, which may be lost.
@@ -123,7 +123,7 @@ def _kill(
     size = _size(bag)
     recorder.kill()
     recorder.wait()
-    result = recovery.recover(bag)
+    result = bag_writer.recover(bag)
     run = read(result.bag)
     steps = np.diff(run.time_ns)
     if len(steps) and not np.all(steps == SAMPLE_NS):

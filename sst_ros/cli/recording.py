@@ -120,7 +120,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _recover(options: argparse.Namespace) -> None:
-    from sst_ros.recording.recovery import recover
+    from sst_ros.recording.bag_writer import recover
 
     found = recover(options.bag, options.out)
     print(f"{found.messages} messages recovered into {found.bag}, {found.lost} known to be lost")

@@ -45,7 +45,7 @@ def _view(options: argparse.Namespace) -> int:
     from sst_ros.scene.scene import load
 
     load(options.scene)
-    from sst_ros.view.live import simulator
+    from sst_ros.view.source import simulator
 
     with simulator(options.scene):
         return _live(options)
@@ -61,7 +61,7 @@ def _live(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     from sst_ros.view.page import Page
-    from sst_ros.view.replay import Replay
+    from sst_ros.view.source import Replay
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -37,9 +37,9 @@ from sst_ros.plot.style import (
     three,
     widen,
 )
-from sst_ros.recording.signals import Signals
-from sst_ros.recording.time_series import NANOSECONDS, Integers
+from sst_ros.recording.signals import Integers, Signals
 from sst_ros.scene.scene import Scene
+from sst_ros.state import NANOSECONDS
 
 NUMBERS = {
     "example1": {"position_of_E": 8, "psi": 9},

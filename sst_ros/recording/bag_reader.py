@@ -3,17 +3,344 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import mmap
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from pathlib import Path, PurePath
+from struct import Struct
+from struct import error as StructError
 from typing import Any, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
 import yaml
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, Header, MessageIndex, Schema, Statistics
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.recording.mcap_file import McapFile, McapMessage
+
+RECORD, MESSAGE = Struct("<BQ"), Struct("<HIQQ")
+ERRORS = (
+    McapError, StructError, ValueError, KeyError, EOFError, RuntimeError, MemoryError,
+    zstandard.ZstdError,
+)  # fmt: skip
+"""What reading a damaged record may raise."""
+
+_DATA_OPCODES = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
+_SMALLEST_CHUNK = 49
+_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
+    "": lambda content: content,
+    "zstd": lambda content: bytes(zstandard.ZstdDecompressor().decompressobj().decompress(content)),
+    "lz4": lambda content: bytes(lz4.frame.decompress(content)),
+}
+
+
+@dataclass
+class Damage:
+    """A part of a file that cannot be used.
+
+    Attributes:
+        offset: first byte of the part.
+        reason: what is wrong with it.
+        messages: number of messages in it, 0 where that is not known.
+        begin_ns, end_ns: first and last reception of them [ns], 0 where that is not known.
+
+    """
+
+    offset: int
+    reason: str
+    messages: int = 0
+    begin_ns: int = 0
+    end_ns: int = 0
+
+    def add(self, index: MessageIndex) -> None:
+        """Count the messages that the index of a chunk lists for one channel."""
+        times = [time for time, _ in index.records]
+        if times:
+            self.begin_ns = min([self.begin_ns or times[0], *times])
+            self.end_ns = max([self.end_ns, *times])
+            self.messages += len(times)
+
+    def describe(self, origin_ns: int) -> str:
+        """Name offset, reason and time range, in seconds after `origin_ns`."""
+        text = f"byte {self.offset}: {self.reason}"
+        if self.messages:
+            first, last = ((time - origin_ns) / 1e9 for time in (self.begin_ns, self.end_ns))
+            text += f" ({self.messages} messages, {first:.3f} s to {last:.3f} s)"
+        return text
+
+
+def frame(data: mmap.mmap | bytes, position: int, end: int) -> tuple[int, int]:
+    """Return opcode and end of the record at a position; the end is 0 where there is none."""
+    if position + RECORD.size > end:
+        return 0, 0
+    opcode, length = RECORD.unpack_from(data, position)
+    stop = position + RECORD.size + int(length)
+    return (opcode, stop) if opcode in _DATA_OPCODES and stop <= end else (opcode, 0)
+
+
+def records_of(chunk: Chunk) -> bytes:
+    """Return the records of a chunk, decompressed.
+
+    Raises:
+        ERRORS: they cannot be decompressed, or size or checksum are wrong.
+
+    """
+    records = _DECOMPRESS[chunk.compression](chunk.data)
+    if len(records) != chunk.uncompressed_size:
+        raise ValueError("chunk of wrong size")
+    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
+        raise ValueError("chunk with wrong checksum")
+    return records
+
+
+def next_chunk(data: mmap.mmap, position: int, end: int) -> int:
+    """Find the next chunk that is intact and not empty; 0 where there is none."""
+    while (position := data.find(bytes([Opcode.CHUNK]), position + 1, end)) > 0:
+        _, stop = frame(data, position, end)
+        if stop > position + _SMALLEST_CHUNK:
+            try:
+                if records_of(Chunk.read(stream(data[position + RECORD.size : stop]))):
+                    return position
+            except ERRORS:
+                continue
+    return 0
+
+
+def stream(content: bytes) -> ReadDataStream:
+    """Return content as a stream, which the records of `mcap` are read from."""
+    return ReadDataStream(BytesIO(content))
+
+
+def reason(error: Exception) -> str:
+    """Describe an error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+MAGIC = b"\x89MCAP0\r\n"
+LIBRARY = "sst_ros"
+"""Name of the writer in files of ours, whose messages are numbered from 1 on in each channel."""
+
+_BODY = RECORD.size + MESSAGE.size
+_FOOTER_SIZE = RECORD.size + 20
+
+
+class McapMessage(NamedTuple):
+    """One message: topic, type, reception by the recorder [ns], serialized content."""
+
+    topic: str
+    type: str
+    received_ns: int
+    data: bytes
+
+
+class McapFile:
+    """Reads one file; the attributes are complete when `messages` is exhausted.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        channels: topic and type by number.
+        damage: what cannot be used.
+        cut: the file ends before its index does.
+        unverified: number of chunks without a checksum.
+        count: number of messages read.
+        lost: number of messages known to be lost.
+
+    Raises:
+        OSError: the file cannot be read.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.channels: dict[int, tuple[str, str]] = {}
+        self.damage: list[Damage] = []
+        self.cut = False
+        self.unverified = self.count = self.lost = 0
+        self._schemas: dict[int, str] = {}
+        self._origin_ns = 0
+        self._expected: int | None = None
+        self._numbered = False
+        self._sequence: dict[int, int] = {}
+        self._skipped = 0
+
+    @property
+    def intact(self) -> bool:
+        """Whether the file is whole and all its checksums are right."""
+        return not (self.cut or self.damage or self.lost)
+
+    def describe(self) -> list[str]:
+        """Name what is damaged or lost, a line for each part."""
+        lines = [f"{self.path.name}, {one.describe(self._origin_ns)}" for one in self.damage]
+        if self.cut:
+            lines.append(f"{self.path.name}: the file ends before its index")
+        if self.lost:
+            lines.append(f"{self.path.name}: {self.lost} messages are lost")
+        return lines
+
+    def messages(self) -> Iterator[McapMessage]:
+        """Yield all messages that are intact, in the order of the file."""
+        if not self.path.stat().st_size:
+            self.cut = True
+            return
+        with (
+            self.path.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
+            end = self._read_summary(data)
+            yield from self._data_section(data, end)
+        by_index = sum(one.messages for one in self.damage)
+        by_statistics = 0 if self._expected is None else self._expected - self.count
+        self.lost = max(by_index, by_statistics, self._skipped)
+
+    def _data_section(self, data: mmap.mmap, end: int) -> Iterator[McapMessage]:
+        """Yield the messages between the magic bytes and `end`."""
+        position, checksum = len(MAGIC), zlib.crc32(MAGIC)
+        broken: Damage | None = None
+        if data[: len(MAGIC)] != MAGIC:
+            self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
+        while position < end:
+            opcode, stop = frame(data, position, end)
+            if not stop:
+                resumed = next_chunk(data, position, end)
+                if not resumed and self.cut:
+                    yield from self._cut_chunk(data, position)
+                    return
+                self.damage.append(Damage(position, "unreadable bytes"))
+                if not resumed:
+                    return
+                broken, position = self.damage[-1], resumed
+                continue
+            content = data[position + RECORD.size : stop]
+            if opcode == Opcode.DATA_END:
+                self._check_data_end(content, checksum, position)
+                return
+            checksum = zlib.crc32(data[position:stop], checksum)
+            try:
+                if opcode == Opcode.CHUNK:
+                    broken = None
+                    yield from self._records(self._verified(content))
+                elif opcode == Opcode.MESSAGE_INDEX:
+                    if broken:
+                        broken.add(MessageIndex.read(stream(content)))
+                else:
+                    yield from self._records(data[position:stop])
+            except ERRORS as error:
+                broken = Damage(position, reason(error))
+                self.damage.append(broken)
+            position = stop
+        if not self.cut:
+            self.damage.append(Damage(position, "the end of the data section is missing"))
+
+    def _verified(self, content: bytes) -> bytes:
+        """Return the records of a chunk; counts it if it has no checksum."""
+        chunk = Chunk.read(stream(content))
+        self._origin_ns = self._origin_ns or chunk.message_start_time
+        records = records_of(chunk)
+        self.unverified += not chunk.uncompressed_crc
+        return records
+
+    def _records(self, records: bytes) -> Iterator[McapMessage]:
+        """Yield the messages among records; schemas and channels are remembered."""
+        position, end = 0, len(records)
+        while position + RECORD.size <= end:
+            opcode, length = RECORD.unpack_from(records, position)
+            begin, stop = position, position + RECORD.size + length
+            position = stop
+            if stop > end:
+                raise ValueError("record longer than its chunk")
+            if opcode == Opcode.MESSAGE:
+                number, sequence, received_ns, _ = MESSAGE.unpack_from(records, begin + RECORD.size)
+                channel = self.channels.get(number)
+                self._follow(number, sequence)
+                if channel is None:
+                    self.damage.append(Damage(0, f"channel {number} is not described", 1))
+                    continue
+                self.count += 1
+                yield McapMessage(*channel, received_ns, records[begin + _BODY : stop])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER):
+                self._describe(opcode, records[begin + RECORD.size : stop])
+
+    def _describe(self, opcode: int, content: bytes) -> None:
+        fields = stream(content)
+        if opcode == Opcode.HEADER:
+            self._numbered = Header.read(fields).library.startswith(LIBRARY)
+        elif opcode == Opcode.SCHEMA:
+            schema = Schema.read(fields)
+            self._schemas[schema.id] = schema.name
+        else:
+            channel = Channel.read(fields)
+            self.channels[channel.id] = (channel.topic, self._schemas.get(channel.schema_id, ""))
+
+    def _follow(self, number: int, sequence: int) -> None:
+        """Count the messages that are missing between those of one channel."""
+        if self._numbered:
+            self._skipped += max(0, sequence - self._sequence.get(number, 0) - 1)
+            self._sequence[number] = sequence
+
+    def _cut_chunk(self, data: mmap.mmap, position: int) -> Iterator[McapMessage]:
+        """Yield the whole messages of an uncompressed chunk that the file ends in."""
+        content = data[position : len(data)]
+        if len(content) > RECORD.size and content[0] == Opcode.CHUNK:
+            head = RECORD.size + 28
+            if len(content) >= head + 12 and content[head : head + 4] == bytes(4):
+                position += head + 12
+                content = content[head + 12 :]
+        end, complete = len(content), 0
+        while True:
+            opcode, stop = frame(content, complete, end)
+            if not stop or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                break
+            complete = stop
+        try:
+            yield from self._records(content[:complete])
+        except ERRORS as error:
+            self.damage.append(Damage(position, reason(error)))
+
+    def _check_data_end(self, content: bytes, checksum: int, position: int) -> None:
+        expected = int.from_bytes(content, "little")
+        if len(content) != 4 or (expected and expected != checksum and not self.damage):
+            self.damage.append(Damage(position, "data section with wrong checksum"))
+
+    def _read_summary(self, data: mmap.mmap) -> int:
+        """Read channels and statistics from the index; return where the data section may end."""
+        size = len(data)
+        footer_at = size - len(MAGIC) - _FOOTER_SIZE
+        if data[size - len(MAGIC) :] != MAGIC or footer_at < len(MAGIC):
+            self.cut = True
+            return size
+        try:
+            opcode, length = RECORD.unpack_from(data, footer_at)
+            footer = Footer.read(stream(data[footer_at + RECORD.size : size - len(MAGIC)]))
+            begin = footer.summary_start or footer_at
+            if (opcode, length) != (Opcode.FOOTER, 20) or not len(MAGIC) <= begin <= footer_at:
+                raise ValueError("index with wrong position")
+            if footer.summary_crc and footer.summary_crc != zlib.crc32(data[begin : size - 12]):
+                raise ValueError("index with wrong checksum")
+            position = begin
+            while position < footer_at:
+                opcode, stop = frame(data, position, footer_at)
+                if not stop:
+                    raise ValueError("index with unreadable bytes")
+                content = data[position + RECORD.size : stop]
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._describe(opcode, content)
+                elif opcode == Opcode.STATISTICS:
+                    self._expected = Statistics.read(stream(content)).message_count
+                position = stop
+        except ERRORS as error:
+            self.damage.append(Damage(footer_at, reason(error)))
+            return size
+        return begin
 
 
 class Topic(NamedTuple):

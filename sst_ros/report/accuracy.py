@@ -53,11 +53,10 @@ stands behind it.
 """
 
 TERMS_INTRODUCTION = """\
-Operations of the right-hand side are counted in the source that is generated for the scene, and for
-the scene without the term; times are of an evaluation in steps of RK4, with the step around it, the
-shortest of 200 turns that both take. A term that folds into constants adds no operation. A compiler
-may need less time with a term than without it. The last row of a scene counts the operations in its
-source that the code of a term has written that it does not have.
+Operations of the right-hand side are those of the scene, less those of the scene without the term;
+times are of an evaluation in steps of RK4, with the step around it, the shortest of 200 turns that
+both take. A term that folds into constants adds no operation. A compiler may need less time with a
+term than without it.
 """
 
 

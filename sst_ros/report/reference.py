@@ -22,9 +22,10 @@ from sst_ros.integration.tick_propagator import LONGEST_NS, TickPropagator, Tick
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.time_series import NANOSECONDS, Integers, places
+from sst_ros.recording.signals import Integers, places
 from sst_ros.report import states
 from sst_ros.report.states import Vector
+from sst_ros.state import NANOSECONDS
 
 COMPILED_FROM = 10_000
 """From this number of ticks on compilation costs less than it saves."""

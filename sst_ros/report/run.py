@@ -21,13 +21,13 @@ from sst_ros.plot import pictures
 from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.time_series import NANOSECONDS
 from sst_ros.report import page, reference, states, text, timing, tracking
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.results import made_on
 from sst_ros.report.states import begins, lags
 from sst_ros.report.text import ERROR_LIMIT_RAD, QUANTITIES
 from sst_ros.report.timing import Timing
+from sst_ros.state import NANOSECONDS
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that a report has, too."""

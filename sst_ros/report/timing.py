@@ -32,9 +32,10 @@ from sst_ros.integration import codegen
 from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.time_series import NANOSECONDS, Integers
+from sst_ros.recording.signals import Integers
 from sst_ros.report import states
 from sst_ros.report.reference import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
+from sst_ros.state import NANOSECONDS
 
 REPORTED = (
     "ticks_missed", "ticks", "step_mean_us", "error_estimate", "hold_error_start",

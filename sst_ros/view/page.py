@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: a local web server by viser, fed from a source some thirty times a second."""
+"""The page: a picture by viser, numbers, plots and controls, some thirty times a second."""
 
 from __future__ import annotations
 
@@ -7,21 +7,81 @@ import os
 import threading
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import jinja2
 import numpy as np
+from viser import GuiSliderHandle, GuiUplotHandle, Icon, ViserServer, uplot
 
+from sst_ros.description.shapes import LEG_COLOURS
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.view.buttons import PlaybackButtons, RunButtons, buttons
-from sst_ros.view.panel import Panel
 from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import LOCAL, PORT, PageServer
-from sst_ros.view.source import Playback, RunControl, ViewState
+from sst_ros.view.source import Replay, RunControl, RunStatus, ViewState
 
 PERIOD_S = 1.0 / 30.0
 _SHOW_EVERY, _DRAW_EVERY = 3, 6
+"""Frames between two updates of the numbers, and of the plots."""
 _PANEL_WIDTH = 400.0
+_LARGEST_TORQUE = 5.0
+"""Range of the torque sliders where the scene has no limit [N m]."""
+_SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
+_REFUSAL_S = 4.0
+_WINDOW_S = 10.0
+_POINTS = 500
+_COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in LEG_COLOURS)
+_LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
+_DIAGNOSTICS = {
+    "error_estimate": ("error estimate", "rad", ".1e"),
+    "energy_residual_J": ("energy residual", "J", ".1e"),
+    "closure_residual": ("loop-closure error", "", ".1e"),
+    "real_time_factor_now": ("real-time factor", "", ".3f"),
+    "step_mean_us": ("mean step", "µs", ".0f"),
+    "ticks_missed": ("missed ticks", "", ".0f"),
+    "commands_dropped": ("commands dropped", "", ".0f"),
+    "integrator": ("integrator", "", ""),
+    "fault": ("fault", "", ""),
+}
+"""Diagnostics that are shown: label, unit, format."""
+
+_templates = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+_templates.globals["style"] = (
+    "font-size:13px;line-height:1.5;padding:2px 10px;font-variant-numeric:tabular-nums;"
+    "overflow-wrap:anywhere"
+)
+_HEAD = _templates.from_string("""
+<div style="{{ style }}"><div style="font-size:15px"><b>{{ scene.name }}</b></div>
+<div style="color:#555">{{ scene.description }}</div>
+<div style="font-size:15px"><b id="sst-phase" style="color:{{ colour }}">{{ phase }}</b>
+&nbsp; t = <span id="sst-time">{{ time }}</span></div></div>
+""")
+_JOINTS = _templates.from_string("""
+<div style="{{ style }}"><table style="width:100%;border-collapse:collapse"><tr><th></th>
+{% for colour in colours %}
+<th style="color:{{ colour }};text-align:right;width:24%">leg {{ loop.index }}</th>
+{% endfor %}
+</tr>
+{% for name, unit, values in rows %}
+<tr><td>{{ name }} <span style="color:#777">{{ unit }}</span></td>
+{% for value in values %}
+<td style="text-align:right" data-joint="{{ name }}{{ loop.index }}">{{ "%.2f" % value }}</td>
+{% endfor %}
+</tr>
+{% endfor %}
+</table></div>
+""")
+_STATUS = _templates.from_string("""
+<div style="{{ style }}"><table style="width:100%">
+<tr><td colspan="2" style="color:{{ colour }}">{{ message }}</td></tr>
+{% for label, value in rows %}
+<tr><td>{{ label }}</td><td style="text-align:right">{{ value }}</td></tr>
+{% endfor %}
+</table></div>
+""")
+_CONTROLLER = _templates.from_string("<small>&nbsp; commands come from {{ name }}</small>")
 
 
 class Page:
@@ -35,15 +95,15 @@ class Page:
 
     """
 
-    def __init__(self, source: RunControl | Playback, host: str = LOCAL, port: int = PORT) -> None:
+    def __init__(self, source: RunControl | Replay, host: str = LOCAL, port: int = PORT) -> None:
         self._source = source
         self._server = PageServer(host, port)
         self.url = self._server.url
         _arrange(self._server)
-        self._parts: tuple[SceneDrawing, Panel, RunButtons | PlaybackButtons] | None = None
+        self._server.gui.add_markdown("Waiting for a simulator ...")
+        self._parts: tuple[SceneDrawing, _Panel, _RunControls | _ReplayControls] | None = None
         self._scene: Scene | None = None
         self._state: ViewState | None = None
-        self._waiting = self._server.gui.add_markdown("Waiting for a simulator ...")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._live, name="page", daemon=True)
         self._thread.start()
@@ -61,7 +121,7 @@ class Page:
         self._server.stop()
 
     def _live(self) -> None:
-        for count in _frames(self._stop):
+        for count in _count_frames(self._stop):
             self._update(count)
 
     def _update(self, count: int) -> None:
@@ -70,7 +130,7 @@ class Page:
             self._build(scene)
         if self._parts is None:
             return
-        drawing, panel, pressed = self._parts
+        drawing, panel, controls = self._parts
         with self._server.atomic():
             for state in self._source.states():
                 drawing.add(state)
@@ -80,23 +140,26 @@ class Page:
                 drawing.show(self._state)
             if count % _SHOW_EVERY == 0:
                 status = self._source.status()
-                pressed.show(self._state, status)
+                controls.show(self._state, status)
                 if self._state is not None:
                     panel.show(self._state, status)
             if count % _DRAW_EVERY == 0:
                 panel.draw()
 
     def _build(self, scene: Scene) -> None:
-        """Show another scene."""
-        for part in self._parts or ():
-            part.remove()
-        self._waiting.visible = False
+        """Show another scene in place of the last."""
+        server, source = self._server, self._source
+        if self._parts is not None:
+            self._parts[0].remove()
+        server.gui.reset()
+        _arrange(server)
         self._scene, self._state = scene, None
-        server = self._server
         self._parts = (
             SceneDrawing(server, scene),
-            Panel(server, scene),
-            buttons(server, scene, self._source),
+            _Panel(server, scene),
+            _ReplayControls(server, source)
+            if isinstance(source, Replay)
+            else _RunControls(server, scene, source),
         )
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
@@ -122,7 +185,7 @@ def _arrange(server: PageServer) -> None:
     server.scene.set_up_direction("+z")
 
 
-def _frames(stop: threading.Event) -> Iterator[int]:
+def _count_frames(stop: threading.Event) -> Iterator[int]:
     """Count at the rate of the page until it is stopped; late frames are dropped."""
     count, due = 0, time.monotonic()
     while not stop.is_set():
@@ -130,3 +193,197 @@ def _frames(stop: threading.Event) -> Iterator[int]:
         count += 1
         due = max(due + PERIOD_S, time.monotonic())
         stop.wait(max(0.0, due - time.monotonic()))
+
+
+class _Panel:
+    """The numbers beside the picture: state, joints, status, and plots of gamma and torque."""
+
+    def __init__(self, server: ViserServer, scene: Scene) -> None:
+        gui = server.gui
+        self._scene = scene
+        self._head = gui.add_html("", order=0.0)
+        self._joints = gui.add_html("", order=2.0)
+        with gui.add_folder("actuator angles γ, last 10 s", order=3.0):
+            self._gamma = _plot(server, "γ [deg]", (0.0, 90.0))
+        with gui.add_folder("torques τ, last 10 s", order=4.0):
+            self._torque = _plot(server, "τ [N m]", (-1.0, 1.0))
+        with gui.add_folder("status of the run", order=6.0):
+            self._status = gui.add_html("")
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
+        self._show_head(None, RunStatus())
+
+    def add(self, state: ViewState) -> None:
+        """Add a state to the plots; a time that goes back begins new ones."""
+        if state.time is None:
+            return
+        if self._rows and state.time < self._rows[-1][0]:
+            self._rows.clear()
+        if not self._rows or state.time - self._rows[-1][0] >= _WINDOW_S / _POINTS:
+            self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
+
+    def show(self, state: ViewState, status: RunStatus) -> None:
+        """Show the numbers of a state."""
+        self._show_head(state, status)
+        rows = (
+            ("γ", "deg", np.degrees(state.gamma)),
+            ("γ̇", "rad/s", state.gamma_dot),
+            ("τ", "N m", state.torque),
+            ("μ", "deg", np.degrees(state.mu)),
+            ("β", "deg", np.degrees(state.beta)),
+        )
+        # No minus before a zero.
+        shown = [(name, unit, [float(x) + 0.0 for x in values]) for name, unit, values in rows]
+        self._joints.content = _JOINTS.render(colours=_COLOURS, rows=shown)
+        values = [
+            (label, f"{_format(status.values[key], form)} {unit}")
+            for key, (label, unit, form) in _DIAGNOSTICS.items()
+            if status.values.get(key)
+        ]
+        colour = _LEVELS[status.level]
+        self._status.content = _STATUS.render(colour=colour, message=status.message, rows=values)
+
+    def _show_head(self, state: ViewState | None, status: RunStatus) -> None:
+        """Show name, description, phase and time."""
+        phase = status.phase or "no simulator"
+        self._head.content = _HEAD.render(
+            scene=self._scene,
+            phase=phase,
+            colour=_LEVELS[2 if phase.startswith("fault") else status.level],
+            time="–" if state is None or state.time is None else f"{state.time:.2f} s",
+        )
+
+    def draw(self) -> None:
+        """Draw the plots."""
+        if len(self._rows) < 2:
+            return
+        rows = np.array(self._rows)
+        rows = rows[rows[:, 0] > rows[-1, 0] - _WINDOW_S]
+        for plot, columns in ((self._gamma, rows[:, 1:4]), (self._torque, rows[:, 4:7])):
+            plot.data = (rows[:, 0], *columns.T.copy())
+
+
+def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
+    """Add a plot of three legs whose axis shows a range at least."""
+    empty = np.array([0.0, 1.0])
+    lines: list[uplot.Series] = [{"label": "t [s]"}]
+    for k, colour in enumerate(_COLOURS):
+        lines.append({"label": f"{label[0]}{'₁₂₃'[k]}", "stroke": colour, "width": 2.0})
+    ends = {
+        end: {"soft": value, "mode": 1, "pad": 0.1}
+        for end, value in zip(("min", "max"), range_, strict=True)
+    }
+    return server.gui.add_uplot(
+        (empty, *(np.zeros(2) for _ in range(3))),
+        tuple(lines),
+        scales={"x": {"time": False}, "y": {"range": ends}},
+        axes=({"label": "t [s]", "labelSize": 16, "size": 26}, {"label": label, "size": 44}),
+        legend={"show": False},
+        height=130,
+    )
+
+
+def _format(text: str, form: str) -> str:
+    try:
+        return format(float(text), form) if form else text
+    except ValueError:
+        return text
+
+
+class _RunControls:
+    """Pause, step, reset, and manual torques while no controller commands the run."""
+
+    def __init__(self, server: ViserServer, scene: Scene, run: RunControl) -> None:
+        self._run, self._paused = run, False
+        gui = server.gui
+        limit = scene.actuators.torque_limit if scene.actuators is not None else None
+        most = limit or _LARGEST_TORQUE
+        with gui.add_folder("run", order=1.0):
+            self._pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+            self._step = gui.add_button("Step", icon=Icon.PLAYER_SKIP_FORWARD, disabled=True)
+            reset = gui.add_button("Reset", icon=Icon.REFRESH)
+        with gui.add_folder("manual torques [N m]", order=5.0):
+            self._note = gui.add_html("")
+            self._sliders = [
+                gui.add_slider(f"τ{'₁₂₃'[k]}", -most, most, most / 100.0, 0.0) for k in range(3)
+            ]
+            self._zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
+        self._pause.on_click(_ask("pause", lambda: run.pause(not self._paused)))
+        self._step.on_click(_ask("step", run.step))
+        reset.on_click(_ask("reset", self._reset))
+        self._zero.on_click(lambda _: self._release())
+        for slider in self._sliders:
+            slider.on_update(lambda event: self._apply() if event.client is not None else None)
+
+    def show(self, state: ViewState | None, status: RunStatus) -> None:
+        """Enable what is possible now."""
+        paused = status.phase == "paused"
+        if paused != self._paused:
+            self._paused = paused
+            self._pause.label = "Resume" if paused else "Pause"
+            self._pause.icon = Icon.PLAYER_PLAY if paused else Icon.PLAYER_PAUSE
+            self._step.disabled = not paused
+        controller = self._run.controller()
+        for handle in (*self._sliders, self._zero):
+            if handle.disabled != bool(controller):
+                handle.disabled = bool(controller)
+        note = _CONTROLLER.render(name=controller) if controller else ""
+        if note != self._note.content:
+            self._note.content = note
+
+    def _apply(self) -> None:
+        first, second, third = (float(slider.value) for slider in self._sliders)
+        self._run.apply((first, second, third))
+
+    def _release(self) -> None:
+        for slider in self._sliders:
+            _move(slider, 0.0)
+        self._run.apply((0.0, 0.0, 0.0))
+
+    def _reset(self) -> tuple[bool, str]:
+        if any(slider.value for slider in self._sliders):
+            self._release()
+        return self._run.reset()
+
+
+class _ReplayControls:
+    """Play, a time slider, and the speed of a recording."""
+
+    def __init__(self, server: ViserServer, replay: Replay) -> None:
+        self._replay, self._playing = replay, True
+        gui = server.gui
+        with gui.add_folder("recording", order=1.0):
+            self._play = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+            self._time = gui.add_slider("t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0)
+            speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
+        self._play.on_click(lambda _: replay.play(not replay.playing))
+        self._time.on_update(
+            lambda event: replay.seek(float(self._time.value)) if event.client is not None else None
+        )
+        speed.on_update(lambda _: replay.set_speed(float(speed.value.split()[0])))
+
+    def show(self, state: ViewState | None, status: RunStatus) -> None:
+        """Update button and slider."""
+        before, playing = self._playing, self._replay.playing
+        if playing != before:
+            self._playing = playing
+            self._play.label = "Pause" if playing else "Play"
+            self._play.icon = Icon.PLAYER_PAUSE if playing else Icon.PLAYER_PLAY
+        if (playing or before) and state is not None and state.time is not None:
+            _move(self._time, round(min(state.time, self._replay.length), 6))
+
+
+def _move(slider: GuiSliderHandle[float], value: float) -> None:
+    slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
+
+
+def _ask(name: str, act: Callable[[], tuple[bool, str]]) -> Callable[[Any], None]:
+    """Return a handler that acts and notifies the client of a refusal."""
+
+    def clicked(event: Any) -> None:
+        done, message = act()
+        if not done and event.client is not None:
+            event.client.add_notification(
+                f"{name} refused", message, auto_close_seconds=_REFUSAL_S, color="red"
+            )
+
+    return clicked

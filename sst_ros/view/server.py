@@ -7,8 +7,7 @@ Everyone who reaches the page can apply torques. Every request, the websocket's 
 - come from the page itself where a browser states where it comes from (Origin);
 - carry the token of the printed URL, in the query or in the cookie that the first answer sets.
 
-viser has no hook for this, so its call of `websockets.asyncio.server.serve` is wrapped while it
-starts; a viser that starts otherwise is refused, never served without the check.
+A viser that cannot be guarded so is refused, never served without the check.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _PORTS = (1024, 65535)
 _TRIED = 100
 """Ports that are tried from the given one on."""
 
-Check = Callable[[ServerConnection, Request], Response | None]
+Handler = Callable[[ServerConnection, Request], Response | None]
 _starting = threading.Lock()
 
 
@@ -53,7 +52,7 @@ class AccessCheck:
         if not _loopback(host):
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
 
-    def around(self, serve_files: Check) -> Check:
+    def guard(self, serve_files: Handler) -> Handler:
         """Return viser's handler of requests, behind the check."""
         self.installed = True
 
@@ -121,7 +120,7 @@ class PageServer(ViserServer):
 
     def __init__(self, host: str = LOCAL, port: int = PORT) -> None:
         check = AccessCheck(host)
-        with _silence(), _requests_pass(check):
+        with _silence(), _swap_serve(check):
             super().__init__(host, _free_port(host, port), label=TITLE, verbose=False)
         if not check.installed:
             self.stop()
@@ -140,12 +139,16 @@ class PageServer(ViserServer):
 
 
 @contextlib.contextmanager
-def _requests_pass(check: AccessCheck) -> Iterator[None]:
-    """Put the check before what viser answers with, for the server that it starts meanwhile."""
+def _swap_serve(check: AccessCheck) -> Iterator[None]:
+    """Put the check before viser's own handler in the call by which it starts its web server.
+
+    viser 1.1 neither takes a handler of requests nor hands on the server that it starts, and hears
+    of a client only when its websocket is open; so `websockets` gets another `serve` meanwhile.
+    """
     module = vars(websockets.asyncio.server)
 
-    def serve(*args: Any, process_request: Check, **options: Any) -> Any:
-        return original(*args, process_request=check.around(process_request), **options)
+    def serve(*args: Any, process_request: Handler, **options: Any) -> Any:
+        return original(*args, process_request=check.guard(process_request), **options)
 
     with _starting:
         original = module["serve"]

@@ -3,12 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Protocol
 
+import numpy as np
+
+from sst_ros.host import child_process
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import Triple
+from sst_ros.state import Vector3
+
+_PUBLISH_RATE = 100
+"""Samples a second of a simulator that is only looked at [Hz]: more than a screen shows."""
+_END_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -49,8 +62,11 @@ class RunStatus:
     values: dict[str, str] = field(default_factory=dict)
 
 
-class ViewSource(Protocol):
-    """Where the page takes its data from; called from the page's thread."""
+class RunControl(Protocol):
+    """A run that is shown, paused and driven; called from the page's thread.
+
+    Requests return success and a message.
+    """
 
     @property
     def scene(self) -> Scene | None:
@@ -62,10 +78,6 @@ class ViewSource(Protocol):
     def status(self) -> RunStatus:
         """Return the latest status of the run."""
 
-
-class RunControl(ViewSource, Protocol):
-    """A run that can be paused and driven; requests return success and a message."""
-
     def pause(self, paused: bool) -> tuple[bool, str]:
         """Pause or resume the run."""
 
@@ -75,30 +87,112 @@ class RunControl(ViewSource, Protocol):
     def reset(self) -> tuple[bool, str]:
         """Return to the initial state."""
 
-    def apply(self, torque: Triple) -> None:
+    def apply(self, torque: Vector3) -> None:
         """Hold torques [N m] from now on."""
 
     def controller(self) -> str:
         """Name of another node that commands the run; empty if there is none."""
 
 
-@runtime_checkable
-class Playback(ViewSource, Protocol):
-    """A recording that can be played."""
+class Replay:
+    """Plays a bag; has `scene`, `states` and `status` as a run; used from two threads of the page.
+
+    Raises:
+        InputError: the bag is no whole recording of a run.
+
+    """
+
+    def __init__(self, bag: Path) -> None:
+        from sst_ros.recording.recording import read  # needs rosbags, which a live view does not
+
+        self._run = read(bag)
+        self._lock = threading.Lock()
+        self._seconds = self._run.seconds
+        self._now, self._since, self._factor = 0.0, time.monotonic(), 1.0
+        self._playing, self._shown = False, -1
+        self.play(True)
+
+    @property
+    def scene(self) -> Scene:
+        """The recorded scene."""
+        return self._run.scene
 
     @property
     def length(self) -> float:
-        """Its length [s]."""
+        """Length of the run [s]."""
+        return float(self._seconds[-1])
 
     @property
     def playing(self) -> bool:
         """Whether it is playing."""
+        return self._playing
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""
+        with self._lock:
+            self._advance()
+            if playing and self._now >= self.length:
+                self._now = 0.0
+            self._playing = playing
 
     def seek(self, time: float) -> None:
         """Go to a time [s]."""
+        with self._lock:
+            self._advance()
+            self._now = min(max(time, 0.0), self.length)
 
     def set_speed(self, factor: float) -> None:
         """Set recorded time per time."""
+        with self._lock:
+            self._advance()
+            self._factor = factor
+
+    def states(self) -> Sequence[ViewState]:
+        """Return the states up to now, from the beginning after a jump back."""
+        with self._lock:
+            self._advance()
+            at = int(np.searchsorted(self._seconds, self._now + 1e-9, side="right")) - 1
+        at = max(at, 0)
+        first = self._shown + 1 if at >= self._shown else 0
+        self._shown = at
+        run, rows = self._run, slice(first, at + 1)
+        columns = (run.gamma, run.mu, run.beta, run.gamma_dot, run.effort)
+        parts = zip(self._seconds[rows].tolist(), *(one[rows] for one in columns), strict=True)
+        return [ViewState(*part) for part in parts]
+
+    def status(self) -> RunStatus:
+        """Return the last diagnostics of the recording."""
+        values = self._run.diagnostics
+        fault = values.get("fault", "")
+        phase = "recording" if self._playing else "recording, paused"
+        return RunStatus(phase, 2 if fault else 0, fault, values)
+
+    def _advance(self) -> None:
+        now = time.monotonic()
+        if self._playing:
+            self._now += (now - self._since) * self._factor
+            if self._now >= self.length:
+                self._now, self._playing = self.length, False
+        self._since = now
+
+
+@contextmanager
+def simulator(scene: str, speed: float = 1.0) -> Iterator[None]:
+    """Run a simulator of a scene to look at; `speed` is simulated time per time."""
+    given: dict[str, object] = {
+        "scene": scene,
+        "publish_rate": _PUBLISH_RATE,
+        "real_time_factor": speed,
+        "duration": 0.0,
+    }
+    process = child_process.start("simulator", given, stdout=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -9,9 +9,9 @@ from rosbags.rosbag2 import Reader
 
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
+from sst_ros.recording.bag_reader import MAGIC, McapFile
+from sst_ros.recording.bag_writer import recover
 from sst_ros.recording.export import export
-from sst_ros.recording.mcap_file import MAGIC, McapFile
-from sst_ros.recording.recovery import recover
 from sst_ros.scene import scene
 
 CHUNK = 40

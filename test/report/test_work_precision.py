@@ -126,8 +126,8 @@ def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
     assert found.target.tolist() == [1e-6, 1e-9, 1e-12]
     save_figure(draw_summary(found, "made today"), tmp_path / "summary.png")
     terms = cost_table(SHORT, compiled=False)
-    assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51, 0]
-    assert terms[0]["ns"] > terms[2]["ns"] and terms[3]["term"].startswith("absent")
+    assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51]
+    assert terms[0]["ns"] > terms[2]["ns"]
     assert "| example2_heavy | intermediate links | 51 |" in page([short], terms)
 
 

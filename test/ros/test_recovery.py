@@ -10,7 +10,7 @@ from rosbags.rosbag2 import Reader
 from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import InputError
-from sst_ros.recording import recording, recovery
+from sst_ros.recording import bag_writer, recording
 
 pytestmark = pytest.mark.ros
 
@@ -36,7 +36,7 @@ def test_kill_of_the_recorder_leaves_all_but_the_last_second(nodes, observer, tm
     assert nodes.stop(simulator)[0] == 0  # it does not care
     with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
         recording.read(tmp_path / "bag")
-    result = recovery.recover(tmp_path / "bag")
+    result = bag_writer.recover(tmp_path / "bag")
     assert (result.bag, result.cut) == (tmp_path / "bag_recovered", True)
     run = recording.read(result.bag)
     assert len(run.time_ns) > published - 750
@@ -63,7 +63,7 @@ def test_a_full_disk_ends_the_recorder_in_words(nodes, observer, tmp_path):
     assert "bag is cut: " in err and "sst_ros recover" in err and "Traceback" not in err
     observer.told("phase", "running")
     assert nodes.stop(simulator, signal.SIGTERM)[0] == 0
-    run = recording.read(recovery.recover(tmp_path / "bag").bag)
+    run = recording.read(bag_writer.recover(tmp_path / "bag").bag)
     assert len(run.time_ns) > 100
     assert np.array_equal(run.time_ns, np.arange(len(run.time_ns)) * 2_000_000)
 
@@ -81,7 +81,7 @@ def test_every_cut_gives_what_lies_before_it(nodes, observer, tmp_path):
     for part in (0.2, 0.5, 0.9, 1.0):
         cut = tmp_path / f"cut_{part}.mcap"
         cut.write_bytes(whole[: int(part * len(whole))])
-        result = recovery.recover(cut)
+        result = bag_writer.recover(cut)
         with Reader(result.bag) as bag:
             found = [(c.topic, t, bytes(raw)) for c, t, raw in bag.messages()]
         assert set(found) <= set(expected) and len(found) == result.messages
@@ -92,7 +92,7 @@ def test_every_cut_gives_what_lies_before_it(nodes, observer, tmp_path):
 
 def test_what_cannot_be_recovered_is_refused(tmp_path):
     (tmp_path / "noise.mcap").write_bytes(b"no bag at all")
-    (tmp_path / "empty.mcap").write_bytes(recovery.MAGIC)
+    (tmp_path / "empty.mcap").write_bytes(bag_writer.MAGIC)
     (tmp_path / "folder").mkdir()
     for name, said in (
         ("noise.mcap", "must be an MCAP file"),
@@ -101,6 +101,6 @@ def test_what_cannot_be_recovered_is_refused(tmp_path):
         ("folder", "must hold one .mcap file"),
     ):
         with pytest.raises(InputError, match=said):
-            recovery.recover(tmp_path / name)
+            bag_writer.recover(tmp_path / name)
     with pytest.raises(InputError, match="must be a new folder"):
-        recovery.recover(tmp_path / "empty.mcap", tmp_path / "folder")
+        bag_writer.recover(tmp_path / "empty.mcap", tmp_path / "folder")

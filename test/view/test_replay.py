@@ -16,7 +16,7 @@ from sst_ros.recording.recording import read
 pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 
-from sst_ros.view import replay
+from sst_ros.view import source
 from tools.browser import chromium
 
 PICTURES = Path(__file__).parents[2] / "view_out"
@@ -26,12 +26,12 @@ RIGHT, HOME = "\ue014", "\ue011"
 class Clock:
     def __init__(self, monkeypatch):
         self.now = 100.0
-        monkeypatch.setattr(replay.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(source.time, "monotonic", lambda: self.now)
 
 
 def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
     clock, run = Clock(monkeypatch), read(bag)
-    reel = replay.Replay(bag)
+    reel = source.Replay(bag)
     seen = list(reel.states())
     while reel.playing:
         clock.now += 1.0 / 30.0
@@ -43,7 +43,7 @@ def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
 
 def test_hold_seek_and_speed(bag, monkeypatch):
     clock = Clock(monkeypatch)
-    reel = replay.Replay(bag)
+    reel = source.Replay(bag)
     reel.set_speed(0.5)
     clock.now += 0.2
     assert reel.states()[-1].time == pytest.approx(0.1)
