@@ -11,13 +11,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sst_ros import load_scene, simulate
-from sst_ros.dynamics import energy
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import model_of
 
 scene = load_scene("gravity_payload")
 times = np.linspace(0.0, 2.0, 201)
 motion = simulate(scene, duration=2.0, t_eval=times, method="dop853", tolerance=1e-13)
-kinetic = energy.kinetic(model_of(scene), (*motion.quaternion.T, *motion.body_rate.T))
+kinetic = kernel.kinetic_energy(model_of(scene), (*motion.quaternion.T, *motion.body_rate.T))
 potential = motion.energy - kinetic
 
 figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained")

@@ -10,7 +10,7 @@ is the nearest limit? Singular poses are printed, and marked in the picture.
 import numpy as np
 
 from sst_ros import Geometry, plot_workspace, workspace
-from sst_ros.mechanism import singularities
+from sst_ros.mechanism.workspace import report_singularities
 
 MANIPULATORS = {
     "Isotropic: v = I, α = 120°, 120°, 120°": Geometry.build(np.eye(3), np.radians([120] * 3)),
@@ -22,7 +22,7 @@ MANIPULATORS = {
 
 charts = [workspace(geometry, progress=True) for geometry in MANIPULATORS.values()]
 for (title, geometry), chart in zip(MANIPULATORS.items(), charts, strict=True):
-    print(f"{title}\n{singularities.report(geometry, chart)}\n")
+    print(f"{title}\n{report_singularities(geometry, chart)}\n")
 
 figure = plot_workspace(*charts, titles=list(MANIPULATORS))
 figure.savefig("workspace.png", dpi=110)

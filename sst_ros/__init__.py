@@ -15,7 +15,7 @@ from sst_ros.version import VERSION
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
     from sst_ros.control.controller import Controller as Controller
-    from sst_ros.control.controller_settings import ControllerSettings as ControllerSettings
+    from sst_ros.control.controller import ControllerSettings as ControllerSettings
     from sst_ros.control.inverse_dynamics import InverseDynamics as InverseDynamics
     from sst_ros.control.reference import ReferenceMotion as ReferenceMotion
     from sst_ros.control.reference_motions import reference_motion as reference_motion
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sst_ros.recording import recording as _recording
     from sst_ros.recording.recording import Recording as Recording
     from sst_ros.scene import scene as _scene
-    from sst_ros.scene.arcs import arc_inertia as arc_inertia
+    from sst_ros.scene.bodies import arc_inertia as arc_inertia
     from sst_ros.scene.loads import SineTorque as SineTorque
     from sst_ros.scene.scene import Scene as Scene
     from sst_ros.simulation.simulate import simulate as simulate
@@ -55,7 +55,7 @@ _MODULES = {
     "AssemblyError": "errors",
     "Batch": "integration.batch",
     "Controller": "control.controller",
-    "ControllerSettings": "control.controller_settings",
+    "ControllerSettings": "control.controller",
     "Geometry": "mechanism.geometry",
     "Identification": "identification.identification",
     "InputError": "errors",
@@ -72,7 +72,7 @@ _MODULES = {
     "State": "state",
     "TorqueTable": "simulation.torque",
     "Trajectory": "simulation.trajectory",
-    "arc_inertia": "scene.arcs",
+    "arc_inertia": "scene.bodies",
     "direct_kinematics": "mechanism.kinematics:direct",
     "identify": "identification.identify",
     "inverse_kinematics": "mechanism.kinematics:inverse",

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 NANOSECONDS = 1_000_000_000
 """Of a second: time is integer nanoseconds."""
 
+Array: TypeAlias = NDArray[np.float64]
 Vector3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+"""(x, y, z, w)."""
 TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
 
@@ -68,7 +71,7 @@ class State:
     """
 
     time_ns: int
-    quaternion: tuple[float, float, float, float]
+    quaternion: Quaternion
     body_rate: Vector3
     joints: Joints
     torque: Vector3
@@ -126,3 +129,23 @@ DIMENSIONS: dict[str, list[str] | list[int]] = {
     "angle": ["theta", "phi", "psi"],
 }
 """Coordinates of each dimension."""
+
+
+BASE_FRAME = "base_link"
+"""Root of the robot (REP 105): frame {B} of the paper."""
+
+IDLE_FRAME_ID = "idle"
+"""header.frame_id of joint_states that show a state before the run, in a pause or in a fault."""
+
+
+def is_idle(stamp_ns: int, frame_id: str) -> bool:
+    """Return whether a joint_states message shows a state and is not a sample of a run.
+
+    Recordings of version 0.1 mark such messages by the stamp zero.
+    """
+    return stamp_ns == 0 or frame_id == IDLE_FRAME_ID
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a Time or Duration as one number [ns]."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller import Controller, ControlStopped, Measurement
-from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.control.controller import Controller, ControllerSettings, ControlStopped, Measurement
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import ReferenceMotion, Triple
+from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import Vector3
 
 WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
 
@@ -63,10 +63,10 @@ class ChannelState:
     def __init__(self, channel: Channel, period_s: float, seed: int) -> None:
         self._channel, self._period = channel, period_s
         self._random = np.random.default_rng(seed)
-        self._before: Triple | None = None
-        self._queue: deque[Triple] = deque()
+        self._before: Vector3 | None = None
+        self._queue: deque[Vector3] = deque()
 
-    def measure(self, gamma: Triple, gamma_dot: Triple) -> tuple[Triple, Triple]:
+    def measure(self, gamma: Vector3, gamma_dot: Vector3) -> tuple[Vector3, Vector3]:
         """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
         if self._channel.counts:
             step = 2.0 * math.pi / self._channel.counts
@@ -86,14 +86,14 @@ class ChannelState:
             gamma_dot = self._noisy(gamma_dot, self._channel.noise[1])
         return gamma, gamma_dot
 
-    def delayed(self, command: Triple) -> Triple:
+    def delayed(self, command: Vector3) -> Vector3:
         """Return the torques [N m] that act when this command has been sent."""
         if not self._queue:
             self._queue.extend([command] * self._channel.delay)
         self._queue.append(command)
         return self._queue.popleft()
 
-    def _noisy(self, values: Triple, deviation: float) -> Triple:
+    def _noisy(self, values: Vector3, deviation: float) -> Vector3:
         a, b, c = (self._random.standard_normal(3) * deviation).tolist()
         return (values[0] + a, values[1] + b, values[2] + c)
 
@@ -203,7 +203,7 @@ def unheld_error(scene: Scene, motion: ReferenceMotion) -> tuple[float, float]:
     """
     inverse = InverseDynamics(scene)
 
-    def torque(time: float) -> Triple:
+    def torque(time: float) -> Vector3:
         now = motion.at(time)
         return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
-from sst_ros.mechanism import kinematics, singularities, workspace
+from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, load
@@ -108,7 +108,7 @@ def singular_pose() -> Array:
     """Return a rotation R with det J2 = 0 of the scene SINGULAR, shape (3, 3)."""
     geometry = Geometry.of(changed(SINGULAR))
     chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
-    poses = singularities.parallel(chart)
+    poses = workspace.parallel_singularities(chart)
     return np.asarray(poses.rotation[len(poses) // 2])
 
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller_settings import INSTANTS, MODES, ControllerSettings
+from sst_ros.control.controller import INSTANTS, MODES, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from sst_ros import __main__ as cli
-from sst_ros.scene.json_schema import json_schema
 from sst_ros.scene.scene import Scene, names
+from sst_ros.scene.schema import json_schema
 from tools.scene_keys import keys
 
 jsonschema = pytest.importorskip("jsonschema")

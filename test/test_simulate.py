@@ -6,8 +6,7 @@ import pytest
 
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
-from sst_ros.scene.values import plain
-from sst_ros.scene.yaml_document import dump
+from sst_ros.scene.yaml_document import dump, plain
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 

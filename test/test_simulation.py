@@ -13,7 +13,7 @@ import yaml
 from models import seeded_samples
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.energy import kinetic
+from sst_ros.dynamics.kernel import kinetic
 from sst_ros.errors import (
     AmbiguousAssembly,
     Diverged,

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.description.shapes import end_point
-from sst_ros.description.tree import BASE, LEGS, STAR, actuated, intermediate
+from sst_ros.description.tree import BASE, LEGS, STAR, actuated, end_point, intermediate
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation

@@ -37,7 +37,7 @@ def _demo(options: argparse.Namespace) -> int:
         allowed = "is an option of `demo feedforward`"
         if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
             raise InputError("demo", wrong)
-    from sst_ros.control.controller_settings import MODES
+    from sst_ros.control.controller import MODES
 
     for mode in options.mode or ():
         if mode not in MODES:

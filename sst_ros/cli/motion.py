@@ -104,9 +104,8 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     from sst_ros.control.plan import examine
-    from sst_ros.control.plan_table import as_json, table, write_torques
     from sst_ros.control.reference_motions import reference_motion
-    from sst_ros.control.time_scaling import time_scaling
+    from sst_ros.control.time_scaling import as_json, table, time_scaling, write_torques
     from sst_ros.recording.recorded_motion import samples
     from sst_ros.scene.scene import load
 

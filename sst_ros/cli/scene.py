@@ -89,8 +89,8 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _schema(_: argparse.Namespace) -> None:
-    from sst_ros.scene.json_schema import json_schema
     from sst_ros.scene.scene import Scene
+    from sst_ros.scene.schema import json_schema
 
     print(json.dumps(json_schema(Scene, "sst_ros scene"), indent=2))
 
@@ -126,7 +126,7 @@ def _compile(options: argparse.Namespace) -> None:
 
 
 def _workspace(options: argparse.Namespace) -> None:
-    from sst_ros.mechanism import singularities, workspace
+    from sst_ros.mechanism import workspace
     from sst_ros.mechanism.geometry import Geometry
     from sst_ros.scene.scene import load
 
@@ -142,7 +142,7 @@ def _workspace(options: argparse.Namespace) -> None:
     geometry = Geometry.of(scene)
     directions, _ = workspace.triangle_directions(geometry, divisions=60)
     chart = workspace.over_orientations(geometry, directions, turns=180, progress=True)
-    print(singularities.report(geometry, chart))
+    print(workspace.report_singularities(geometry, chart))
     save_figure(plot_workspace(chart, titles=[scene.name]), out)
     print(out)
 

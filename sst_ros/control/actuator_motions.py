@@ -5,23 +5,136 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solveh_banded
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.quintic import minimum_jerk, timed
-from sst_ros.control.reference import Quadruple, Reference, ReferenceMotion, Triple, equal_pieces
-from sst_ros.control.star_motions import PIECES
+from sst_ros.control.reference import (
+    PIECES,
+    REST,
+    Reference,
+    ReferenceMotion,
+    equal_pieces,
+    minimum_jerk,
+    timed,
+)
 from sst_ros.errors import InputError, Problem, SingularConfiguration
-from sst_ros.mechanism import continuation
+from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import axpy, scaled
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.motions import Sweep, ToAngles
+from sst_ros.state import Quaternion, Vector3
 
-Path = Callable[[float], tuple[Triple, Triple, Triple]]
+# Power coefficients c_0 ... c_5 on [0, 1] of (p0, v0, a0, p1, v1, a1), derivatives by that time.
+_POWERS = np.array(
+    [
+        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.5, 0.0, 0.0, 0.0],
+        [-10.0, -6.0, -1.5, 10.0, -4.0, 0.5],
+        [15.0, 8.0, 1.5, -15.0, 7.0, -1.0],
+        [-6.0, -3.0, -0.5, 6.0, -3.0, 0.5],
+    ]
+)
+
+
+class Quintic:
+    """A path of one or more numbers, quintic between points.
+
+    Args:
+        times: of the points, rising [s], shape (n,), n >= 2.
+        positions: shape (n, m).
+        velocities, accelerations: shape (n, m); NaN where they are left open.
+
+    """
+
+    def __init__(
+        self,
+        times: ArrayLike,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        accelerations: ArrayLike,
+    ) -> None:
+        at = np.asarray(times, dtype=float)
+        nodes = np.stack(
+            [np.array(x, dtype=float) for x in (positions, velocities, accelerations)], axis=1
+        )
+        self.times: list[float] = at.tolist()
+        lengths = np.diff(at)
+        _complete(nodes, lengths)
+        scale = np.stack([np.ones_like(lengths), lengths, lengths * lengths], axis=1)
+        local = np.concatenate(
+            [nodes[:-1] * scale[..., None], nodes[1:] * scale[..., None]], axis=1
+        )
+        # By segment and number: coefficients in the time of the segment, from 0 to 1.
+        self._segments = np.einsum("ij,njm->nmi", _POWERS, local).tolist()
+        self._lengths: list[float] = lengths.tolist()
+
+    def at(self, time: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+        """Position, velocity and acceleration at a time between the first point and the last."""
+        index = min(max(bisect_right(self.times, time) - 1, 0), len(self._lengths) - 1)
+        h = self._lengths[index]
+        u = (time - self.times[index]) / h
+        p, v, a = [], [], []
+        for c0, c1, c2, c3, c4, c5 in self._segments[index]:
+            p.append(c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))))
+            v.append((c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h)
+            a.append((2.0 * c2 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h))
+        return tuple(p), tuple(v), tuple(a)
+
+
+def _complete(nodes: Array, lengths: Array) -> None:
+    """Fill in what is open in nodes, shape (n, 3, m), in place."""
+    usual = float(np.median(lengths))
+    # A velocity times the usual length has the size of a position: the system stays well scaled.
+    scale = np.array([1.0, usual, usual * usual])
+    hessians = np.stack([_jerk(h) for h in (lengths / usual).tolist()])
+    for column in range(nodes.shape[2]):
+        if np.isnan(nodes[:, :, column]).any():
+            nodes[:, :, column] = _least_jerk(nodes[:, :, column], hessians, scale)
+
+
+def _least_jerk(nodes: Array, hessians: Array, scale: Array) -> Array:
+    """Return nodes, shape (n, 3), completed; hessians, shape (n - 1, 6, 6), are the segments'."""
+    missing = np.isnan(nodes).ravel()
+    x = np.where(missing, 0.0, (nodes * scale).ravel())
+    size, last = len(x), len(x) - 5
+    ends = x.reshape(-1, 3)
+    slope = np.einsum("nij,nj->ni", hessians, np.concatenate([ends[:-1], ends[1:]], axis=1))
+    right = np.zeros(size)
+    band = np.zeros((6, size))  # as solveh_banded takes it: band[5 + i - j, j] is entry (i, j)
+    for j in range(6):
+        right[j : last + j : 3] -= slope[:, j]
+        for i in range(j + 1):
+            band[5 + i - j, j : last + j : 3] += hessians[:, i, j]
+    # A given number keeps its value: its row and column become those of the unit matrix.
+    right[~missing] = 0.0
+    for above in range(1, 6):
+        band[5 - above, above:][~(missing[above:] & missing[:-above])] = 0.0
+    band[5][~missing] = 1.0
+    root = 1.0 / np.sqrt(band[5])
+    for above in range(6):
+        band[5 - above, above:] *= root[above:] * root[: size - above]
+    found = (root * solveh_banded(band, root * right)).reshape(nodes.shape) / scale
+    return np.where(np.isnan(nodes), found, nodes)
+
+
+def _jerk(h: float) -> Array:
+    """Return the form of the integral of the jerk squared in the numbers at the ends."""
+    powers = _POWERS * np.array([1.0, h, h * h, 1.0, h, h * h])
+    # jerk = 6 c_3 + 24 c_4 u + 60 c_5 u^2, over h^3; du = dt / h.
+    jerk = powers[3:] * np.array([[6.0], [24.0], [60.0]])
+    hilbert = np.array([[1.0, 1 / 2, 1 / 3], [1 / 2, 1 / 3, 1 / 4], [1 / 3, 1 / 4, 1 / 5]])
+    return np.asarray(jerk.T @ hilbert @ jerk / h**5)
+
+
+Path = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 """Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
 
 STEP = 0.03
@@ -54,7 +167,7 @@ class ActuatorMotion(ReferenceMotion):
     """
 
     def __init__(
-        self, geometry: Geometry, path: Path, pieces: tuple[float, ...], start: Quadruple
+        self, geometry: Geometry, path: Path, pieces: tuple[float, ...], start: Quaternion
     ) -> None:
         super().__init__(pieces[-1], pieces)
         self._path, self._geometry = path, geometry
@@ -107,7 +220,7 @@ def _spaced(path: Path, pieces: tuple[float, ...]) -> Iterator[float]:
     yield pieces[-1]
 
 
-def _alike(quaternions: list[list[float]], before: Quadruple) -> Iterator[Quadruple]:
+def _alike(quaternions: list[list[float]], before: Quaternion) -> Iterator[Quaternion]:
     """Yield quaternions with signs that change as little as they can."""
     for x, y, z, w in quaternions:
         same = x * before[0] + y * before[1] + z * before[2] + w * before[3] >= 0.0
@@ -115,24 +228,24 @@ def _alike(quaternions: list[list[float]], before: Quadruple) -> Iterator[Quadru
         yield before
 
 
-def straight_path(start: Triple, goal: ToAngles) -> Path:
+def straight_path(start: Vector3, goal: ToAngles) -> Path:
     """From one gamma straight to another, with minimum jerk."""
     span = axpy(1.0, goal.gamma, -1.0, start)
 
-    def path(time: float) -> tuple[Triple, Triple, Triple]:
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
         s, rate, acceleration = timed(time, goal.duration)
         return axpy(1.0, start, s, span), scaled(rate, span), scaled(acceleration, span)
 
     return path
 
 
-def sweep_path(sweep: Sweep, centre: Triple) -> tuple[Path, tuple[float, ...]]:
+def sweep_path(sweep: Sweep, centre: Vector3) -> tuple[Path, tuple[float, ...]]:
     """Sines that fade in and out, and pieces of a quarter of a period or less."""
     last = sweep.last_frequency or sweep.frequency
     slopes = [(b - a) / sweep.duration for a, b in zip(sweep.frequency, last, strict=True)]
     rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
 
-    def path(time: float) -> tuple[Triple, Triple, Triple]:
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
         e, e1, e2 = _fading(time, sweep.fade, sweep.duration)
         p, v, a = [], [], []
         for middle, amplitude, first, slope in rows:
@@ -158,3 +271,160 @@ def _fading(time: float, fade: float, duration: float) -> tuple[float, float, fl
         return 1.0, 0.0, 0.0
     e, e1, e2 = minimum_jerk(min(time, duration - time) / fade)
     return e, (e1 if time < fade else -e1) / fade, e2 / (fade * fade)
+
+
+Points = Sequence[Sequence[float]]
+OpenPoints = Sequence[Sequence[float] | None]
+
+NEAR = 0.1
+"""Largest distance of a first point at time 0 from the start [rad]."""
+
+
+SAMPLES_A_PIECE = 8
+
+
+@dataclass(frozen=True)
+class MotionSamples:
+    """A recorded motion.
+
+    Attributes:
+        times: of the samples, rising [s], shape (n,); the motion begins with the first.
+        gamma, gamma_dot: of the actuators [rad], [rad/s], shape (n, 3).
+        quaternion: of {E} in {B} at the first sample, (x, y, z, w).
+
+    """
+
+    times: Array
+    gamma: Array
+    gamma_dot: Array
+    quaternion: Quaternion
+
+
+def waypoints(
+    geometry: Geometry,
+    start: Quaternion,
+    times: Sequence[float],
+    positions: Points,
+    velocities: OpenPoints | None = None,
+    accelerations: OpenPoints | None = None,
+    begin: tuple[Vector3, Vector3] = (REST, REST),
+) -> ReferenceMotion:
+    """Return the motion of the actuators through points, quintic between them.
+
+    The fields of trajectory_msgs/JointTrajectory, rows in the order of the legs. A first point
+    after time 0 is reached from the start; one at time 0 is the start itself, at rest. The motion
+    ends at rest. Rates and accelerations that are not given (no rows, or None or nothing in place
+    of a row) are zero at the ends and chosen for minimum jerk between them.
+
+    Args:
+        geometry: base triangle and star.
+        start: quaternion (x, y, z, w) of {E} in {B} from which the motion begins.
+        times: of the points [s], n >= 1.
+        positions: gamma [rad], n rows of three.
+        velocities: gamma_dot [rad/s], n rows.
+        accelerations: gamma_ddot [rad/s^2], n rows.
+        begin: gamma_dot and gamma_ddot at the start, where the first point comes after time 0.
+
+    Raises:
+        InputError: no points, wrong shapes, numbers that are not finite, times that do not rise,
+            a beginning or an end that moves, a first point that is not where the motion starts.
+        SingularConfiguration: the motion meets a parallel singularity.
+
+    """
+    count = len(times)
+    problems: list[Problem] = []
+    rows = [
+        _rows("times", [[time] for time in times], count, 1, problems),
+        _rows("positions", positions, count, 3, problems),
+        *(
+            _rows(name, [()] * count if given is None else given, count, 3, problems)
+            for name, given in (("velocities", velocities), ("accelerations", accelerations))
+        ),
+    ]
+    if not count:
+        problems.append(Problem("points", 0, "must be one or more"))
+    if problems:
+        raise InputError("trajectory", problems)
+    at, gamma, rates, seconds = map(np.array, rows)
+    at = at.ravel()
+    problems += _faults(at, rates)
+    if problems:
+        raise InputError("trajectory", problems)
+    here = kinematics.inverse(geometry, rotation_matrix(start))[0]
+    if at[0] > 0.0:
+        at, gamma = np.append(0.0, at), np.vstack([here, gamma])
+        rates, seconds = np.vstack([begin[0], rates]), np.vstack([begin[1], seconds])
+    elif np.abs(gamma[0] - here).max() > NEAR:
+        said = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
+        problem = Problem("positions[0]", gamma[0].tolist(), said.format(NEAR, *here))
+        raise InputError("trajectory", [problem])
+    for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
+        ends[np.isnan(ends)] = 0.0
+    begun = moved(geometry, start, here, gamma[0])
+    return _along(geometry, begun, Quintic(at, gamma, rates, seconds), tuple(at.tolist()))
+
+
+def recorded(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
+    """Return the motion of a recording, quintic between samples; it may begin and end moving.
+
+    Raises:
+        AssemblyError: the recording is of another manipulator.
+        SingularConfiguration: the motion meets a parallel singularity.
+
+    """
+    times = samples.times - samples.times[0]
+    gamma = np.unwrap(samples.gamma, axis=0)
+    free = np.full_like(gamma, np.nan)
+    # Samples lie much denser than the motion turns: several make one piece.
+    pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
+    spline = Quintic(times, gamma, samples.gamma_dot, free)
+    return _along(geometry, samples.quaternion, spline, pieces)
+
+
+def moved(geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike) -> Quaternion:
+    """Follow the assembly from one gamma straight to another."""
+    rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
+    x, y, z, w = quaternion_of(rotation).tolist()
+    return (x, y, z, w)
+
+
+def _along(
+    geometry: Geometry, start: Quaternion, spline: Quintic, pieces: tuple[float, ...]
+) -> ReferenceMotion:
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
+        (p1, p2, p3), (v1, v2, v3), (a1, a2, a3) = spline.at(time)
+        return (p1, p2, p3), (v1, v2, v3), (a1, a2, a3)
+
+    return ActuatorMotion(geometry, path, pieces, start)
+
+
+def _rows(
+    name: str, rows: OpenPoints, count: int, size: int, problems: list[Problem]
+) -> list[list[float]]:
+    """Read rows of numbers; one that is open becomes NaN. What is wrong joins the problems."""
+    if len(rows) != count:
+        problems.append(Problem(name, len(rows), f"must have a row for each of {count} points"))
+    found = []
+    may_be_open = name in ("velocities", "accelerations")
+    for index, row in enumerate(rows):
+        numbers = [] if row is None else [float(number) for number in row]
+        if not numbers and may_be_open:
+            numbers = [math.nan] * size
+        elif len(numbers) != size or not all(map(math.isfinite, numbers)):
+            allowed = f"must be {size} finite numbers" if size > 1 else "must be finite"
+            problems.append(Problem(f"{name}[{index}]", numbers, allowed))
+        found.append(numbers)
+    return found
+
+
+def _faults(at: Array, rates: Array) -> Iterator[Problem]:
+    """Yield what is wrong with points of finite numbers."""
+    for index in np.flatnonzero(at[1:] <= at[:-1]) + 1:
+        allowed = f"must be > {at[index - 1]:g} s, that of the point before"
+        yield Problem(f"times[{index}]", float(at[index]), allowed)
+    if at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1):
+        yield Problem("times[0]", float(at[0]), "must be >= 0 s, that of a single point > 0 s")
+    for end in {0, len(at) - 1} if at[0] == 0.0 else {len(at) - 1}:
+        if np.nan_to_num(rates[end]).any():
+            allowed = "must be zero: a motion begins and ends at rest"
+            yield Problem(f"velocities[{end}]", rates[end].tolist(), allowed)

@@ -14,10 +14,12 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-from sst_ros.control.reference import Quadruple, Reference, Triple
-from sst_ros.dynamics import kernel, loads
+import numpy as np
+
+from sst_ros.control.reference import Reference
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import trace
-from sst_ros.dynamics.kernel import Leg
+from sst_ros.dynamics.model import Leg, joint_angle
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
@@ -25,8 +27,11 @@ from sst_ros.dynamics.traced_dynamics import (
     compiled,
     compiled_for_arrays,
 )
+from sst_ros.mechanism import continuation
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
+    axpy,
     cross,
     dot,
     rotation_rows,
@@ -35,6 +40,7 @@ from sst_ros.mechanism.generic_math import (
     turned_back,
 )
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.state import Quaternion, Vector3
 
 ROUNDING = 4e-16
 """Residual abs(r_k . t_k) at which Newton's method ends: rounding."""
@@ -59,7 +65,7 @@ class ActuatorSpaceMap:
         self._posture = compiled(trace(self._of_posture, QUATERNION))
         self._newton = compiled(trace(self.newton_step, (*QUATERNION, *_CARRIAGES)))
 
-    def of_star(self, q: Quadruple, rate: Triple, acceleration: Triple) -> Reference:
+    def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
 
         Raises:
@@ -69,7 +75,7 @@ class ActuatorSpaceMap:
         g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
         return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
 
-    def posture(self, q: Quadruple) -> tuple[float, ...]:
+    def posture(self, q: Quaternion) -> tuple[float, ...]:
         """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation.
 
         Raises:
@@ -79,7 +85,7 @@ class ActuatorSpaceMap:
         return self._posture(*q)
 
     def of_actuators(
-        self, near: Quadruple, gamma: Triple, gamma_dot: Triple, gamma_ddot: Triple
+        self, near: Quaternion, gamma: Vector3, gamma_dot: Vector3, gamma_ddot: Vector3
     ) -> Reference:
         """Return the reference of a state of the actuators, in the assembly mode closest to `near`.
 
@@ -91,7 +97,7 @@ class ActuatorSpaceMap:
         x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
         return Reference(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
 
-    def orientation(self, near: Quadruple, gamma: Triple) -> Quadruple:
+    def orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
         """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
 
         Raises:
@@ -122,7 +128,7 @@ class ActuatorSpaceMap:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         legs = [(leg, kernel.leg_motion(leg, rows, rate)) for leg in self._legs]
         return (
-            *(loads.angle(at, 0, leg.across, leg.v) for leg, at in legs),
+            *(joint_angle(at, 0, leg.across, leg.v) for leg, at in legs),
             *(at.gamma_dot for _, at in legs),
             *(dot(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
         )
@@ -136,7 +142,7 @@ class ActuatorSpaceMap:
             scaled(1.0 / sine, cross(at.along, at.p))
             for sine, (_, at) in zip(sines, legs, strict=True)
         ]
-        beta = (loads.angle(at, 2, leg.across, leg.v) for leg, at in legs)
+        beta = (joint_angle(at, 2, leg.across, leg.v) for leg, at in legs)
         return (*sines, *beta, dot(j2[0], cross(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
@@ -179,3 +185,81 @@ def _solved(rows: list[Any], right: Any) -> tuple[Any, ...]:
         for i in range(3)
     ]
     return tuple(part / determinant for part in total)
+
+
+CLOSED = 1e-14
+"""Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
+
+
+class OrientationObserver:
+    """Tracks one assembly mode, however far apart successive angles are.
+
+    Args:
+        geometry: base triangle and star.
+        quaternion: initial orientation (x, y, z, w).
+        gamma: actuator angles there [rad].
+
+    """
+
+    def __init__(self, geometry: Geometry, quaternion: Quaternion, gamma: Vector3) -> None:
+        self.coordinates = ActuatorSpaceMap(geometry)
+        self._begin = quaternion, gamma
+        across = np.cross(geometry.w, geometry.v)
+        legs = (geometry.v.tolist(), across.tolist(), geometry.e.tolist())
+        self._legs = list(zip(*legs, strict=True))
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the initial orientation."""
+        self._quaternion, self._gamma = self._begin
+        self._sigma, _ = self._measures(self._quaternion, self._gamma)
+
+    def update(self, gamma: Vector3) -> Quaternion:
+        """Return the quaternion (x, y, z, w) at the next angles [rad].
+
+        Raises:
+            BranchEnds: a parallel singularity lies between, or no assembly has these angles.
+
+        """
+        found = self._stepped(gamma)
+        if found is None:
+            found = self._followed(gamma)
+        self._quaternion, self._gamma = found, gamma
+        return found
+
+    def _stepped(self, gamma: Vector3) -> Quaternion | None:
+        """Newton's method in one step; None where it might reach another assembly mode."""
+        step, sigma = math.dist(gamma, self._gamma), self._sigma
+        if step > continuation.SAFE * sigma * sigma:
+            return None
+        try:
+            found = self.coordinates.orientation(self._quaternion, gamma)
+        except ArithmeticError:
+            return None
+        # The theorem holds in a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
+        half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, self._quaternion)) ** 2))
+        next_sigma, residual = self._measures(found, gamma)
+        if residual > CLOSED or half > 0.25 * (sigma - step):
+            return None
+        self._sigma = next_sigma
+        return found
+
+    def _followed(self, gamma: Vector3) -> Quaternion:
+        rotation = continuation.advance(
+            self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
+        )
+        x, y, z, w = quaternion_of(rotation).tolist()
+        self._sigma, _ = self._measures((x, y, z, w), gamma)
+        return x, y, z, w
+
+    def _measures(self, quaternion: Quaternion, gamma: Vector3) -> tuple[float, float]:
+        """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
+        rows = rotation_rows(quaternion)
+        normals, worst = [], 0.0
+        for angle, (v, across, e) in zip(gamma, self._legs, strict=True):
+            r = axpy(math.cos(angle), v, math.sin(angle), across)
+            t = dot(rows[0], e), dot(rows[1], e), dot(rows[2], e)
+            normals.append(cross(t, r))
+            worst = max(worst, abs(dot(r, t)))
+        determinant = dot(normals[0], cross(normals[1], normals[2]))
+        return 2.0 / 3.0 * abs(determinant), worst

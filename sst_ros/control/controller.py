@@ -23,23 +23,114 @@ the error would drive it further (conditional integration, Astrom and Hagglund 2
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sst_ros.control import quaternions
-from sst_ros.control.controller_settings import MODES, ControllerSettings
+from sst_ros.control.actuator_space import OrientationObserver
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.orientation_observer import OrientationObserver
-from sst_ros.control.reference import Reference, ReferenceMotion, Triple
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.generic_math import ZERO, added, axpy, cross, dot, rotation_rows, scaled
+from sst_ros.mechanism.generic_math import (
+    ZERO,
+    added,
+    axpy,
+    cross,
+    dot,
+    relative_quaternion,
+    rotation_rows,
+    scaled,
+)
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.state import State, clamped
+from sst_ros.scene.schema import Section, choice, number
+from sst_ros.state import Quaternion, State, Vector3, clamped
+
+MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
+SPACES = ("gamma", "so3")
+INSTANTS = ("start", "middle")
+
+
+@dataclass(frozen=True)
+class ControllerSettings(Section):
+    """Mode and gains.
+
+    Gains are of a joint, tau_k = stiffness_k e_k + damping_k e_dot_k with e = desired - measured.
+    By bandwidth they are those of the inertia M_kk that joint k has at the start of the motion:
+    stiffness M_kk bandwidth^2, damping 2 damping_ratio M_kk bandwidth; so pd, gravity_pd and
+    feedforward_pd have equal gains. computed_torque takes them over M_kk, as accelerations.
+    """
+
+    mode: str = choice(
+        "feedforward: torque of the desired motion; feedforward_pd: and feedback; computed_torque: "
+        "the model at the measured state, and feedback; pd: feedback alone; gravity_pd: and the "
+        "weight at the measured position",
+        MODES,
+        default="feedforward",
+    )
+    space: str = choice(
+        "where computed_torque is linear: the actuator angles, or the orientation",
+        SPACES,
+        default="gamma",
+    )
+    bandwidth: float = number(
+        "natural frequency of the error", "rad/s", default=30.0, above=0.0, most=1e6
+    )
+    damping_ratio: float = number(
+        "damping ratio of the error", "1", default=1.0, above=0.0, most=1e3
+    )
+    stiffness: Vector3 = number(
+        "stiffness of the feedback, in place of bandwidth; zeros for that of bandwidth",
+        "N m/rad",
+        shape=(3,),
+        default=(0.0, 0.0, 0.0),
+        least=0.0,
+        most=1e9,
+    )
+    damping: Vector3 = number(
+        "damping of the feedback, in place of damping_ratio; zeros for that of bandwidth",
+        "N m s/rad",
+        shape=(3,),
+        default=(0.0, 0.0, 0.0),
+        least=0.0,
+        most=1e9,
+    )
+    integral_rate: float = number(
+        "integral action: stiffness times this is the torque per sum of errors; 0 for none",
+        "1/s",
+        default=0.0,
+        least=0.0,
+        most=1e6,
+    )
+    torque_limit: float = number(
+        "largest torque that is commanded, beside that of the scene's actuators; 0 for none",
+        "N m",
+        default=0.0,
+        least=0.0,
+        most=1e9,
+    )
+    feedforward_at: str = choice(
+        "instant of a control period whose feedforward is held over it",
+        INSTANTS,
+        default="start",
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse gains of a joint where there is none."""
+        if self.direct and self.mode == "computed_torque" and self.space == "so3":
+            allowed = "is a joint's: on so3 give bandwidth and damping_ratio"
+            yield Problem("stiffness", self.stiffness, allowed)
+        if self.direct and not any(self.stiffness) and self.integral_rate:
+            yield Problem("integral_rate", self.integral_rate, "acts on stiffness: give it")
+
+    @property
+    def direct(self) -> bool:
+        """Whether the gains are given as such, and not by bandwidth."""
+        return any(self.stiffness) or any(self.damping)
+
 
 __all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
@@ -61,8 +152,8 @@ class ControlStopped(SstError):
 class Measurement:
     """Angles [rad] and rates [rad/s] of the actuators, as encoders measure them."""
 
-    gamma: Triple
-    gamma_dot: Triple
+    gamma: Vector3
+    gamma_dot: Vector3
 
 
 @dataclass(frozen=True)
@@ -78,9 +169,9 @@ class Command:
 
     """
 
-    torque: Triple
-    feedforward: Triple
-    feedback: Triple
+    torque: Vector3
+    feedforward: Vector3
+    feedback: Vector3
     desired: Reference
     saturated: bool
 
@@ -127,7 +218,7 @@ class Controller:
     def reset(self) -> None:
         """Clear the integral, the observer and a failure."""
         self._observer.reset()
-        self._sum: Triple = ZERO
+        self._sum: Vector3 = ZERO
         self._failure: ControlStopped | None = None
 
     def follow(self, motion: ReferenceMotion) -> None:
@@ -150,7 +241,7 @@ class Controller:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
 
-    def __call__(self, time: float, state: State) -> Triple:
+    def __call__(self, time: float, state: State) -> Vector3:
         """Torques [N m] for the angles and rates of a state: a function for `simulate`."""
         joints = state.joints
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
@@ -164,7 +255,7 @@ class Controller:
             feedforward = self._inverse.gravity_torque(self._observer.update(measured.gamma))
         elif mode != "pd":
             feedforward = self._at_desired(desired)
-        summed: Triple = ZERO
+        summed: Vector3 = ZERO
         if mode == "computed_torque":
             total, summed = self._computed(desired, measured, error)
             feedback = axpy(1.0, total, -1.0, feedforward)
@@ -178,11 +269,11 @@ class Controller:
 
     def _limited(
         self,
-        feedforward: Triple,
-        feedback: Triple,
+        feedforward: Vector3,
+        feedback: Vector3,
         desired: Reference,
-        error: Triple,
-        summed: Triple,
+        error: Vector3,
+        summed: Vector3,
     ) -> Command:
         total = added(feedforward, feedback)
         _require_finite(total, "torque")
@@ -191,12 +282,12 @@ class Controller:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
         return Command(torque, feedforward, feedback, desired, torque != total)
 
-    def _at_desired(self, at: Reference) -> Triple:
+    def _at_desired(self, at: Reference) -> Vector3:
         return self._inverse.reference_torque(at)
 
     def _computed(
-        self, desired: Reference, measured: Measurement, error: Triple
-    ) -> tuple[Triple, Triple]:
+        self, desired: Reference, measured: Measurement, error: Vector3
+    ) -> tuple[Vector3, Vector3]:
         """Torque of computed_torque, and the error to integrate."""
         quaternion = self._observer.update(measured.gamma)
         rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
@@ -209,25 +300,25 @@ class Controller:
             body_acceleration, summed = self._on_so3(desired, now)
         return self._inverse.torque(now.quaternion, now.body_rate, body_acceleration), summed
 
-    def _on_so3(self, desired: Reference, now: Reference) -> tuple[Triple, Triple]:
+    def _on_so3(self, desired: Reference, now: Reference) -> tuple[Vector3, Vector3]:
         """W_dot in {E}, and the rotation vector of the error, which is integrated."""
-        between = quaternions.between(now.quaternion, desired.quaternion)
+        between = relative_quaternion(now.quaternion, desired.quaternion)
         turn = rotation_rows(between)
         rate, forward = (
             _three(dot(row, vector) for row in turn)
             for vector in (desired.body_rate, desired.body_acceleration)
         )
         moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
-        phi = quaternions.rotation_vector(between)
+        phi = rotation_vector(between)
         acceleration, summed = self._feedback(phi, axpy(1.0, rate, -1.0, now.body_rate))
         return added(moving, acceleration), summed
 
-    def _feedback(self, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
+    def _feedback(self, error: Vector3, rates: Vector3) -> tuple[Vector3, Vector3]:
         """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
         leaning = axpy(1.0, error, self._settings.integral_rate, self._sum)
         return added(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
 
-    def _gains(self) -> tuple[Triple, Triple]:
+    def _gains(self) -> tuple[Vector3, Vector3]:
         """Gains kp [1/s^2] and kd [1/s] of accelerations."""
         given, of = self._settings, self.inertia
         if given.direct:
@@ -243,15 +334,24 @@ class Controller:
         return kp, kd
 
 
-def _three(values: Iterable[float]) -> Triple:
+def _three(values: Iterable[float]) -> Vector3:
     first, second, third = map(float, values)
     return first, second, third
 
 
-def _by_joint(factors: Triple, values: Triple) -> Triple:
+def _by_joint(factors: Vector3, values: Vector3) -> Vector3:
     return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
 
 
 def _require_finite(numbers: Sequence[float], what: str) -> None:
     if not all(map(math.isfinite, numbers)):
         raise InputError("control", [Problem(what, tuple(numbers), "must be finite numbers")])
+
+
+def rotation_vector(quaternion: Quaternion) -> Vector3:
+    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
+    sign = math.copysign(1.0, quaternion[3])
+    x, y, z, w = (sign * part for part in quaternion)
+    sine = math.hypot(x, y, z)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
+    return factor * x, factor * y, factor * z

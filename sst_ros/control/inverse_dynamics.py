@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sst_ros.control.reference import REST, Quadruple, Reference, Triple
+from sst_ros.control.reference import REST, Reference
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics
@@ -16,6 +16,7 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import State
+from sst_ros.state import Quaternion, Vector3
 
 SINGULAR = 1e-10
 """sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""
@@ -41,11 +42,11 @@ class InverseDynamics:
 
     def torque(
         self,
-        quaternion: Quadruple,
-        body_rate: Triple,
-        body_acceleration: Triple,
-        moment: Triple = REST,
-    ) -> Triple:
+        quaternion: Quaternion,
+        body_rate: Vector3,
+        body_acceleration: Vector3,
+        moment: Vector3 = REST,
+    ) -> Vector3:
         """Torques [N m] that give W_dot in a state.
 
         Args:
@@ -74,11 +75,11 @@ class InverseDynamics:
             raise self._refusal(quaternion, given)
         return first, second, third
 
-    def reference_torque(self, reference: Reference) -> Triple:
+    def reference_torque(self, reference: Reference) -> Vector3:
         """Torques [N m] of a reference: the feedforward; raises as `torque`."""
         return self.torque(reference.quaternion, reference.body_rate, reference.body_acceleration)
 
-    def gravity_torque(self, at: State | Sequence[float]) -> Triple:
+    def gravity_torque(self, at: State | Sequence[float]) -> Vector3:
         """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
 
         Args:
@@ -100,7 +101,7 @@ class InverseDynamics:
         x, y, z, w = pose
         return self.torque((x, y, z, w), REST, REST)
 
-    def _refusal(self, quaternion: Quadruple, given: Sequence[float]) -> Exception:
+    def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> Exception:
         problems = list(_problems(quaternion, given))
         if problems:
             return InputError("inverse dynamics", problems)
@@ -120,7 +121,7 @@ class InverseDynamics:
         return SingularConfiguration(said, determinant)
 
 
-def _problems(quaternion: Quadruple, given: Sequence[float]) -> Iterator[Problem]:
+def _problems(quaternion: Quaternion, given: Sequence[float]) -> Iterator[Problem]:
     if not all(map(math.isfinite, given)):
         yield Problem("state", tuple(given), "must be finite numbers")
     elif math.hypot(*quaternion) < 1e-100:

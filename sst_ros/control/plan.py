@@ -7,19 +7,76 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import simpson
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.peaks import Peak, maximum, minimum, peak_magnitude
-from sst_ros.control.reference import Reference, ReferenceMotion, Triple
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Actuators, Scene
+from sst_ros.state import Vector3
+
+_ROUNDING = 1e-13
+
+
+class Peak(NamedTuple):
+    """A value and the time at which it is taken [s]."""
+
+    value: float
+    time: float
+
+
+def maximum(
+    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+) -> Peak:
+    """Return the maximum of a function of which samples are known.
+
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
+    if the function could exceed the best sample there: extrapolated by its change to the lower
+    neighbour.
+
+    Args:
+        function: of time.
+        times: of the samples, rising [s], shape (n,).
+        values: the function there, shape (n,).
+        floor: maxima that are certainly below it are not refined.
+
+    """
+    top = int(np.argmax(values))
+    best = Peak(float(values[top]), float(times[top]))
+    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
+    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
+    summits = (values >= left) & (values >= right) & high
+    for index in np.flatnonzero(summits):
+        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
+        width = float(bounds[1] - bounds[0])
+        found = minimize_scalar(
+            lambda time: -function(time), bounds=bounds, method="bounded",
+            options={"xatol": 1e-8 * width},
+        )  # fmt: skip
+        if -found.fun > best.value + _ROUNDING * abs(best.value):
+            best = Peak(float(-found.fun), float(found.x))
+    return best
+
+
+def minimum(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the minimum; see `maximum`."""
+    found = maximum(lambda time: -function(time), times, -values)
+    return Peak(-found.value, found.time)
+
+
+def peak_magnitude(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the value of the largest magnitude, with its sign; see `maximum`."""
+    high, low = maximum(function, times, values), minimum(function, times, values)
+    return high if high.value >= -low.value else low
+
 
 SAMPLES = 16
 """Parts of a piece of the motion; even, for Simpson's rule."""
@@ -130,7 +187,7 @@ def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     distances = tuple(_distances(motion, scene, geometry, times, desired))
     inverse = InverseDynamics(scene)
 
-    def torque(time: float) -> Triple:
+    def torque(time: float) -> Vector3:
         return inverse.reference_torque(motion.at(time))
 
     torques = np.array([inverse.reference_torque(at) for at in desired])
@@ -152,7 +209,7 @@ def sample_times(motion: ReferenceMotion) -> Array:
 
 def _demand(
     motion: ReferenceMotion,
-    torque: Callable[[float], Triple],
+    torque: Callable[[float], Vector3],
     leg: int,
     times: Array,
     desired: tuple[Reference, ...],

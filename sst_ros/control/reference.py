@@ -6,10 +6,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
-Triple = tuple[float, float, float]
-Quadruple = tuple[float, float, float, float]
+from sst_ros.mechanism.generic_math import axpy, scaled
+from sst_ros.state import Quaternion, Vector3
 
-REST: Triple = (0.0, 0.0, 0.0)
+REST: Vector3 = (0.0, 0.0, 0.0)
+
+PIECES = 8
+"""Pieces of a minimum-jerk law, and of a quarter of a turn."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +27,12 @@ class Reference:
 
     """
 
-    quaternion: Quadruple
-    body_rate: Triple
-    body_acceleration: Triple
-    gamma: Triple
-    gamma_dot: Triple
-    gamma_ddot: Triple
+    quaternion: Quaternion
+    body_rate: Vector3
+    body_acceleration: Vector3
+    gamma: Vector3
+    gamma_dot: Vector3
+    gamma_ddot: Vector3
 
 
 class ReferenceMotion(ABC):
@@ -66,3 +69,57 @@ class ReferenceMotion(ABC):
 def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
     """Return the ends of `count` equal parts of a duration."""
     return (*(duration * (k / count) for k in range(count)), duration)
+
+
+class StoppingMotion(ReferenceMotion):
+    """Another motion from a time on, slowed down to rest by time scaling.
+
+    Its time s has ds/dt = 1 - 3 u^2 + 2 u^3 with u = t / duration: 1 at first and 0 at the end,
+    with d^2s/dt^2 = 0 at both. It stays on the path of the other motion, which is inside all
+    limits of position, for half of `duration` more at most.
+
+    Args:
+        motion: the other motion.
+        begin: its time from which it is slowed down [s].
+        duration: time until it rests [s], > 0.
+
+    """
+
+    def __init__(self, motion: ReferenceMotion, begin: float, duration: float) -> None:
+        super().__init__(duration, equal_pieces(duration, 4))
+        self._motion, self._begin = motion, begin
+
+    def _inside(self, time: float) -> Reference:
+        u = time / self.duration
+        at = self._motion.at(self._begin + self.duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
+        speed = 1.0 - u * u * (3.0 - 2.0 * u)
+        change = -6.0 * u * (1.0 - u) / self.duration
+
+        def second(rate: Vector3, acceleration: Vector3) -> Vector3:
+            return axpy(speed * speed, acceleration, change, rate)
+
+        return Reference(
+            at.quaternion,
+            scaled(speed, at.body_rate),
+            second(at.body_rate, at.body_acceleration),
+            at.gamma,
+            scaled(speed, at.gamma_dot),
+            second(at.gamma_dot, at.gamma_ddot),
+        )
+
+
+def minimum_jerk(u: float) -> tuple[float, float, float]:
+    """s(u) from 0 to 1 for u in [0, 1], at rest at both ends, with its two derivatives by u."""
+    rest = 1.0 - u
+    square = u * u
+    return (
+        square * u * (10.0 + u * (6.0 * u - 15.0)),
+        30.0 * square * rest * rest,
+        60.0 * u * rest * (rest - u),
+    )
+
+
+def timed(time: float, duration: float) -> tuple[float, float, float]:
+    """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
+    s, rate, acceleration = minimum_jerk(time / duration)
+    return s, rate / duration, acceleration / (duration * duration)

@@ -3,16 +3,119 @@
 
 from __future__ import annotations
 
+import math
+from abc import abstractmethod
 from collections.abc import Callable
 
-from sst_ros.control.actuator_motions import ActuatorMotion, straight_path, sweep_path
-from sst_ros.control.reference import Quadruple, ReferenceMotion, equal_pieces
-from sst_ros.control.star_motions import PIECES, GeodesicMotion, SpiralMotion
-from sst_ros.control.waypoints import MotionSamples, moved, recorded, waypoints
+from scipy.spatial.transform import Rotation
+
+from sst_ros.control.actuator_motions import (
+    ActuatorMotion,
+    MotionSamples,
+    moved,
+    recorded,
+    straight_path,
+    sweep_path,
+    waypoints,
+)
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.reference import PIECES, Reference, ReferenceMotion, equal_pieces, timed
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.mechanism.generic_math import axpy, quaternion_product, scaled
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.state import Quaternion, Vector3
+
+StarState = tuple[Quaternion, Vector3, Vector3]
+
+
+class StarMotion(ReferenceMotion):
+    """A motion of the star; a subclass defines it by `star`."""
+
+    def __init__(self, geometry: Geometry, duration: float, turn: float) -> None:
+        """Prepare a motion that turns the star by some `turn` [rad] in all."""
+        count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
+        super().__init__(duration, equal_pieces(duration, count))
+        self._coordinates = ActuatorSpaceMap(geometry)
+
+    @abstractmethod
+    def star(self, time: float) -> StarState:
+        """Quaternion, W and W_dot at a time [s] between 0 and the duration."""
+
+    def _inside(self, time: float) -> Reference:
+        try:
+            return self._coordinates.of_star(*self.star(time))
+        except ArithmeticError:
+            said = f"serial singularity at t = {time:.9g} s, sin(mu)"
+            raise SingularConfiguration(said, 0.0) from None
+
+
+class GeodesicMotion(StarMotion):
+    """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
+
+    Quaternions (x, y, z, w) may have any length > 0; the shorter rotation is taken.
+    """
+
+    def __init__(
+        self, geometry: Geometry, start: Quaternion, end: Quaternion, duration: float
+    ) -> None:
+        self._start = _unit(start)
+        vector = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+        x, y, z = vector.tolist()
+        self._angle = math.hypot(x, y, z)
+        self._vector: Vector3 = (x, y, z)
+        super().__init__(geometry, duration, self._angle)
+
+    def star(self, time: float) -> StarState:
+        """See `StarMotion.star`; the axis is the same in {B} and in {E}."""
+        s, rate, acceleration = timed(time, self.duration)
+        half = 0.5 * s * self._angle
+        part = math.sin(half) / self._angle if self._angle else 0.0
+        q = quaternion_product(self._start, (*scaled(part, self._vector), math.cos(half)))
+        return q, scaled(rate, self._vector), scaled(acceleration, self._vector)
+
+
+class SpiralMotion(StarMotion):
+    """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
+
+    Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so the motion
+    is smooth where ZYZ angles are not.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        start: Quaternion,
+        end: tuple[float, float, float],
+        duration: float,
+    ) -> None:
+        self._start = _unit(start)
+        self._theta, self._phi, self._psi = end
+        turn = abs(self._theta) + abs(self._phi) + abs(self._psi)
+        super().__init__(geometry, duration, turn)
+
+    def star(self, time: float) -> StarState:
+        """See `StarMotion.star`."""
+        s, rate, acceleration = timed(time, self.duration)
+        a, b, c = s * self._theta, s * self._phi, s * (self._psi - self._theta)
+        q = quaternion_product(
+            quaternion_product(_about_z(a), (0.0, math.sin(0.5 * b), 0.0, math.cos(0.5 * b))),
+            _about_z(c),
+        )
+        # W = u rate with u = (theta part, phi part, third angle's part) by the angles a, b, c.
+        third = self._psi - self._theta
+        sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
+        x = -self._theta * sb * cc + self._phi * sc
+        y = self._theta * sb * sc + self._phi * cc
+        z = self._theta * cb + third
+        # Its derivatives by s; the angles are linear in s.
+        dx = -self._theta * (self._phi * cb * cc - third * sb * sc) + self._phi * third * cc
+        dy = self._theta * (self._phi * cb * sc + third * sb * cc) - self._phi * third * sc
+        dz = -self._theta * self._phi * sb
+        turning = axpy(acceleration, (x, y, z), rate * rate, (dx, dy, dz))
+        return quaternion_product(self._start, q), scaled(rate, (x, y, z)), turning
+
 
 __all__ = ["MotionSamples", "ReferenceMotion", "recorded", "reference_motion", "waypoints"]
 
@@ -64,7 +167,7 @@ def reference_motion(
     return ActuatorMotion(geometry, path, pieces, start)
 
 
-def _through(scene: Scene, geometry: Geometry, start: Quadruple) -> ReferenceMotion:
+def _through(scene: Scene, geometry: Geometry, start: Quaternion) -> ReferenceMotion:
     assert scene.motion is not None
     points = scene.motion.waypoints
     try:
@@ -78,3 +181,14 @@ def _through(scene: Scene, geometry: Geometry, start: Quadruple) -> ReferenceMot
         )
     except InputError as error:
         raise InputError(f"{scene.name}: motion.waypoints", error.problems) from None
+
+
+def _about_z(angle: float) -> Quaternion:
+    """Quaternion of a turn about z."""
+    return (0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle))
+
+
+def _unit(q: Quaternion) -> Quaternion:
+    """Quaternion of length 1."""
+    length = math.hypot(*q)
+    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

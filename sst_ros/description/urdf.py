@@ -15,17 +15,101 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.description.inertials import Body, bodies
-from sst_ros.description.shapes import Arc, Ball, Box, Colour, Shape, shapes
-from sst_ros.description.tree import BASE, Joint, tree
+from sst_ros.description.tree import (
+    BASE,
+    LEGS,
+    STAR,
+    Arc,
+    Ball,
+    Box,
+    Colour,
+    Joint,
+    Shape,
+    actuated,
+    intermediate,
+    shapes,
+    tree,
+)
 from sst_ros.dynamics.limits import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.bodies import Inertia, Payload
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import LARGEST, Friction, Scene
+from sst_ros.state import Vector3
+
+PAYLOAD = "payload"
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body that is fixed to a link.
+
+    Attributes:
+        name: its own; the link's where it is the link.
+        link: of the tree, whose frame all vectors are in.
+        mass: [kg].
+        centre: of mass [m], shape (3,).
+        tensor: about the centre of mass [kg m^2], shape (3, 3).
+        assumed: the scene has no mass for it.
+
+    """
+
+    name: str
+    link: str
+    mass: float
+    centre: Array
+    tensor: Array
+    assumed: bool = False
+
+
+def bodies(scene: Scene) -> list[Body]:
+    """All bodies that have mass or inertia."""
+    star, base = scene.star, scene.base
+    found = [_body(STAR, star.mass, star.centre, star.inertia, star.radius)]
+    if scene.payload is not None:
+        found.append(_payload(scene.payload))
+    for k, leg in enumerate(LEGS):
+        for name, link, radius in (
+            (actuated(leg), scene.actuated_links[k], base.radius),
+            (intermediate(leg), scene.intermediate_links[k], star.radius),
+        ):
+            if link.mass or link.inertia is not None:
+                found.append(_body(name, link.mass, link.centre, link.inertia, radius))
+        if scene.actuators is not None and scene.actuators.rotor_inertia:
+            found.append(_rotor(scene, leg))
+    return found
+
+
+def _body(name: str, mass: float, centre: Vector3, inertia: Inertia | None, radius: float) -> Body:
+    about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
+    if mass == 0.0:
+        return Body(name, name, _mass(about_o, radius), np.zeros(3), about_o, assumed=True)
+    c = np.array(centre)
+    return Body(name, name, mass, c, about_o - mass * (c @ c * np.eye(3) - np.outer(c, c)))
+
+
+def _payload(payload: Payload) -> Body:
+    tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
+    return Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
+
+
+def _rotor(scene: Scene, leg: int) -> Body:
+    """Return a rotor behind its gear as a thin disc: only its inertia about w matters."""
+    assert scene.actuators is not None
+    behind = scene.actuators.gear_ratio**2 * scene.actuators.rotor_inertia
+    tensor = np.diag([behind / 2.0, behind / 2.0, behind])
+    mass = _mass(tensor, scene.base.radius)
+    return Body(f"rotor_{leg}", actuated(leg), mass, np.zeros(3), tensor, assumed=True)
+
+
+def _mass(tensor: Array, radius: float) -> float:
+    return float(np.trace(tensor)) / (2.0 * radius**2)
+
 
 _NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
      star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they

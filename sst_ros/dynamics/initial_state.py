@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterator
 
-from sst_ros.errors import SingularConfiguration
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 
@@ -46,3 +50,93 @@ def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Arra
         message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
         raise SingularConfiguration(message, determinant)
     return np.asarray(rotation.T @ at.j @ gamma_dot)
+
+
+REFUSED = "the equations of the paper have no such term: use equations = quaternion"
+
+
+def body_acceleration(
+    mechanism: virtual_work.Mechanism,
+    state: ArrayLike,
+    torque: ArrayLike,
+    moment: ArrayLike = (0.0, 0.0, 0.0),
+) -> tuple[Array, Array]:
+    """Return W_dot and gamma_dot by Eqs. 1 to 92.
+
+    Args:
+        mechanism: geometry and inertias.
+        state: quaternion (x, y, z, w) and body rate W in {E} [rad/s], shape (7,).
+        torque: actuator torques [N m], shape (3,).
+        moment: external moment on the star in {B} [N m], shape (3,).
+
+    Returns:
+        W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each of shape (3,).
+
+    Raises:
+        SingularConfiguration: the posture is singular.
+
+    """
+    numbers = np.asarray(state, dtype=float)
+    rotation = rotation_matrix(numbers[:4])
+    gamma = kinematics.inverse(mechanism.geometry, rotation)[0]
+    at = virtual_work.posture(mechanism.geometry, gamma, rotation)
+    gamma_dot = np.linalg.solve(at.j, rotation @ numbers[4:])
+    gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
+    # Eq. 40; R W_dot = omega_dot, because W x W = 0.
+    omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, gamma_dot).omega_dot
+    return np.asarray(rotation.T @ omega_dot), np.asarray(gamma_dot)
+
+
+class VirtualWorkDerivative:
+    """Derivative of a scene's state by Eqs. 1 to 92.
+
+    Args:
+        scene: bodies, payload, rotors, torque limits and an external moment, as the paper has them
+            or in its inertias and n_ext.
+
+    Raises:
+        InputError: the scene has another term; names each.
+
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        if problems := list(_foreign_terms(scene)):
+            raise InputError(scene.name, problems)
+        self._mechanism = virtual_work.Mechanism.of(scene)
+        value = scene.moment.value if scene.moment is not None else None
+        self._moment = np.array(value or (0.0, 0.0, 0.0))
+
+    def __call__(self, _: float, *inputs: float) -> tuple[float, ...]:
+        """Differentiate the state by time.
+
+        Args:
+            inputs: quaternion, body rate [rad/s], work [J]; torques [N m], and a moment on the star
+                in {B} [N m] if it comes from a topic.
+
+        Raises:
+            ArithmeticError: the posture is singular.
+
+        """
+        x, y, z, w, *rate = inputs[:7]
+        torque = np.array(inputs[8:11])
+        moment = self._moment + inputs[11:14] if len(inputs) > 11 else self._moment
+        try:
+            acceleration, gamma_dot = body_acceleration(self._mechanism, inputs[:7], torque, moment)
+        except SingularConfiguration as error:
+            raise ArithmeticError(str(error)) from None
+        omega = rotation_matrix(np.array(inputs[:4])) @ rate
+        return (
+            *quaternion_rate((x, y, z, w), (rate[0], rate[1], rate[2])),
+            *acceleration.tolist(),
+            float(torque @ gamma_dot + moment @ omega),
+        )
+
+
+def _foreign_terms(scene: Scene) -> Iterator[Problem]:
+    for name in ("gravity", "friction", "springs"):
+        if value := getattr(scene, name):
+            yield Problem(name, value, REFUSED)
+    if scene.actuators is not None and scene.actuators.time_constant is not None:
+        yield Problem("actuators.time_constant", scene.actuators.time_constant, REFUSED)
+    if scene.stroke.at_end == "elastic":
+        yield Problem("stroke.at_end", scene.stroke.at_end, REFUSED)

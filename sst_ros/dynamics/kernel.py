@@ -13,7 +13,7 @@ energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces act on the star
 only a serial singularity (t_k = +-w_k) has no dynamics.
 
 The inertial part uses + - * / and, for a link with products of inertia xz or yz, one square root;
-loads may need angles (`loads`). The functions run on floats, complex numbers, NumPy columns,
+loads may need angles (`model`). The functions run on floats, complex numbers, NumPy columns,
 mpmath numbers and expressions alike; the simulation runs what `trace` leaves of them for a scene.
 """
 
@@ -21,11 +21,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sst_ros.dynamics import loads
-from sst_ros.dynamics.loads import LegMotion
-from sst_ros.dynamics.model import Leg, Model, model_of
+from sst_ros.dynamics.model import (
+    Leg,
+    LegMotion,
+    Model,
+    dissipation,
+    joint_angle,
+    joint_rate,
+    joint_torques,
+    model_of,
+    spring_and_weight_energy,
+)
 from sst_ros.mechanism.generic_math import (
     ZERO,
+    Quadruple,
     Rows,
     Scalar,
     Triple,
@@ -55,9 +64,6 @@ __all__ = [
     "model_of",
 ]
 
-Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
-State = tuple[Scalar, ...]
-
 
 class Balance(NamedTuple):
     """M W_dot = force in {E}, everything reduced to the star by virtual work.
@@ -74,7 +80,9 @@ class Balance(NamedTuple):
     jacobian: Rows
 
 
-def derivative(model: Model, state: State, torque: Triple, moment: Triple | None = None) -> State:
+def derivative(
+    model: Model, state: tuple[Scalar, ...], torque: Triple, moment: Triple | None = None
+) -> tuple[Scalar, ...]:
     """Time derivative of the state, seven numbers (q, W), and with lag three torques more.
 
     Args:
@@ -86,7 +94,7 @@ def derivative(model: Model, state: State, torque: Triple, moment: Triple | None
 
     """
     x, y, z, w, wx, wy, wz, *given = state
-    more: State = ()
+    more: tuple[Scalar, ...] = ()
     if model.time_constant is not None:
         more = tuple(
             (asked - has) / model.time_constant for asked, has in zip(torque, given, strict=True)
@@ -156,7 +164,7 @@ def balance(
         toward_a = scaled(c_inertia, g)
         toward_gamma = axpy(a_inertia, g, c_inertia, p)
         if leg.loads is not None:
-            at_gamma, at_mu, at_beta = loads.joint_torques(leg.loads, at, leg.across, leg.v, field)
+            at_gamma, at_mu, at_beta = joint_torques(leg.loads, at, leg.across, leg.v, field)
             force_gamma = force_gamma - at_gamma
             # mu_dot = -a_dot / sqrt(u)
             force_a = force_a + _quotient(at_mu, u)
@@ -175,15 +183,15 @@ def balance(
     )
 
 
-def joints(model: Model, state: State) -> Joints:
+def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
     x, y, z, w, wx, wy, wz = state[:7]
     rows = rotation_rows((x, y, z, w))
     angles, rates = [], []
     for leg in model.legs:
         at = leg_motion(leg, rows, (wx, wy, wz))
-        angles.append([loads.angle(at, kind, leg.across, leg.v) for kind in range(3)])
-        rates.append([loads.rate(at, kind) for kind in range(3)])
+        angles.append([joint_angle(at, kind, leg.across, leg.v) for kind in range(3)])
+        rates.append([joint_rate(at, kind) for kind in range(3)])
     gamma, mu, beta = zip(*angles, strict=True)
     gamma_dot, mu_dot, beta_dot = zip(*rates, strict=True)
     return Joints(gamma, mu, beta, gamma_dot, mu_dot, beta_dot)
@@ -250,3 +258,57 @@ def field_of(model: Model, rows: Rows) -> Triple:
 
 def _quotient(torque: Scalar, u: Scalar) -> Scalar:
     return 0.0 if type(torque) is float and torque == 0.0 else torque / sqrt(u)
+
+
+def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
+    """Kinetic energy of all seven links, payload and rotors [J]."""
+    x, y, z, w, wx, wy, wz = state[:7]
+    ixx, iyy, izz, ixy, ixz, iyz = model.star
+    total = ixx * wx * wx + iyy * wy * wy + izz * wz * wz
+    total = total + 2.0 * (ixy * wx * wy + ixz * wx * wz + iyz * wy * wz)
+    rows = rotation_rows((x, y, z, w))
+    for leg in model.legs:
+        at = leg_motion(leg, rows, (wx, wy, wz))
+        total = total + (leg.a0 + leg.a2 * (at.a * at.a)) * at.gamma_dot * at.gamma_dot
+        if leg.ixy or leg.ixz or leg.iyz:
+            root = sqrt(at.u)
+            mixed = (leg.ixz * at.a / root - leg.ixy) * at.a_dot
+            mixed = mixed - leg.iyz * at.a * root * at.gamma_dot
+            total = total + 2.0 * mixed * at.gamma_dot
+    return 0.5 * total
+
+
+def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
+    """Potential energy [J]: weight, springs and elastic ends."""
+    x, y, z, w, wx, wy, wz = state[:7]
+    rows = rotation_rows((x, y, z, w))
+    field = field_of(model, rows)
+    total: Scalar = 0.0 if model.gravity is None else -dot(model.weight, field)
+    for leg in model.legs:
+        if leg.loads is not None:
+            at = leg_motion(leg, rows, (wx, wy, wz))
+            total = total + spring_and_weight_energy(leg.loads, at, leg.across, leg.v, field)
+    return total
+
+
+def power(
+    model: Model, state: tuple[Scalar, ...], torque: Triple, moment: Triple | None = None
+) -> Scalar:
+    """Power [W] that actuators and external moments put in, less what friction takes out.
+
+    It is the rate of kinetic plus potential energy. With lag the torques are the state's own.
+    """
+    x, y, z, w, wx, wy, wz, *given = state
+    rows = rotation_rows((x, y, z, w))
+    acting = torque if model.time_constant is None else given
+    total: Scalar = 0.0
+    for leg, drive in zip(model.legs, acting, strict=True):
+        at = leg_motion(leg, rows, (wx, wy, wz))
+        total = total + drive * at.gamma_dot
+        if leg.loads is not None:
+            total = total - dissipation(leg.loads, at, leg.across, leg.v)
+    for external in (model.moment, moment):
+        if external is not None:
+            omega = tuple(dot(row, (wx, wy, wz)) for row in rows)
+            total = total + dot(external, (omega[0], omega[1], omega[2]))
+    return total

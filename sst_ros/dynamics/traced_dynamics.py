@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.dynamics import energy, kernel
-from sst_ros.dynamics.differentiation import with_jacobian
-from sst_ros.dynamics.expression import Program, trace
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import Program, trace, with_jacobian
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, SineTorque
@@ -110,8 +109,11 @@ class Dynamics:
 
     def _energies(self, *inputs: Any) -> tuple[Any, ...]:
         state, torque, moment = self._split(inputs)
-        stored = energy.kinetic(self.model, state), energy.potential(self.model, state)
-        return (*stored, energy.power(self.model, state, torque, moment))
+        stored = (
+            kernel.kinetic_energy(self.model, state),
+            kernel.potential_energy(self.model, state),
+        )
+        return (*stored, kernel.power(self.model, state, torque, moment))
 
     def _split(self, inputs: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         size = len(self.state)
@@ -207,7 +209,7 @@ class ODE:
         slope = kernel.derivative(model, state, torque, moment)
         if not self._work:
             return slope
-        return (*slope, energy.power(model, state, torque, moment))
+        return (*slope, kernel.power(model, state, torque, moment))
 
 
 def _clamped(torque: Any, limit: float) -> Any:

@@ -24,9 +24,9 @@ from sst_ros.errors import AssemblyError, InputError, Problem
 from sst_ros.identification.measured_motion import MeasuredMotion
 from sst_ros.identification.sine_components import BAND
 from sst_ros.mechanism import continuation, kinematics
-from sst_ros.mechanism.direct_kinematics import cross, turned
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.kinematics import turned
 
 States = tuple[Array, Array, Array]
 """Quaternions (n, 4), W (n, 3) and W_dot (n, 3) in {E}."""

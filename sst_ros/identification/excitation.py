@@ -27,9 +27,9 @@ from sst_ros.identification.base_parameters import BaseParameters, structural
 from sst_ros.identification.fourier_series import FourierSeries
 from sst_ros.identification.regressor import Regressor
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.direct_kinematics import cross, turned
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.kinematics import turned
 from sst_ros.scene.scene import Scene
 
 SHARE = 0.9

@@ -12,8 +12,7 @@ from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured
 from sst_ros.identification.simulation_fit import SimulationFit, fit_simulation
 from sst_ros.identification.torque_fit import TorqueFit, fit_torques
-from sst_ros.scene.given import scene_of
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scene, scene_of
 
 INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"
 Given = Scene | Mapping[str, Any] | str | Path | None

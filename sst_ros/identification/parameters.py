@@ -19,8 +19,7 @@ from sst_ros.identification.scene_numbers import JOINT_KINDS, at, opened, set_nu
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.values import replaced
-from sst_ros.scene.yaml_document import from_values, values_of
+from sst_ros.scene.yaml_document import from_values, replaced, values_of
 
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" for part in INERTIA))

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics import kernel, loads
-from sst_ros.dynamics.differentiation import with_jacobian
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import with_jacobian
+from sst_ros.dynamics.model import joint_angle
 from sst_ros.dynamics.traced_dynamics import QUATERNION, compiled_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.measured_motion import Measured, measured_motion
@@ -143,7 +144,7 @@ def observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
         legs = [(kernel.leg_motion(leg, rows, ZERO), leg) for leg in model.legs]
         first, second, third = rows
         return (
-            *(loads.angle(at, 0, leg.across, leg.v) for at, leg in legs),
+            *(joint_angle(at, 0, leg.across, leg.v) for at, leg in legs),
             atan2(second[2], first[2]),
             atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
             atan2(third[1], -third[0]),

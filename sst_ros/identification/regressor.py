@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.differentiation import with_jacobian
-from sst_ros.dynamics.expression import Expression, Program
+from sst_ros.dynamics.expression import Expression, Program, with_jacobian
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,

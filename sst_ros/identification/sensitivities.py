@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.differentiation import with_jacobian
+from sst_ros.dynamics.expression import with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compiled

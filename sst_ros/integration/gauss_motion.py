@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics import energy
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
@@ -142,7 +142,7 @@ class GaussMotion:
         weights = (lengths[:, None] * rows[1]).ravel()
         y = tuple(self.at(times).T)
         torque: Any = tuple(self.torque(times).T)
-        work = float(np.sum(weights * energy.power(model, y, torque)))
+        work = float(np.sum(weights * kernel.power(model, y, torque)))
         start, stop = map(self._dynamics.stored_energy, self.at(np.array([0.0, end])).tolist())
         return stop - start - work
 

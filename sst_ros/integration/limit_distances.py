@@ -8,7 +8,7 @@ from typing import Any
 
 from sst_ros.dynamics.kernel import Leg, Model, leg_motion
 from sst_ros.dynamics.limits import Limit
-from sst_ros.dynamics.loads import LegMotion
+from sst_ros.dynamics.model import LegMotion
 from sst_ros.mechanism.generic_math import Scalar, dot, rotation_rows
 
 

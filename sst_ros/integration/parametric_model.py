@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics import energy, kernel
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compiled_for_arrays
@@ -146,7 +146,9 @@ class ParametricModel:
         def values(*inputs: Expression) -> tuple[Any, ...]:
             model, state = self.constants(inputs[7:]).model, inputs[:7]
             found = kernel.joints(model, state)._asdict()
-            found["energy"] = (energy.kinetic(model, state) + energy.potential(model, state),)
+            found["energy"] = (
+                kernel.kinetic_energy(model, state) + kernel.potential_energy(model, state),
+            )
             return tuple(number for name in names for number in found[name])
 
         if names not in self._functions:

@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.direct_kinematics import ROUNDING, cross, turned
+from sst_ros.mechanism.frames import cross
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.kinematics import ROUNDING, turned
 
 SAFE = 0.18
 """Largest step in gamma [rad] over sigma^2 that cannot leave the branch."""

@@ -14,6 +14,7 @@ import numpy as np
 
 Scalar = Any
 Triple = tuple[Scalar, Scalar, Scalar]
+Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 Rows = tuple[Triple, Triple, Triple]
 
 ZERO: Triple = (0.0, 0.0, 0.0)
@@ -77,7 +78,7 @@ def _other(name: str, *arguments: Any) -> Any:
     return getattr(mpmath, name)(*arguments)
 
 
-def rotation_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Rows:
+def rotation_rows(q: Quadruple) -> Rows:
     """Rows of R for a quaternion (x, y, z, w) of any length > 0."""
     x, y, z, w = q
     s = 2.0 / (x * x + y * y + z * z + w * w)
@@ -91,7 +92,25 @@ def rotation_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Rows:
     )
 
 
-def quaternion_rate(q: tuple[Scalar, Scalar, Scalar, Scalar], rate: Triple) -> tuple[Scalar, ...]:
+def quaternion_product(a: Quadruple, b: Quadruple) -> Quadruple:
+    """Product of quaternions (x, y, z, w): first b, then a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by + ay * bw + az * bx - ax * bz,
+        aw * bz + az * bw + ax * by - ay * bx,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def relative_quaternion(first: Quadruple, second: Quadruple) -> Quadruple:
+    """Quaternion of R1^T R2: the second orientation relative to the first."""
+    x, y, z, w = first
+    return quaternion_product((-x, -y, -z, w), second)
+
+
+def quaternion_rate(q: Quadruple, rate: Triple) -> tuple[Scalar, ...]:
     """Differentiate a quaternion (x, y, z, w) by time at the body rate W [rad/s]."""
     x, y, z, w = q
     wx, wy, wz = rate

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sst_ros.scene.scene import Scene
+from sst_ros.state import Array
 
-Array = NDArray[np.float64]
+__all__ = ["Array", "Geometry", "frozen"]
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:

@@ -9,15 +9,236 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
-from sst_ros.mechanism.direct_kinematics import cross, dot, rotations
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.frames import columns, cross, dot, quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.state import Assembly
+
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+ROUNDING = 1e-15
+"""Largest abs(r_k . t_k) that is rounding and not a residual."""
+
+_NOT_ISOLATED = 1e-13
+_NEAR_REAL = 1e-3
+_NEAR = 1e-3
+_MISFIT = 1e-2
+_STEPS = 40
+_LONGEST_TURN = 0.3
+_LAST_STEP = 1e-9
+_REGULAR = 1e-5
+
+
+def rotations(r: Array, e: Array) -> tuple[Index, Array, Mask]:
+    """Solve r_k . R e_k = 0 for many configurations at once.
+
+    Args:
+        r: unit vectors r_k in rows, shape (n, 3, 3), one block a configuration.
+        e: axes e_k of the star in {E} in rows, e_1 = (0, 1, 0), shape (3, 3), or (n, 3, 3).
+
+    Returns:
+        The configuration that each root belongs to, ascending, shape (m,); the rotations, (m, 3,
+        3), pairs R, R Rot(z, pi) side by side, pairs in the order of (s_z, s_y, s_x); and whether
+        the roots of a configuration are isolated, (n,): where they are not, none is given.
+
+    """
+    r0, rest = r[:, 0], r[:, 1:]
+    n = cross(r0, np.eye(3)[np.argmin(np.abs(r0), axis=1)])
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    m = cross(r0, n)
+    rn, rm = (rest @ n[:, :, None])[..., 0], (rest @ m[:, :, None])[..., 0]
+    ex, ey = e[..., 1:, 0], e[..., 1:, 1]
+    # Coefficients of (cos x, sin x) in a and c, and the number b; shapes (n, 2, 2) and (n, 2).
+    a = ex[..., None] * np.stack([-rm, rn], axis=-1)
+    b = -ex * (rest @ r0[:, :, None])[..., 0]
+    c = ey[..., None] * np.stack([rn, rm], axis=-1)
+    form = _quartic(a, b, c)
+    isolated = np.abs(form).max(axis=1) > _NOT_ISOLATED
+    x, keep = _roots(form, isolated)
+    y, fits = _second_angles(x, a, b, c)
+    owner, root, which = np.nonzero(keep[:, :, None] & fits)
+    x, y = x[owner, root][:, None], y[owner, root, which][:, None]
+    t1 = np.cos(x) * n[owner] + np.sin(x) * m[owner]
+    s = np.cos(y) * r0[owner] + np.sin(y) * cross(t1, r0[owner])
+    rotation, residual = _polish(r[owner], _of(e, owner), columns(cross(t1, s), t1, s))
+    good = residual <= ROUNDING
+    owner, rotation = _distinct(r, e, owner[good], rotation[good])
+    return (*_arranged(owner, rotation), isolated)
+
+
+def _of(e: Array, rows: Any) -> Array:
+    """Return e of some rows: the same for all, or one for each."""
+    return e if e.ndim == 2 else np.asarray(e[rows])
+
+
+def _largest(rows: Array) -> Array:
+    """Largest size of an entry in rows of three."""
+    size = np.abs(rows)
+    return np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])
+
+
+def _quartic(a: Array, b: Array, c: Array) -> Array:
+    """Coefficients of cos^4, cos^3 sin, ..., sin^4 in cos(y)^2 + sin(y)^2 - 1, shape (n, 5)."""
+    cosine = b[:, :1] * c[:, 1] - b[:, 1:] * c[:, 0]
+    one = a[:, 0] * b[:, 1:] - a[:, 1] * b[:, :1]
+    sine = _product(c[:, 0], a[:, 1]) - _product(a[:, 0], c[:, 1])
+    form = _product(sine, sine)
+    bare = _product(cosine, cosine) - _product(one, one)
+    form[:, :3] += bare
+    form[:, 2:] += bare
+    return form
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of forms, coefficients along the last axis."""
+    result = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
+    for power in range(a.shape[1]):
+        result[:, power : power + b.shape[1]] += a[:, power, None] * b
+    return result
+
+
+def _turned_forms(count: int) -> tuple[Array, Array]:
+    """Angles x0 and matrices that turn a quartic form's coefficients from x to x - x0."""
+    angles = np.arange(count) * np.pi / count
+    matrices = np.zeros((count, 5, 5))
+    for turn, (cosine, sine) in enumerate(zip(np.cos(angles), np.sin(angles), strict=True)):
+        for power in range(5):
+            term = np.ones(1)
+            for factor in [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power:
+                term = np.convolve(term, factor)
+            matrices[turn, :, power] = term
+    return angles, matrices
+
+
+_TURN, _TURNED = _turned_forms(5)
+
+
+def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
+    """Angles x of the roots, shape (n, 4), modulo pi, and which of them may be real."""
+    # Count x from where the form is largest: then its leading coefficient is no small number.
+    best = np.argmax(np.abs(form @ _TURNED[:, 0].T), axis=1)
+    turned = (_TURNED[best] @ form[:, :, None])[..., 0]
+    lead = np.where(isolated, turned[:, 0], 1.0)
+    companion = np.zeros((len(form), 4, 4))
+    companion[:, 0] = -turned[:, 1:] / lead[:, None]
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    z = np.linalg.eigvals(companion)
+    size = z.real**2 + z.imag**2
+    x = _TURN[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, size - 1.0)
+    return x, isolated[:, None] & (np.abs(z.imag) < _NEAR_REAL * (1.0 + size))
+
+
+def _second_angles(x: Array, a: Array, b: Array, c: Array) -> tuple[Array, Mask]:
+    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where the legs agree."""
+    direction = np.stack([np.cos(x), np.sin(x)], axis=1)
+    a, c = a @ direction, c @ direction
+    b = np.broadcast_to(b[:, :, None], a.shape)
+    reach = np.hypot(a, b)
+    steep = reach[:, 1] > reach[:, 0]
+    chosen = np.where(steep, reach[:, 1], reach[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.clip(-np.where(steep, c[:, 1], c[:, 0]) / chosen, -1.0, 1.0)
+    swing = np.arccos(np.where(chosen > 0.0, cosine, 0.0))
+    middle = np.arctan2(np.where(steep, b[:, 1], b[:, 0]), np.where(steep, a[:, 1], a[:, 0]))
+    y = np.stack([middle + swing, middle - swing], axis=-1)
+    misfit = a[..., None] * np.cos(y)[:, None] + b[..., None] * np.sin(y)[:, None] + c[..., None]
+    return y, np.abs(misfit).max(axis=1) < _MISFIT
+
+
+def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
+    """Newton's method on SO(3); the best iterate of each start and its residual."""
+    best, least = rotation.copy(), np.full(len(rotation), np.inf)
+    active, last = np.arange(len(rotation)), np.full(len(rotation), np.inf)
+    for _ in range(_STEPS):
+        t = e @ rotation.transpose(0, 2, 1)
+        residual = dot(r, t)
+        worst = _largest(residual)
+        better = worst < least[active]
+        least[active[better]], best[active[better]] = worst[better], rotation[better]
+        open_ = last > _LAST_STEP
+        if not open_.any():
+            break
+        if not open_.all():
+            active, r, t, rotation = active[open_], r[open_], t[open_], rotation[open_]
+            residual, e = residual[open_], _of(e, open_)
+        step = _newton_step(cross(t, r), residual)
+        last = np.sqrt(dot(step, step))
+        if last.max() > _LONGEST_TURN:
+            step = step * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
+        rotation = turned(rotation, step)
+    return best, least
+
+
+def _newton_step(slope: Array, residual: Array) -> Array:
+    """Solve slope step = -residual; the shortest such step where slope is nearly singular."""
+    first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
+    # A^-1 is the adjugate over the determinant; its columns are these vector products.
+    adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
+    determinant = dot(first, adjugate[:, :, 0])
+    regular = np.abs(determinant) > _REGULAR
+    scale = -1.0 / np.where(regular, determinant, 1.0)
+    step = (adjugate @ residual[:, :, None])[..., 0] * scale[:, None]
+    if not regular.all():
+        odd = ~regular
+        inverse = np.linalg.pinv(slope[odd], rcond=1e-9)
+        step[odd] = -(inverse @ residual[odd][:, :, None])[..., 0]
+    return np.asarray(step)
+
+
+def turned(rotation: Array, step: Array) -> Array:
+    """Turn R, shape (..., 3, 3), by small rotation vectors `step` in {B} and keep it orthonormal.
+
+    The turn is exact to second order, which is all that Newton's method asks for.
+    """
+    t, s = rotation[..., 1], rotation[..., 2]
+    ts, ss = cross(step, t), cross(step, s)
+    t, s = t + ts + 0.5 * cross(step, ts), s + ss + 0.5 * cross(step, ss)
+    s = s / np.sqrt(dot(s, s))[..., None]
+    t = t - s * dot(s, t)[..., None]
+    t = t / np.sqrt(dot(t, t))[..., None]
+    return columns(cross(t, s), t, s)
+
+
+def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index, Array]:
+    """Keep one of each root; t_1 and -t_1 count as the same here."""
+    if not len(owner):
+        return owner, rotation
+    fresh = np.ones(len(owner), dtype=bool)
+    for back in range(1, 8):
+        later = np.arange(back, len(owner))
+        later = later[(owner[later] == owner[later - back]) & fresh[later]]
+        if not len(later):
+            continue
+        new, old = rotation[later], rotation[later - back]
+        sign = np.where(dot(new[:, :, 1], old[:, :, 1]) < 0.0, -1.0, 1.0)
+        old = old * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, None, :]
+        close = np.abs(new - old).max(axis=(1, 2)) < _NEAR
+        if close.any():
+            at = later[close]
+            middle = turned(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
+            t = _of(e, owner[at]) @ middle.transpose(0, 2, 1)
+            fresh[at] = _largest(dot(r[owner[at]], t)) > ROUNDING
+    return owner[fresh], rotation[fresh]
+
+
+def _arranged(owner: Index, rotation: Array) -> tuple[Index, Array]:
+    """Sort, and set the partner R Rot(z, pi) beside each root."""
+    s = np.round(rotation[:, :, 2], 6)
+    order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
+    owner, rotation = owner[order], rotation[order]
+    # t_1 first, then -t_1: first the one further along the first base vector where they differ.
+    t = np.round(rotation[:, :, 1], 6)
+    lead = t[np.arange(len(t)), np.argmax(t != 0.0, axis=1)] < 0.0
+    rotation = np.where(lead[:, None, None], rotation * [-1.0, -1.0, 1.0], rotation)
+    both = np.stack([rotation, rotation * [-1.0, -1.0, 1.0]], axis=1)
+    return np.repeat(owner, 2), both.reshape(-1, 3, 3)
+
 
 NEAR = 0.1
 """How near an assembly must be to the rotation that names it [rad]."""

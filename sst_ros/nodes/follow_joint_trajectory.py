@@ -27,7 +27,8 @@ from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import TrajectoryFollower
 from sst_ros.runtime.trajectory_goal import ErrorCode, TrajectoryGoal
-from sst_ros.simulation.simulation import NANOSECONDS, Triple
+from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.state import Vector3
 
 try:
     from control_msgs.action import FollowJointTrajectory
@@ -163,7 +164,7 @@ class FollowJointTrajectoryServer:
         active.handle.publish_feedback(message)
 
 
-def _point(time: float, angles: Triple, rates: Triple, torques: Triple) -> JointTrajectoryPoint:
+def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> JointTrajectoryPoint:
     point = JointTrajectoryPoint()
     point.positions, point.velocities = array("d", angles), array("d", rates)
     point.effort = array("d", torques)

@@ -15,11 +15,11 @@ from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from sst_ros.description.headers import BASE_FRAME
 from sst_ros.errors import SstError
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.state import BASE_FRAME
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _STAMP = struct.Struct("<iI")

@@ -20,7 +20,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from sst_ros.description.headers import IDLE_FRAME_ID
 from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem
 from sst_ros.nodes import topics
@@ -32,7 +31,8 @@ from sst_ros.runtime.torque_input import ZERO, HasState
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.simulation import State, Triple
+from sst_ros.simulation.simulation import State
+from sst_ros.state import IDLE_FRAME_ID, Vector3
 
 _HISTORY_S = 2
 _FAST = 10
@@ -108,7 +108,7 @@ class SimulatorTopics:
         self._log.clear()
         self._counted_ns = 0
 
-    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+    def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
         """Log the torque [N m] and external moment [N m] of some ticks."""
         self._log.append(torque, moment, count)
 

@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.reference import Quadruple, Triple
-from sst_ros.description.headers import BASE_FRAME
 from sst_ros.errors import AssemblyError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.run_loop import Reply, RunLoop
+from sst_ros.state import BASE_FRAME, Quaternion, Vector3
 
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
@@ -99,7 +98,7 @@ class SimulatedStar:
             return answer(response, INVALID_POSE, str(error) or "the manipulator is singular there")
         return replied(response, self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot)))
 
-    def _actuators(self, quaternion: Quadruple, rate: Triple) -> tuple[Triple, Triple]:
+    def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
 
         Raises:
@@ -139,7 +138,7 @@ def _unknown(request: Any, response: Any) -> Any:
     return answer(response, NOT_FOUND, f"there is no entity {request.entity!r}, only {NAME!r}")
 
 
-def _turned(quaternion: Quadruple, vector: Triple) -> Triple:
+def _turned(quaternion: Quaternion, vector: Vector3) -> Vector3:
     """From {E} into base_link."""
     x, y, z = (rotation_matrix(quaternion) @ vector).tolist()
     return x, y, z
@@ -152,7 +151,7 @@ def _numbers(message: Any, names: str) -> Any:
     return numbers
 
 
-def _unit(quaternion: Quadruple) -> Quadruple:
+def _unit(quaternion: Quaternion) -> Quaternion:
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) < _UNIT:
         raise ValueError(f"orientation has length {length:.6g}, must be 1")

@@ -11,12 +11,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.simulation.simulation import Triple
+from sst_ros.state import Vector3, is_idle, nanoseconds
 
 _DEPTH = 1000
 """As of the other topics that are recorded: with ten, a recorder that is held up for a hundredth
@@ -55,7 +54,7 @@ class TorqueCommands:
         stamp_ns = nanoseconds(state.header.stamp)
         return 0 if is_idle(stamp_ns, state.header.frame_id) else stamp_ns
 
-    def send(self, torque: Triple) -> None:
+    def send(self, torque: Vector3) -> None:
         """Publish torques [N m]."""
         self._torques[0], self._torques[1], self._torques[2] = torque
         self.publisher.publish(self._message)

@@ -18,7 +18,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.errors import InputError
 from sst_ros.nodes import graph, parameters, topics
 from sst_ros.nodes.clocks import STEADY
@@ -27,7 +26,8 @@ from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Triple
+from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.state import Vector3, is_idle, nanoseconds
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 
@@ -49,7 +49,7 @@ class Viewer:
         self._phase, self._status = "", RunStatus()
         self._start_ns, self._time_ns = 0, 0
         self._states: deque[ViewState] = deque(maxlen=_QUEUE)
-        self._torque: Triple = ZERO
+        self._torque: Vector3 = ZERO
         self._controller, self._driving = "", False
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
@@ -96,7 +96,7 @@ class Viewer:
             self._restart()
         return reply
 
-    def apply(self, torque: Triple) -> None:
+    def apply(self, torque: Vector3) -> None:
         """Hold torques from now on; the timer publishes them."""
         self._torque, self._driving = torque, True
 

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from sst_ros.dynamics import energy as physics
+from sst_ros.dynamics import kernel as physics
 from sst_ros.dynamics.kernel import model_of
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -381,8 +381,8 @@ def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
     state = (*quaternion[known].T, *turned.T)
     model = model_of(scene)
     result = np.full((2, len(known)), np.nan)
-    result[0, known] = physics.kinetic(model, state)
-    result[1, known] = physics.potential(model, state)
+    result[0, known] = physics.kinetic_energy(model, state)
+    result[1, known] = physics.potential_energy(model, state)
     return result[0], result[1]
 
 

@@ -20,7 +20,7 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sst_ros.mechanism import singularities, workspace
+from sst_ros.mechanism import workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
@@ -56,7 +56,7 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
 
 def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
     view = View(chart.geometry)
-    poses = singularities.parallel(chart)
+    poses = workspace.parallel_singularities(chart)
     share = f"E reaches {100 * _reached(chart, faces):.0f} % of the triangle"
     worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
     least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
@@ -79,7 +79,7 @@ def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str
             axes.plot(x, y, ".", markersize=2.2, color=_ALARM, alpha=0.8)
             axes.plot([], [], "o", markersize=4, color=_ALARM, label="det J2 = 0 at some turn")
         if unit == "cond J":
-            ends = singularities.serial(chart.geometry)
+            ends = workspace.serial_singularities(chart.geometry)
             if len(ends):
                 x, y = view.flat(ends.rotation[:, :, 2])
                 axes.plot(x, y, "o", markersize=2, color="#1b6ca8", label="det J1 = 0 at the edge")

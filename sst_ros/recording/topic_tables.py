@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.description.headers import is_idle, nanoseconds
 from sst_ros.recording.bag_reader import Topic
+from sst_ros.state import is_idle, nanoseconds
 
 KINDS = ("gamma", "mu", "beta")
 JOINTS = tuple(f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3))

@@ -15,9 +15,8 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program
-from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.initial_state import body_acceleration, initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.dynamics.virtual_work_derivative import body_acceleration
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics import energy
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.host.output import slices
@@ -308,7 +308,10 @@ def _energy(recording: Recording) -> Program:
     dynamics = Dynamics.of(recording.scene)
 
     def stored(*state: Any) -> tuple[Any]:
-        return (energy.kinetic(dynamics.model, state) + energy.potential(dynamics.model, state),)
+        return (
+            kernel.kinetic_energy(dynamics.model, state)
+            + kernel.potential_energy(dynamics.model, state),
+        )
 
     return trace(stored, dynamics.state)
 

@@ -23,7 +23,8 @@ from sst_ros.runtime.settings import RunSettings
 from sst_ros.runtime.tick_loop import Counters, HeldTorques, NoAnswer, RunOutput, TickLoop
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Initial, Scene
-from sst_ros.simulation.simulation import Simulation, Triple
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import Vector3
 
 IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001
@@ -234,7 +235,7 @@ class RunLoop:
             self._to(Phase.WAITING)
         return Reply(True, f"at the initial state, {self.phase.value}")
 
-    def set_state(self, gamma: Triple, gamma_dot: Triple) -> Reply:
+    def set_state(self, gamma: Vector3, gamma_dot: Vector3) -> Reply:
         """Put a run that waits or is paused into another state [rad], [rad/s]."""
         if self.phase not in (Phase.WAITING, Phase.PAUSED):
             return Reply(False, f"refused: pause or reset first, the run is {self._status}")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.control.controller import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts

@@ -14,7 +14,8 @@ from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.settings import RunSettings
 from sst_ros.runtime.torque_input import ZERO, HasState, TorqueInput
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation.simulation import Simulation, State, Triple
+from sst_ros.simulation.simulation import Simulation, State
+from sst_ros.state import Vector3
 
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
@@ -41,7 +42,7 @@ class RunOutput(Protocol):
     def start(self) -> None:
         """Forget the torques of the run before."""
 
-    def ticks(self, torque: Triple, moment: Triple, count: int) -> None:
+    def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
         """Log the torque [N m] and external moment [N m] of some ticks."""
 
     def sample(self, simulation: HasState, stamp_ns: int) -> None:
@@ -137,14 +138,14 @@ class HeldTorques:
 
     def clear(self) -> None:
         """Forget the torques."""
-        self._first: Triple | None = None
-        self._second: Triple | None = None
-        self._last: Triple | None = None
+        self._first: Vector3 | None = None
+        self._second: Vector3 | None = None
+        self._last: Vector3 | None = None
         self._impulse = [0.0, 0.0, 0.0]
         self._seconds = self._held = 0.0
         self._changes = 0
 
-    def add(self, torque: Triple | SineTorque, seconds: float) -> None:
+    def add(self, torque: Vector3 | SineTorque, seconds: float) -> None:
         """Add torques [N m] that were held for some time [s]; a sine is not held."""
         if torque is not self._last and torque != self._last:
             if isinstance(torque, SineTorque):
@@ -229,7 +230,7 @@ class TickLoop:
         self._lockstep, self._last_tick = run.lockstep, run.last_tick
         self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
-        self._kept: Triple | None = None  # in lockstep, an answer whose deadline has not come
+        self._kept: Vector3 | None = None  # in lockstep, an answer whose deadline has not come
         self._awaited_since = self._waits_since = time.monotonic()
 
     def warm_up(self) -> None:
@@ -359,7 +360,7 @@ class TickLoop:
         most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
         return (most - ticks) // self._ticks_per_sample
 
-    def _advance(self, torque: Triple, ticks: int) -> None:
+    def _advance(self, torque: Vector3, ticks: int) -> None:
         simulation, moment = self.simulation, self._input.moment
         before = simulation.time_ns
         self.step_since = began = time.perf_counter()
@@ -375,7 +376,7 @@ class TickLoop:
                 self.held.add(torque, 1e-9 * done * self._period_ns)
                 self._tick += done
 
-    def _answer(self, paced: bool) -> Triple | None:
+    def _answer(self, paced: bool) -> Vector3 | None:
         """Torques that answer the last sample; None if interrupted before."""
         while (answer := self._input.answer(self._stamp_ns)) is None:
             if self.stopped.is_set() or (paced and self.requested.is_set()):

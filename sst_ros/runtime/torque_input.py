@@ -8,11 +8,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from sst_ros.description.headers import nanoseconds
 from sst_ros.runtime.settings import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.state import NANOSECONDS, State, Vector3, clamped, finite_vector
+from sst_ros.state import NANOSECONDS, State, Vector3, clamped, finite_vector, nanoseconds
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]

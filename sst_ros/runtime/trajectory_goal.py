@@ -13,16 +13,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+from sst_ros.control.actuator_motions import waypoints
 from sst_ros.control.controller import Measurement
 from sst_ros.control.reference import Reference, ReferenceMotion
-from sst_ros.control.waypoints import waypoints
-from sst_ros.description.headers import nanoseconds
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, nanoseconds
 
 NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""

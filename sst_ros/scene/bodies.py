@@ -10,16 +10,16 @@ link k.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import Problem
+from sst_ros.errors import InputError, Problem
 from sst_ros.scene.schema import Section, choice, number, section
-
-Vector = tuple[float, float, float]
+from sst_ros.state import Vector3
 
 RELATIVE_ROUNDING = 1e-9
 
@@ -74,7 +74,7 @@ class Inertia(Section):
 class Base(Section):
     """The fixed spherical triangle P1 P2 P3 in {B}."""
 
-    v: tuple[Vector, Vector, Vector] = number(
+    v: tuple[Vector3, Vector3, Vector3] = number(
         "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
         "1",
         shape=(3, 3),
@@ -109,7 +109,7 @@ class Link(Section):
 
     inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
     mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
-    centre: Vector = number(
+    centre: Vector3 = number(
         "centre of mass in the frame of the inertia", "m", shape=(3,), default=(0.0, 0.0, 0.0)
     )
     inertia_about: str = choice(
@@ -152,7 +152,7 @@ class Star(Link):
     """The moving spherical star."""
 
     inertia: Inertia = section("inertia of the star in {E}", Inertia)
-    alpha_deg: Vector = number(
+    alpha_deg: Vector3 = number(
         "angles between the planes of arcs 1-2, 2-3, 3-1", "deg", shape=(3,), above=0.0
     )
     radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
@@ -170,7 +170,7 @@ class Payload(Section):
     """A body carried by the star; its inertia is about its own centre of mass."""
 
     mass: float = number("mass", "kg", above=0.0)
-    centre: Vector = number("centre of mass in {E}", "m", shape=(3,))
+    centre: Vector3 = number("centre of mass in {E}", "m", shape=(3,))
     inertia: Inertia | None = section(
         "inertia about the payload's centre of mass, axes of {E}; none for a point",
         Inertia,
@@ -184,6 +184,54 @@ class Payload(Section):
         return own + _of_point(self.mass, self.centre)
 
 
-def _of_point(mass: float, centre: Vector) -> NDArray[np.float64]:
+def _of_point(mass: float, centre: Vector3) -> NDArray[np.float64]:
     c = np.array(centre)
     return np.asarray(mass * (c @ c * np.eye(3) - np.outer(c, c)))
+
+
+def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) -> Inertia:
+    """Inertia about O of a thin, uniform arc of a great circle. Inertias of several arcs add up.
+
+    Args:
+        mass: of the arc [kg].
+        radius: of its circle [m].
+        begin: direction of its beginning seen from O, of any length, shape (3,).
+        end: direction of its end, less than pi from `begin`, shape (3,).
+
+    Raises:
+        InputError: mass or radius is not positive, or the directions span no arc.
+
+    """
+    problems = [
+        Problem(name, value, f"must be > 0 and finite [{unit}]")
+        for name, value, unit in (("mass", mass, "kg"), ("radius", radius, "m"))
+        if not (value > 0.0 and math.isfinite(value))
+    ]
+    first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
+    fits = first.shape == last.shape == (3,) and np.all(np.isfinite([first, last]))
+    normal = np.linalg.norm(np.cross(first, last)) if fits else 0.0
+    lengths = np.linalg.norm(first) * np.linalg.norm(last) if fits else 0.0
+    if not normal > 1e-9 * lengths:
+        allowed = "must be two directions, shape (3,), neither parallel nor opposite"
+        problems.append(Problem("begin, end", (begin, end), allowed))
+    if problems:
+        raise InputError("arc_inertia", problems)
+    u = first / np.linalg.norm(first)
+    half = 0.5 * math.atan2(normal, float(first @ last))
+    middle = u * math.cos(half) + _towards(u, last) * math.sin(half)
+    across = _towards(middle, last)
+    # Mean of r r^T over the arc: angles from -half to half about its middle.
+    ratio = math.sin(2.0 * half) / (2.0 * half)
+    spread = 0.5 * (1.0 + ratio) * np.outer(middle, middle)
+    spread += 0.5 * (1.0 - ratio) * np.outer(across, across)
+    tensor = mass * radius**2 * (np.eye(3) - spread)
+    xx, yy, zz = (float(tensor[i, i]) for i in range(3))
+    return Inertia(
+        xx=xx, yy=yy, zz=zz, xy=float(tensor[0, 1]), xz=float(tensor[0, 2]), yz=float(tensor[1, 2])
+    )
+
+
+def _towards(axis: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the unit vector across `axis` in the plane of both, on the side of `other`."""
+    across = other - axis * float(axis @ other)
+    return np.asarray(across / np.linalg.norm(across))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
-from sst_ros.scene.bodies import Vector
 from sst_ros.scene.schema import Section, choice, flag, number, section
+from sst_ros.state import Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
 
@@ -27,7 +27,7 @@ STRIBECK = 0.1
 class Gravity(Section):
     """A uniform field."""
 
-    acceleration: Vector = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
+    acceleration: Vector3 = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
 
     def check(self) -> Iterator[Problem]:
         """Refuse a field that is none."""
@@ -39,7 +39,7 @@ class Gravity(Section):
 class Moment(Section):
     """An external moment on the star: constant, or received on the topic ~/external_moment."""
 
-    value: Vector | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
+    value: Vector3 | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
     topic: bool = flag("take it from the topic ~/external_moment", default=False)
 
     def check(self) -> Iterator[Problem]:
@@ -216,8 +216,8 @@ class Workspace(Section):
 class Initial(Section):
     """The state at t = 0."""
 
-    gamma: Vector = number("actuator angles at t = 0", "rad", shape=(3,))
-    gamma_dot: Vector = number(
+    gamma: Vector3 = number("actuator angles at t = 0", "rad", shape=(3,))
+    gamma_dot: Vector3 = number(
         "actuator rates at t = 0", "rad/s", shape=(3,), default=(0.0, 0.0, 0.0)
     )
     orientation: tuple[float, float, float, float] | None = number(
@@ -233,11 +233,11 @@ class Initial(Section):
 class SineTorque(Section):
     """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
 
-    amplitude: Vector = number("amplitudes", "N m", shape=(3,))
-    frequency: Vector = number("angular frequencies", "rad/s", shape=(3,), least=0.0)
-    phase: Vector = number("phases", "rad", shape=(3,), default=(0.0, 0.0, 0.0))
+    amplitude: Vector3 = number("amplitudes", "N m", shape=(3,))
+    frequency: Vector3 = number("angular frequencies", "rad/s", shape=(3,), least=0.0)
+    phase: Vector3 = number("phases", "rad", shape=(3,), default=(0.0, 0.0, 0.0))
 
-    def at(self, time: float) -> Vector:
+    def at(self, time: float) -> Vector3:
         """Torques [N m] at a time [s]."""
         rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
         first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)

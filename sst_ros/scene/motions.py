@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sst_ros.errors import Problem
-from sst_ros.scene.bodies import Vector
 from sst_ros.scene.schema import Section, number, section, sections, specs, text
+from sst_ros.state import Vector3
 
 NANOSECOND = 1e-9
 """Resolution of time [s]."""
@@ -23,7 +23,7 @@ NANOSECOND = 1e-9
 class ToAngles(Section):
     """The actuators go straight from their initial angles to others, with minimum jerk."""
 
-    gamma: Vector = number("actuator angles at the end", "rad", shape=(3,))
+    gamma: Vector3 = number("actuator angles at the end", "rad", shape=(3,))
     duration: float = number("time that it takes", "s", least=NANOSECOND)
 
 
@@ -51,15 +51,15 @@ class Sweep(Section):
     at the end.
     """
 
-    amplitude: Vector = number("amplitudes", "rad", shape=(3,))
-    frequency: Vector = number("angular frequencies at the beginning", "rad/s", shape=(3,))
-    last_frequency: Vector | None = number(
+    amplitude: Vector3 = number("amplitudes", "rad", shape=(3,))
+    frequency: Vector3 = number("angular frequencies at the beginning", "rad/s", shape=(3,))
+    last_frequency: Vector3 | None = number(
         "angular frequencies at the end; by default those at the beginning",
         "rad/s",
         shape=(3,),
         default=None,
     )
-    centre: Vector | None = number(
+    centre: Vector3 | None = number(
         "centres; by default the initial angles", "rad", shape=(3,), default=None
     )
     fade: float = number("time to grow and to fade", "s", least=NANOSECOND)
@@ -90,9 +90,9 @@ class Waypoint(Section):
     """Where the actuators are at a time. What is not given is chosen for minimum jerk."""
 
     time: float = number("time since the beginning", "s", least=0.0)
-    gamma: Vector = number("actuator angles", "rad", shape=(3,))
-    gamma_dot: Vector | None = number("actuator rates", "rad/s", shape=(3,), default=None)
-    gamma_ddot: Vector | None = number(
+    gamma: Vector3 = number("actuator angles", "rad", shape=(3,))
+    gamma_dot: Vector3 | None = number("actuator rates", "rad/s", shape=(3,), default=None)
+    gamma_ddot: Vector3 | None = number(
         "actuator accelerations", "rad/s^2", shape=(3,), default=None
     )
 

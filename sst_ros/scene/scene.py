@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star, Vector
+from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star
 from sst_ros.scene.loads import (
     Actuators,
     Friction,
@@ -28,8 +28,7 @@ from sst_ros.scene.loads import (
 )
 from sst_ros.scene.motions import DesiredMotion
 from sst_ros.scene.schema import Section, Spec, notes, number, section, sections, specs, text
-from sst_ros.scene.values import replaced
-from sst_ros.scene.yaml_document import from_values, read, values_of
+from sst_ros.scene.yaml_document import from_values, plain, read, replaced, values_of
 
 Matrix = NDArray[np.float64]
 
@@ -54,7 +53,6 @@ __all__ = [
     "Spring",
     "Star",
     "Stroke",
-    "Vector",
     "Workspace",
     "load",
     "names",
@@ -235,3 +233,48 @@ def _has(cls: type[Section], path: list[str]) -> bool:
     if spec is None or len(path) == 1:
         return spec is not None
     return spec.section is not None and _has(spec.section, path[1:])
+
+
+def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
+    """Return a scene as it is, by its name or path, or built from its document as a dict.
+
+    Raises:
+        InputError: there is no such scene, or its document is refused.
+
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, Mapping):
+        return from_values(Scene, scene, "scene")
+    if isinstance(scene, (str, Path)):
+        return load(scene)
+    allowed = "must be a Scene, the name or path of one, or its document as a dict"
+    raise InputError("scene", [Problem("scene", scene, allowed)])
+
+
+def with_initial(scene: Scene, initial: Any) -> Scene:
+    """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
+
+    Raises:
+        InputError: it is none of these, or its numbers are refused.
+
+    """
+    if initial is None:
+        return scene
+    if isinstance(initial, Initial):
+        return replace(scene, initial=initial)
+    names = ("gamma", "gamma_dot", "orientation")
+    if isinstance(initial, Mapping):
+        unknown = [name for name in initial if name not in names]
+        if unknown or "gamma" not in initial:
+            allowed = "must have the key gamma, and may have gamma_dot and orientation"
+            raise InputError("initial", [Problem("initial", list(initial), allowed)])
+        given = dict(initial)
+    else:
+        try:
+            gamma, gamma_dot = initial
+        except (TypeError, ValueError):
+            allowed = "must be (gamma, gamma_dot), a mapping or Initial"
+            raise InputError("initial", [Problem("initial", initial, allowed)]) from None
+        given = {"gamma": gamma, "gamma_dot": gamma_dot}
+    return replace(scene, initial=Initial(**{name: plain(given[name]) for name in given}))

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.dynamics import energy, kernel
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import frames, kinematics
@@ -129,7 +129,7 @@ class SampledMotion:
         """Kinetic and potential energy [J], shape (n,)."""
         with np.errstate(all="ignore"):
             model, columns = self._dynamics.model, self._columns
-            total = energy.kinetic(model, columns) + energy.potential(model, columns)
+            total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(model, columns)
         return np.asarray(np.broadcast_to(total, self.t.shape))
 
     @cached_property

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.gauss_motion import NotSmooth
-from sst_ros.scene.given import scene_of, with_initial
 from sst_ros.scene.loads import Initial, SineTorque
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
 from sst_ros.simulation.simulate_steps import stepped
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.initial_state import VirtualWorkDerivative, initial_state
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.dynamics.virtual_work_derivative import VirtualWorkDerivative
 from sst_ros.errors import Diverged, InputError, Problem, StepBudgetExceeded
 from sst_ros.integration.adaptive_stepper import MethodChange
 from sst_ros.integration.applied_torque import Torque
@@ -23,8 +22,7 @@ from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.given import scene_of
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.simulation.options import (
     AUTO,
     EQUATIONS,
@@ -45,10 +43,8 @@ __all__ = [
     "Simulation",
     "State",
     "Torque",
-    "Triple",
+    "Vector3",
 ]
-
-Triple = Vector3
 
 
 class _Instant(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.control.controller import ControllerSettings
 from sst_ros.control.reference_motions import ReferenceMotion, reference_motion
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.scene import Scene

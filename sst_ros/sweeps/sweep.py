@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.host.output import require_free, writing
-from sst_ros.scene.given import scene_of
+from sst_ros.scene.scene import scene_of
 from sst_ros.sweeps import parts
 from sst_ros.sweeps.chunk_task import ChunkOutcome, ChunkTask, versions
 from sst_ros.sweeps.local_engine import run_local

@@ -17,10 +17,8 @@ import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.given import scene_of
-from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.scene.values import plain
-from sst_ros.scene.yaml_document import values_of
+from sst_ros.scene.scene import Scene, SineTorque, scene_of
+from sst_ros.scene.yaml_document import plain, values_of
 from sst_ros.sweeps import study_checks
 from sst_ros.sweeps.controlled import ControlledRun, control_of
 from sst_ros.sweeps.sampling import LARGEST_HYPERCUBE, Sampler

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.quaternions import product
 from sst_ros.control.reference import REST
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression
@@ -27,6 +26,7 @@ from sst_ros.mechanism.generic_math import (
     cross,
     dot,
     positive,
+    quaternion_product,
     rotation_rows,
     sin,
     sqrt,
@@ -197,7 +197,7 @@ class TracedController(NamedTuple):
         body_rate, body_acceleration = _tuple(now[:3]), _tuple(now[3:])
         if self.loop.settings.space == "so3":
             x, y, z, w = at.observed
-            between = product((-x, -y, -z, w), at.given["quaternion"])
+            between = quaternion_product((-x, -y, -z, w), at.given["quaternion"])
             turn = rotation_rows(between)
             rate, forward = (
                 _tuple(dot(row, at.given[name]) for row in turn)

@@ -10,17 +10,20 @@ import trimesh
 from numpy.typing import ArrayLike
 from viser import ViserServer
 
-from sst_ros.description.shapes import (
+from sst_ros.description.tree import (
+    BASE,
     LEG_COLOURS,
+    STAR,
     STAR_COLOUR,
     Arc,
     Ball,
     Box,
     Shape,
     end_point,
+    rotations,
     shapes,
+    tree,
 )
-from sst_ros.description.tree import BASE, STAR, rotations, tree
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.controller import MODES, Controller, ControlStopped, Measurement
-from sst_ros.control.controller_settings import ControllerSettings
-from sst_ros.control.orientation_observer import OrientationObserver
-from sst_ros.control.star_motions import GeodesicMotion
+from sst_ros.control.actuator_space import ActuatorSpaceMap, OrientationObserver
+from sst_ros.control.controller import (
+    MODES,
+    Controller,
+    ControllerSettings,
+    ControlStopped,
+    Measurement,
+)
+from sst_ros.control.reference_motions import GeodesicMotion
 from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix

@@ -20,10 +20,10 @@ from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.mechanism import singularities, virtual_work, workspace
-from sst_ros.mechanism.equation_of_motion import EquationOfMotion
+from sst_ros.mechanism import virtual_work, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.virtual_work import EquationOfMotion
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
@@ -131,7 +131,7 @@ def test_a_parallel_singularity_is_told():
     scene = dataclasses.replace(scene, star=star)
     geometry = Geometry.of(scene)
     s, _ = workspace.triangle_directions(geometry, 6)
-    poses = singularities.parallel(workspace.over_orientations(geometry, s, 36))
+    poses = workspace.parallel_singularities(workspace.over_orientations(geometry, s, 36))
     assert len(poses)
     for rotation in poses.rotation:
         q = tuple(quaternion_of(rotation).tolist())

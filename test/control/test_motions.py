@@ -11,19 +11,12 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.quaternions import product
 from sst_ros.control.reference_motions import MotionSamples, recorded, reference_motion, waypoints
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.mechanism import (
-    continuation,
-    kinematics,
-    rates,
-    singularities,
-    virtual_work,
-    workspace,
-)
+from sst_ros.mechanism import continuation, kinematics, rates, virtual_work, workspace
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import quaternion_product
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.motions import (
     DesiredMotion,
@@ -83,7 +76,7 @@ def test_rates_and_accelerations_are_derivatives(kind):
         at, h = motion.at(time), 0.02
         x, y, z, w = at.quaternion
         q_dot = slope(motion, time, lambda at: at.quaternion, h)
-        found = 2.0 * np.array(product((-x, -y, -z, w), tuple(q_dot)))[:3]
+        found = 2.0 * np.array(quaternion_product((-x, -y, -z, w), tuple(q_dot)))[:3]
         size = 1.0 + np.abs(at.body_acceleration).max() + np.abs(at.gamma_ddot).max()
         tolerance = 1e-12 * size / h * 0.02
         assert found == pytest.approx(at.body_rate, abs=tolerance)
@@ -229,7 +222,7 @@ def test_a_parallel_singularity_in_the_way_is_told_with_its_time():
     scene = replace(load("example1"), star=star)
     geometry = Geometry.of(scene)
     s, _ = workspace.triangle_directions(geometry, 6)
-    poses = singularities.parallel(workspace.over_orientations(geometry, s, 36))
+    poses = workspace.parallel_singularities(workspace.over_orientations(geometry, s, 36))
     rotation = poses.rotation[1]
     # Where two assemblies meet gamma turns back: ahead of the pose there is none.
     before = rotation @ Rotation.from_rotvec([0.0, 0.0, 0.1]).as_matrix()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from models import FAST
 from scipy.interpolate import BPoly, make_interp_spline
 
-from sst_ros.control.quintic import Quintic, minimum_jerk
+from sst_ros.control.actuator_motions import Quintic, minimum_jerk
 
 OPEN = np.nan
 

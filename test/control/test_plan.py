@@ -18,13 +18,11 @@ from scipy.spatial.transform import Rotation
 from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
-from sst_ros.control.peaks import maximum, minimum
-from sst_ros.control.plan import check, examine
-from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.star_motions import GeodesicMotion
+from sst_ros.control.plan import check, examine, maximum, minimum
+from sst_ros.control.reference_motions import GeodesicMotion, reference_motion
 from sst_ros.control.time_scaling import time_scaling
 from sst_ros.errors import MotionRefused, SingularConfiguration
-from sst_ros.mechanism import kinematics, singularities, workspace
+from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
@@ -249,7 +247,7 @@ def test_a_turn_through_a_parallel_singularity_is_refused():
     )
     geometry = Geometry.of(scene)
     s, _ = workspace.triangle_directions(geometry, 6)
-    poses = singularities.parallel(workspace.over_orientations(geometry, s, 36))
+    poses = workspace.parallel_singularities(workspace.over_orientations(geometry, s, 36))
     ends = [
         quaternion_of(poses.rotation[1] @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix())
         for angle in (-0.1, 0.123)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene, reference_motion
-from sst_ros.control.stopping_motion import StoppingMotion
+from sst_ros.control.reference import StoppingMotion
 
 BEGIN, DURATION = 0.4, 0.25
 

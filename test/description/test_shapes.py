@@ -4,8 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.description.shapes import Arc, Ball, Box, end_point, shapes
-from sst_ros.description.tree import STAR
+from sst_ros.description.tree import STAR, Arc, Ball, Box, end_point, shapes
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import load, names
 

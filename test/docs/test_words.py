@@ -14,7 +14,7 @@ PATTERN = re.compile(
     re.IGNORECASE,
 )
 ALLOWED = {
-    "sst_ros/mechanism/direct_kinematics.py": "companion",  # of a polynomial: the field's term
+    "sst_ros/mechanism/kinematics.py": "companion",  # of a polynomial: the field's term
     "docs/paper.md": "companion",
 }
 TREES = (("sst_ros", "*.py"), ("docs", "*.md"), ("docs", "*.ipynb"), ("launch", "*.py"),

@@ -10,9 +10,10 @@ from identification import manipulators
 from symmetric_motion import drift_free_rate, inertia
 
 from sst_ros import load_scene, simulate
-from sst_ros.dynamics import kernel, loads
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics import model as dynamics_model
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.model import damping_of, joint_angle
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
@@ -126,12 +127,14 @@ def state_after_the_bounce(scene, name, value, monkeypatch):
     def gamma(state):
         leg = model.legs[0]
         at = kernel.leg_motion(leg, rotation_rows(tuple(state[:4])), ZERO)
-        return loads.angle(at, 0, leg.across, leg.v)
+        return joint_angle(at, 0, leg.across, leg.v)
 
     for contact, guess, steps in PHASES:
         # The branch of the phase, also where a stage of the method lies beyond its end.
         least = -0.5 if contact else 0.5
-        monkeypatch.setattr(loads, "positive", lambda x, least=least: x if x > least else mp.mpf(0))
+        monkeypatch.setattr(
+            dynamics_model, "positive", lambda x, least=least: x if x > least else mp.mpf(0)
+        )
 
         def state_at(duration, begin=begin, y=y, steps=steps):
             for k in range(steps):

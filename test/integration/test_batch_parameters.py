@@ -17,7 +17,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.initial_states import NO_RATE
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4
 from sst_ros.integration.scenarios import Scenarios
-from sst_ros.mechanism import singularities, workspace
+from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Initial, Link, Spring
 
@@ -253,7 +253,7 @@ def test_a_singular_start_stops_no_other():
     of_odd = dataclasses.replace(scene, star=dataclasses.replace(scene.star, alpha_deg=odd))
     geometry = Geometry.of(of_odd)
     chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
-    gamma = singularities.parallel(chart).gamma[0]
+    gamma = workspace.parallel_singularities(chart).gamma[0]
     batch = Batch(scene, RK4, parameters={"star.alpha_deg": [odd, scene.star.alpha_deg]})
     y, code = batch.start(gamma, REST)
     assert code.tolist() == [0, 0]

@@ -12,8 +12,7 @@ import pytest
 from loaded_scenes import IGNORE, loaded, viscous
 from models import seeded_samples
 
-from sst_ros.dynamics.differentiation import with_jacobian
-from sst_ros.dynamics.expression import trace
+from sst_ros.dynamics.expression import trace, with_jacobian
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration import codegen

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mechanism.closed_chains import random_geometry, random_mechanism, random_pose
 
 from sst_ros.mechanism import continuation, rates, virtual_work
-from sst_ros.mechanism.equation_of_motion import EquationOfMotion
+from sst_ros.mechanism.virtual_work import EquationOfMotion
 
 
 @settings(max_examples=80)

@@ -18,7 +18,7 @@ from lagrange import OUTER, Lagrange, columns, times
 from models import FAST, inertia_of, samples, seeded_samples
 from mpmath import mp, mpf
 
-from sst_ros.dynamics import energy, kernel
+from sst_ros.dynamics import kernel
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.scene.scene import Link
@@ -95,7 +95,7 @@ def test_kinetic_energy_is_that_of_t1(sample):
     t1, _ = virtual_work.equation_of_motion(sample.mechanism, sample.posture, sample.gamma_dot)
     truth = -sample.gamma_dot @ t1 @ sample.gamma_dot / 2.0
     size = np.abs(t1).max() * (sample.gamma_dot @ sample.gamma_dot)
-    agree(energy.kinetic(sample.model, sample.state), truth, size)
+    agree(kernel.kinetic_energy(sample.model, sample.state), truth, size)
 
 
 @FAST
@@ -129,7 +129,7 @@ def by_complex_step(sample):
     """dT/dt along the motion, exact to rounding: Im T(y + i h y') / h with tiny h."""
     rates = kernel.derivative(sample.model, sample.state, tuple(sample.torque.tolist()))
     moved = [y + 1j * TINY * rate for y, rate in zip(sample.state, rates, strict=True)]
-    return energy.kinetic(sample.model, tuple(moved)).imag / TINY
+    return kernel.kinetic_energy(sample.model, tuple(moved)).imag / TINY
 
 
 @FAST

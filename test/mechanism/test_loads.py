@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from models import FAST, samples, seeded_samples
 
-from sst_ros.dynamics import energy, kernel, loads, model
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.model import friction_torque, loads_of_leg, stop_torque
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
 from sst_ros.scene.bodies import Inertia, Link, Payload
@@ -68,8 +69,10 @@ def test_energy_changes_by_the_power_put_in(sample, number):
     state, torque = sample.state, tuple(sample.torque)
     rate = kernel.derivative(model, state, torque)
     moved = [complex(x, STEP * dx) for x, dx in zip(state, rate, strict=True)]
-    change = np.imag(energy.kinetic(model, moved) + energy.potential(model, moved)) / STEP
-    power = energy.power(model, state, torque)
+    change = (
+        np.imag(kernel.kinetic_energy(model, moved) + kernel.potential_energy(model, moved)) / STEP
+    )
+    power = kernel.power(model, state, torque)
     scale = sum(abs(p) for p in (*np.multiply(rate[4:], 1.0), power, 1.0))
     assert change == pytest.approx(power, rel=1e-12, abs=1e-12 * scale)
 
@@ -86,7 +89,7 @@ def test_potential_energy_is_the_height_of_the_centres_of_mass(sample):
             expected -= link.mass * field @ (frame[k] @ link.centre)
     for body in (scene.star, scene.payload):
         expected -= body.mass * field @ (sample.rotation @ body.centre)
-    found = energy.potential(kernel.model_of(scene), sample.state)
+    found = kernel.potential_energy(kernel.model_of(scene), sample.state)
     assert found == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
@@ -184,12 +187,12 @@ def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
 def test_elastic_ends_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
     scene = only(sample, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
-    stops = model.loads_of_leg(scene, sample.geometry, 0).stops
-    assert loads.stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
-    assert loads.stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
-    assert loads.stop_torque(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)
-    assert loads.stop_torque(stops, -0.01, -0.1) == pytest.approx(1.5)
-    assert loads.stop_torque(stops, -0.01, 10.0) == 0.0
+    stops = loads_of_leg(scene, sample.geometry, 0).stops
+    assert stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
+    assert stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
+    assert stop_torque(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)
+    assert stop_torque(stops, -0.01, -0.1) == pytest.approx(1.5)
+    assert stop_torque(stops, -0.01, 10.0) == 0.0
 
 
 @pytest.mark.parametrize("v", [-2.0, -0.05, 0.0, 0.003, 0.4])
@@ -197,9 +200,9 @@ def test_friction_is_the_documented_torque_of_its_rate(v):
     friction = Friction(viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01)
     fading = 0.2 + 0.3 * np.exp(-((v / 0.1) ** 2))
     expected = 0.3 * v + fading * np.tanh(v / 0.01)
-    assert loads.friction_torque(friction, v) == pytest.approx(expected, rel=1e-14)
-    assert loads.friction_torque(friction, -v) == -loads.friction_torque(friction, v)
-    assert loads.friction_torque(friction, v) * v >= 0.0
+    assert friction_torque(friction, v) == pytest.approx(expected, rel=1e-14)
+    assert friction_torque(friction, -v) == -friction_torque(friction, v)
+    assert friction_torque(friction, v) * v >= 0.0
 
 
 def test_springs_at_one_joint_add_up():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanism.closed_chains import random_geometry, random_mechanism, random_pose, random_rotation
 
-from sst_ros.mechanism import reactions, virtual_work
+from sst_ros.mechanism import rates, virtual_work
 
 RELATIVE = 1e-10
 BODIES = 7  # actuated 0 to 2, intermediate 3 to 5, star 6; the base is None
@@ -80,7 +80,7 @@ def test_constraint_moments_are_the_multipliers(seed):
     mechanism, gamma, rotation, rate, torque, moment = case(seed)
     _, expected, frames = newton_euler(mechanism, gamma, rotation, rate, torque, moment)
     at = virtual_work.posture(mechanism.geometry, gamma, rotation)
-    found = reactions.of_torque(mechanism, at, rate, torque, moment)
+    found = rates.of_torque(mechanism, at, rate, torque, moment)
     moments = np.concatenate([found.actuated, found.revolute, found.prismatic])
     assert np.linalg.norm(moments - expected) <= RELATIVE * np.linalg.norm(expected)
     local = [found.actuated_local, found.revolute_local, found.prismatic_local]
@@ -109,9 +109,9 @@ def test_the_star_is_in_balance_and_motion_and_torque_agree():
     for seed in range(10):
         mechanism, gamma, rotation, rate, torque, moment = case(seed)
         at = virtual_work.posture(mechanism.geometry, gamma, rotation)
-        first = reactions.of_torque(mechanism, at, rate, torque, moment)
+        first = rates.of_torque(mechanism, at, rate, torque, moment)
         acceleration = virtual_work.direct_dynamics(mechanism, at, rate, torque, moment)
-        second = reactions.of_motion(mechanism, at, rate, acceleration, moment)
+        second = rates.of_motion(mechanism, at, rate, acceleration, moment)
         for name in ("actuated", "revolute", "prismatic", "torque"):
             one, two = getattr(first, name), getattr(second, name)
             assert np.linalg.norm(one - two) <= RELATIVE * max(np.linalg.norm(one), 1.0)
@@ -128,7 +128,7 @@ def test_at_rest_without_load_nothing_presses():
     geometry = random_geometry(rng)
     gamma, rotation = random_pose(rng, geometry)
     at = virtual_work.posture(geometry, gamma, rotation)
-    found = reactions.of_torque(random_mechanism(rng, geometry), at, np.zeros(3), np.zeros(3))
+    found = rates.of_torque(random_mechanism(rng, geometry), at, np.zeros(3), np.zeros(3))
     assert not np.any(found.actuated) and not np.any(found.prismatic)
 
 
@@ -141,6 +141,6 @@ def test_a_static_moment_goes_through_the_legs_to_the_base():
         gamma, rotation = random_pose(rng, geometry)
         at = virtual_work.posture(geometry, gamma, rotation)
         moment = random_rotation(rng)[0]
-        found = reactions.of_motion(mechanism, at, np.zeros(3), np.zeros(3), moment)
+        found = rates.of_motion(mechanism, at, np.zeros(3), np.zeros(3), moment)
         base = found.actuated + found.torque[:, None] * geometry.w
         np.testing.assert_allclose(base.sum(axis=0), -moment, atol=1e-12)

@@ -10,7 +10,7 @@ from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_
 from models import assembly_of
 
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kinematics, singularities, virtual_work, workspace
+from sst_ros.mechanism import kinematics, virtual_work, workspace
 from sst_ros.mechanism.frames import zyz_angles
 
 
@@ -63,13 +63,13 @@ def test_the_isotropic_workspace(isotropic):
     found = isotropic.measures
     assert found.cond_j[found.admissible].max() < 2.45
     assert np.nanmin(isotropic.best_cond_j) >= 1.0
-    assert len(singularities.parallel(isotropic)) == 0
+    assert len(workspace.parallel_singularities(isotropic)) == 0
     centre = workspace.over_orientations(ISOTROPIC, [[1.0, 1.0, 1.0]], turns=720)
     np.testing.assert_allclose(np.degrees(centre.turn), 120.0, atol=0.5)
     np.testing.assert_allclose(centre.best_cond_j, 1.0, atol=1e-4)
     # Home: beta is 35.2644 deg, the ends of the stroke are 45 deg away.
     np.testing.assert_allclose(np.degrees(centre.best_margin), 35.2644, atol=1.0)
-    assert "parallel: none" in singularities.report(ISOTROPIC, isotropic)
+    assert "parallel: none" in workspace.report_singularities(ISOTROPIC, isotropic)
 
 
 def test_a_quarter_of_the_isotropic_gamma_cube_is_empty():
@@ -97,7 +97,7 @@ def test_of_several_admissible_assemblies_the_best_conditioned_counts():
 
 def test_parallel_singularities_of_the_folding_geometry(folding):
     """v = I, alpha = 210, 75, 75 deg: tan b1 sin a2 + tan b2 sin a3 + tan b3 sin a1 = 0."""
-    poses = singularities.parallel(folding)
+    poses = workspace.parallel_singularities(folding)
     assert len(poses) > 20
     a1, a2, a3 = FOLDING.alpha
     for i in range(len(poses)):
@@ -108,11 +108,11 @@ def test_parallel_singularities_of_the_folding_geometry(folding):
         assert abs(tangents @ [np.sin(a2), np.sin(a3), np.sin(a1)]) < 1e-11
         with pytest.raises(SingularConfiguration, match="parallel"):
             virtual_work.posture(FOLDING, poses.gamma[i], poses.rotation[i])
-    assert "parallel: none" not in singularities.report(FOLDING, folding)
+    assert "parallel: none" not in workspace.report_singularities(FOLDING, folding)
 
 
 def test_serial_singularities_lie_on_the_edge():
-    poses = singularities.serial(FOLDING)
+    poses = workspace.serial_singularities(FOLDING)
     assert len(poses) > 0
     for i in range(len(poses)):
         k, rotation = poses.leg[i], poses.rotation[i]
@@ -122,7 +122,7 @@ def test_serial_singularities_lie_on_the_edge():
         assert abs(FOLDING.w[k] @ rotation[:, 2]) < 1e-14
         others = [j for j in range(3) if j != k]
         assert np.all(poses.beta[i, others] > 0)
-    assert len(singularities.serial(ISOTROPIC)) == 0
+    assert len(workspace.serial_singularities(ISOTROPIC)) == 0
 
 
 def test_directions_fill_the_triangle():

@@ -21,9 +21,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from ros.forked import ForkedNode  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
-from sst_ros.description.headers import IDLE_FRAME_ID  # noqa: E402
 from sst_ros.host import child_process  # noqa: E402
 from sst_ros.nodes import middleware  # noqa: E402
+from sst_ros.state import IDLE_FRAME_ID  # noqa: E402
 
 # A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -13,13 +13,13 @@ from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
-from sst_ros.description.headers import BASE_FRAME
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
 from sst_ros.nodes.messages import StateMessages, stamp
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import load, names
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import BASE_FRAME
 
 pytestmark = pytest.mark.ros
 CONFIG = Path(__file__).parents[2] / "config"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sst_ros.errors import InputError
-from sst_ros.scene.arcs import arc_inertia
+from sst_ros.scene.bodies import arc_inertia
 
 
 @pytest.mark.parametrize(

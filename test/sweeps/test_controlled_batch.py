@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from sst_ros import load_scene, sweep
-from sst_ros.control.controller import MODES, Controller, Measurement
-from sst_ros.control.controller_settings import ControllerSettings
+from sst_ros.control.controller import MODES, Controller, ControllerSettings, Measurement
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.sweeps.counter_noise import gaussian

@@ -16,8 +16,7 @@ from viser import (
     MeshHandle,
 )
 
-from sst_ros.description.shapes import Arc, Ball, Box, Rod, shapes
-from sst_ros.description.tree import BASE, STAR
+from sst_ros.description.tree import BASE, STAR, Arc, Ball, Box, Rod, shapes
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import load
