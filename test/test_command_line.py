@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sst_ros.__main__ import main
-from sst_ros.cli.main import COMMANDS, NODES, parser
+from sst_ros.cli.commands import COMMANDS, NODES, function, parser
 from sst_ros.simulation.trajectory import Trajectory
 
 BLOCKED = """
@@ -35,19 +35,14 @@ OPTIONAL = (
     "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba", "mpmath",
 )  # fmt: skip
 
-
-def run(*words, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "sst_ros", *words],
-        capture_output=True, text=True, timeout=60, **options,
-    )  # fmt: skip
+TOP = [name for name in COMMANDS if " " not in name]
 
 
 def test_alone_it_prints_help_with_every_command_and_node(capsys):
     assert main([]) == 0
     said = capsys.readouterr().out
     assert said.startswith("usage: sst-ros ")
-    for name in (*COMMANDS, *NODES):
+    for name in (*TOP, *NODES):
         assert f"\n    {name}" in said
 
 
@@ -136,7 +131,7 @@ def broken(options):
 
 
 def test_a_bug_is_one_line_and_a_traceback_only_on_demand(monkeypatch, capsys):
-    monkeypatch.setattr("sst_ros.cli.scene._list", broken)
+    monkeypatch.setattr("sst_ros.cli.scenes.list_all", broken)
     assert main(["scene", "list"]) == 3
     said = capsys.readouterr().err
     assert said.startswith("sst-ros: internal error, please report it with the output of --debug: ")
@@ -150,7 +145,7 @@ def interrupted(options):
 
 
 def test_an_interrupt_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("sst_ros.cli.scene._list", interrupted)
+    monkeypatch.setattr("sst_ros.cli.scenes.list_all", interrupted)
     assert main(["scene", "list"]) == 130
     assert capsys.readouterr().err == "sst-ros: interrupted\n"
 
@@ -255,11 +250,12 @@ def test_importing_the_package_imports_nothing_slow():
     assert done.stdout == "[]\n"
 
 
-def test_every_command_names_itself(capsys):
-    for name in COMMANDS:
+def test_every_command_names_itself_and_a_function_that_exists(capsys):
+    for name, entry in COMMANDS.items():
         with pytest.raises(SystemExit):
-            parser().parse_args([name, "--help"])
+            parser().parse_args([*name.split(), "--help"])
         assert capsys.readouterr().out.startswith(f"usage: sst-ros {name} ")
+        assert isinstance(entry, str) or callable(function(entry.run))
 
 
 def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsys):

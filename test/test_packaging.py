@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import sst_ros
-from sst_ros.cli.main import NODES
+from sst_ros.cli.commands import NODES
 from sst_ros.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]

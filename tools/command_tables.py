@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from sst_ros.cli.main import NODES, parser
+from sst_ros.cli.commands import NODES, parser
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 
 _COMMANDS = """# The command line

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line, one file a command; a command imports what it needs when it runs."""
+"""The command line: one table of commands, and the functions that run them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `sst-ros`: commands, nodes, and the exit status of each."""
+"""The command `sst-ros`: a command or a node is run, and its errors become an exit status."""
 
 from __future__ import annotations
 
@@ -8,38 +8,11 @@ import os
 import sys
 import traceback
 
-from sst_ros.cli.parsing import Parser
+from sst_ros.cli.commands import NODES, PROGRAM, function, parser
 from sst_ros.errors import SstError, printable
-from sst_ros.extras import explanation
-from sst_ros.version import VERSION
+from sst_ros.extras import explanation, require
 
-PROGRAM = "sst-ros"
 FAILED, BUG, INTERRUPTED = 1, 3, 130
-COMMANDS = {
-    "simulate": "motion",
-    "workspace": "scene",
-    "scene": "scene",
-    "plan": "motion",
-    "describe": "scene",
-    "compile": "scene",
-    "demo": "demo",
-    "view": "view",
-    "report": "recording",
-    "plot": "recording",
-    "export": "recording",
-    "recover": "recording",
-    "sweep": "study",
-    "identify": "identify",
-}
-"""Module that adds each command, by a function `add_COMMAND`."""
-
-NODES = {
-    "simulator": "node: integrate the equation of motion in real time",
-    "torque_player": "node: play the torques of a scene",
-    "inverse_dynamics": "node: follow a motion by feedforward and feedback",
-    "recorder": "node: record a run as a rosbag2 recording",
-    "viewer": "node: show a running simulator in a browser",
-}
 
 
 def run(words: list[str]) -> int:
@@ -59,42 +32,22 @@ def run(words: list[str]) -> int:
     return status
 
 
-def parser(only: str | None = None) -> Parser:
-    """Build the parser of all commands, or of one: to import them all takes longer than to run one.
-
-    Nodes are listed but parse their arguments themselves: a node takes those of ROS, too.
-    """
-    result = Parser(
-        prog=PROGRAM,
-        description="Simulator of the 3-RRP spherical star-triangle parallel manipulator.",
-        epilog=f"`{PROGRAM} COMMAND --help` describes a command or a node.",
-    )
-    result.add_argument("--version", action="version", version=f"{PROGRAM} {VERSION}")
-    result.add_argument("--debug", action="store_true", help="print the traceback of an error")
-    commands = result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
-    for name, module in COMMANDS.items():
-        if only in (None, name):
-            getattr(importlib.import_module(f"sst_ros.cli.{module}"), f"add_{name}")(commands)
-    for name, what in NODES.items() if only is None else ():
-        commands.add_parser(name, help=what, add_help=False)
-    return result
-
-
 def _run(words: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
     if words and words[0] in NODES:
-        from sst_ros.nodes import process
-
-        return process.run(words)
-    commands = parser(words[0] if words and words[0] in COMMANDS else None)
+        status: int = function("nodes.process:run")(words)
+        return status
+    commands = parser()
     options, unknown = commands.parse_known_args(words)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if options.command is None:
         commands.print_help()
         return 0
-    done: int | None = options.run(options)
+    for module in options.entry.needs:
+        require(module)
+    done: int | None = function(options.entry.run)(options)
     return done or 0
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from docs.blocks import ROOT, commands
 
 from docs import installed
-from sst_ros.cli.main import NODES
+from sst_ros.cli.commands import NODES
 
 PYTHONS = (".venv/bin/python", "python", "python3")
 COMMAND = "sst-ros"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
 
-from sst_ros.cli.main import NODES, parser
+from sst_ros.cli.commands import NODES, parser
 from sst_ros.host import child_process
 
 PAGES = pages()

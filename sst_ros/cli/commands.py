@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of commands: what each is for, what runs it, and its arguments.
+
+A function is named, not imported: its module, with the rooms and libraries that it uses, is
+imported when its command runs, so that `sst-ros --help` imports none of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import re
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from sst_ros.errors import InputError, Problem, printable, suggestion
+from sst_ros.host.output import require_free
+from sst_ros.version import VERSION
+
+PROGRAM = "sst-ros"
+
+
+class Argument(NamedTuple):
+    """What `argparse.ArgumentParser.add_argument` gets, and what completes it in a shell."""
+
+    name: str
+    options: dict[str, Any]
+    completer: str = ""
+
+
+class Subcommand:
+    """A command: its line of help, what runs it as `module:function`, and its arguments.
+
+    The optional modules in `needs` are looked for before the module that runs it is imported.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        run: str,
+        *arguments: Argument,
+        needs: tuple[str, ...] = (),
+        description: str | None = None,
+    ) -> None:
+        self.what, self.run, self.arguments = what, run, arguments
+        self.needs, self.description = needs, description
+
+
+def arg(name: str, what: str | None = None, **options: Any) -> Argument:
+    """Describe an argument or an option."""
+    return Argument(name, options | {"help": what})
+
+
+def flag(name: str, what: str) -> Argument:
+    """Describe an option without a value."""
+    return arg(name, what, action="store_true")
+
+
+def number(name: str, what: str, **options: Any) -> Argument:
+    """Describe an option that is a number."""
+    return arg(name, what, type=float, **options)
+
+
+def path(name: str, what: str | None = None, **options: Any) -> Argument:
+    """Describe an argument or an option that is a path."""
+    return arg(name, what, type=Path, **options)
+
+
+def scene(
+    name: str, what: str = "name of a scene, or path of a .yaml file", **options: Any
+) -> Argument:
+    """Describe an argument that is a scene, which shells complete by argcomplete."""
+    return Argument(name, options | {"help": what}, "scene.scene:names")
+
+
+def out(what: str, default: str) -> tuple[Argument, Argument]:
+    """Describe `--out` and `--force`, which `free_out` obeys."""
+    force = flag("--force", "overwrite earlier results in --out")
+    return path("--out", f"{what}; default: {default}"), force
+
+
+def integer_from(least: int, most: int) -> Any:
+    """Return a type of arguments: a whole number in a range."""
+
+    def convert(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= most:
+            allowed = f"must be a whole number from {least} to {most}, not {text!r}"
+            raise argparse.ArgumentTypeError(allowed)
+        return value
+
+    return convert
+
+
+SCENE = scene("scene", metavar="SCENE")
+BAG = path("bag", "folder of the bag", metavar="BAG")
+COMMANDS: dict[str, Subcommand | str] = {
+    "simulate": Subcommand(
+        "simulate a scene under its own torques",
+        "cli.runs:run_simulation",
+        SCENE,
+        number("--duration", "length [s]; default: that of the scene"),
+        arg("--method", "integrator; default: auto", default="auto"),
+        number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
+        arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
+        path("--out", "trajectory, .parquet or .csv", metavar="FILE"),
+        flag("--plot", "draw it; beside FILE, or as SCENE.png"),
+        flag("--force", "overwrite earlier results"),
+        description="Simulate a scene under its own torques. Exit status 1 if the motion ended "
+        "before the duration, at a limit of the scene for example.",
+    ),
+    "workspace": Subcommand(
+        "map the workspace of a scene: reach, condition, singular poses",
+        "cli.runs:map_workspace",
+        SCENE,
+        *out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
+    ),
+    "scene": "list, show and check scenes",
+    "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
+    "scene show": Subcommand(
+        "show contents, cost of a step and advice on the method", "cli.scenes:show", SCENE
+    ),
+    "scene check": Subcommand(
+        "check scene files and report all faults",
+        "cli.scenes:check_files",
+        path("files", nargs="+", metavar="FILE"),
+    ),
+    "scene schema": Subcommand("print the JSON schema, for editors", "cli.scenes:print_schema"),
+    "plan": "check a reference motion: torques, limits, shortest duration",
+    "plan check": Subcommand(
+        "check feasibility and the shortest duration; exit status 0 if feasible",
+        "cli.motions:check_plan",
+        scene("scene", "scene with a motion: name, or .yaml file", metavar="SCENE"),
+        flag("--json", "print JSON instead of a table"),
+        path("--csv", "write the torques to play", metavar="OUT"),
+        flag("--force", "overwrite the file of --csv"),
+        number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
+    ),
+    "describe": Subcommand(
+        "write a scene as URDF",
+        "cli.scenes:describe",
+        scene("--scene", default="example2", metavar="S"),
+        flag(
+            "--ros2-control",
+            "with the tag by which ros2_control drives the actuators of a running simulator",
+        ),
+    ),
+    "compile": Subcommand(
+        "compile a scene before its first fast run",
+        "cli.runs:compile_code",
+        scene("scene", nargs="?", default="example2", metavar="SCENE"),
+        arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
+    ),
+    "demo": Subcommand(
+        "run the paper's examples or a reference motion by the nodes",
+        "cli.reports:run_demo",
+        arg(
+            "kind",
+            "the paper's examples; or the node inverse_dynamics following a scene's motion",
+            nargs="?",
+            choices=("examples", "feedforward"),
+            default="examples",
+        ),
+        *out("folder of the results", "demo_out or demo_out/feedforward"),
+        scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
+        arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
+        needs=("rclpy", "rosbags", "matplotlib"),
+    ),
+    "view": Subcommand(
+        "show the manipulator in a browser, live or from a bag",
+        "cli.runs:view",
+        path("bag", "folder of a bag to play", nargs="?"),
+        scene("--scene", "start a simulator of this scene to look at", metavar="S"),
+        arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
+        arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
+        arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
+        arg(
+            "--port",
+            "port; the next free one is taken",
+            type=integer_from(1024, 65535),
+            default=8080,
+        ),
+        flag("--open", "open it, where there is a desktop"),
+        needs=("viser",),
+        description="Show a running simulator, one that is started for it (--scene), or a bag.",
+    ),
+    "report": "evaluate a recorded run or the integration methods",
+    "report run": Subcommand(
+        "evaluate a recorded run",
+        "cli.reports:report_run",
+        BAG,
+        *out("folder of the results", "BAG_report, beside the bag"),
+        flag("--verbose", "print all figures"),
+        flag("--damaged", "evaluate the intact part of a damaged recording"),
+    ),
+    "report accuracy": Subcommand(
+        "work-precision diagrams: error against cost of every method and step",
+        "cli.reports:report_accuracy",
+        scene("--scene", "names, or paths of .yaml files; default: all", nargs="+", metavar="S"),
+        flag("--all", "all shipped scenes, the default"),
+        *out("folder of the results", "accuracy_out"),
+        flag("--mpmath", "reference in 30 digits, slow"),
+    ),
+    "plot": Subcommand(
+        "draw recorded runs, as PDF and PNG",
+        "cli.reports:draw_pictures",
+        path("bags", "folder of the bag", nargs="*", metavar="BAG"),
+        *out("folder of the pictures", "BAG_plots, beside the first bag"),
+        arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
+        flag("--list", "list the pictures, and draw none"),
+        path(
+            "--compare",
+            "overlay runs and print their differences from the first",
+            nargs="+",
+            default=[],
+            metavar="BAG",
+        ),
+    ),
+    "export": Subcommand(
+        "write a recorded run as CSV or Parquet",
+        "cli.recordings:write_tables",
+        BAG,
+        arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
+        *out("folder of the tables", "BAG_tables, beside the bag"),
+    ),
+    "recover": Subcommand(
+        "write a valid recording from a truncated or damaged one",
+        "cli.recordings:write_recovered",
+        BAG,
+        path("--out", "folder of the new bag; default: beside the old"),
+    ),
+    "sweep": Subcommand(
+        "many runs of a scene with varied numbers",
+        "cli.motions:run_sweep",
+        path("study", "study as a .yaml file; or the word plot", metavar="STUDY"),
+        path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
+        path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
+        arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
+        arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
+        flag("--resume", "compute only the chunks that are missing in --out"),
+        description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
+    ),
+    "identify": Subcommand(
+        "identify inertias, friction and more from a recorded run; design excitation motions",
+        "cli.motions:run_identification",
+        arg("bag", "folder of the bag, or the word design", metavar="BAG"),
+        scene(
+            "designed",
+            "after design: the scene to make a motion for, about its initial pose",
+            nargs="?",
+            metavar="SCENE",
+        ),
+        scene(
+            "--scene",
+            "what is known, and the values to start from; default: the recorded scene",
+            metavar="S",
+        ),
+        arg(
+            "--parameters",
+            "unknowns by the beginning of their names, as in: star friction.gamma offset; "
+            "default: bodies, friction, springs and rotors of the scene; by simulation full names, "
+            "as in: friction.gamma.smoothing stroke.restitution",
+            nargs="+",
+            metavar="P",
+        ),
+        arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
+        number(
+            "--cutoff",
+            "of the zero-phase filter of measured angles; default: none, rates as recorded",
+            metavar="HZ",
+        ),
+        number("--delay", "by which measured torques come late; default: 0", metavar="SECONDS"),
+        number("--duration", "of a designed motion [s]; default: 6"),
+        arg("--harmonics", "of a designed motion; default: 5", type=int),
+        arg("--seed", "of a designed motion; default: 0", type=int),
+        path("--out", "write the scene", metavar="SCENE.yaml"),
+        flag("--force", "overwrite the file of --out"),
+        description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
+        "what the motion determines, with standard deviations, and the nearest scene whose bodies "
+        "can exist. With --method simulation the motion is integrated and fitted to the recorded "
+        "angles, by any numbers of the scene. `identify design SCENE` makes a motion that "
+        "determines the parameters well, within stroke, workspace and the limits of the actuators.",
+    ),
+}
+"""A word names a group of commands."""
+
+NODES = {
+    "simulator": "node: integrate the equation of motion in real time",
+    "torque_player": "node: play the torques of a scene",
+    "inverse_dynamics": "node: follow a motion by feedforward and feedback",
+    "recorder": "node: record a run as a rosbag2 recording",
+    "viewer": "node: show a running simulator in a browser",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors suggest the nearest command, option or choice."""
+
+    def __init__(self, **options: Any) -> None:
+        options.setdefault("allow_abbrev", False)
+        super().__init__(**options)
+        self.set_defaults(parser=self)  # that of the innermost command remains
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the error, and exit with status 2."""
+        super().error(printable(message) + self._suggestion(message))
+
+    def _suggestion(self, message: str) -> str:
+        wrong = re.search(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message)
+        if wrong is None:
+            return ""
+        known = [str(choice) for action in self._actions for choice in action.choices or ()]
+        known += self._option_string_actions
+        return suggestion(wrong[1] or wrong[2].partition("=")[0], known)
+
+
+def parser() -> Parser:
+    """Build the parser of all commands.
+
+    Nodes are listed but parse their arguments themselves: a node takes those of ROS, too.
+    """
+    result = Parser(
+        prog=PROGRAM,
+        description="Simulator of the 3-RRP spherical star-triangle parallel manipulator.",
+        epilog=f"`{PROGRAM} COMMAND --help` describes a command or a node.",
+    )
+    result.add_argument("--version", action="version", version=f"{PROGRAM} {VERSION}")
+    result.add_argument("--debug", action="store_true", help="print the traceback of an error")
+    groups = {"": result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)}
+    for name, entry in COMMANDS.items():
+        group, _, last = name.rpartition(" ")
+        if isinstance(entry, str):
+            below = groups[group].add_parser(last, help=entry)
+            groups[name] = below.add_subparsers(dest="kind", required=True, metavar="KIND")
+            continue
+        command = groups[group].add_parser(last, help=entry.what, description=entry.description)
+        command.set_defaults(entry=entry)
+        for each in entry.arguments:
+            action: Any = command.add_argument(each.name, **each.options)
+            if each.completer:
+                action.completer = lambda names=each.completer, **_: function(names)()
+    for name, what in NODES.items():
+        groups[""].add_parser(name, help=what, add_help=False)
+    return result
+
+
+def function(name: str) -> Any:
+    """Import the function that `module:function` names."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(f"sst_ros.{module}"), attribute)
+
+
+def free_out(options: argparse.Namespace, default: str | Path) -> Path:
+    """Return the path of `--out`, or the default, if nothing there would be overwritten.
+
+    Raises:
+        InputError: there are earlier results, and `--force` is not given.
+
+    """
+    out = options.out or Path(default)
+    return require_free(out, options.command, force=getattr(options, "force", False))
+
+
+def refuse(options: argparse.Namespace, option: str, value: object, allowed: str) -> NoReturn:
+    """Refuse the value of an option.
+
+    Raises:
+        InputError: always.
+
+    """
+    raise InputError(options.command, [Problem(option, value, allowed)])

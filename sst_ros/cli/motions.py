@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands on motions of a scene: a plan of one, a sweep of many, identification by one."""
+
+from __future__ import annotations
+
+import argparse
+
+from sst_ros.cli.commands import free_out, function
+from sst_ros.control.plan import examine
+from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.time_scaling import as_json, table, time_scaling, write_torques
+from sst_ros.errors import InputError, Problem
+from sst_ros.host.output import require_free, writing
+from sst_ros.identification.excitation import design
+from sst_ros.identification.identify import identify
+from sst_ros.recording.recorded_motion import samples
+from sst_ros.scene.scene import load
+from sst_ros.scene.yaml_document import dump
+from sst_ros.sweeps.cluster_engine import connect
+from sst_ros.sweeps.parts import read_sweep
+from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.sweeps.sweep_summary import summary
+
+PLOT, DESIGN = "plot", "design"
+"""Words in place of a study and of a bag."""
+
+
+def check_plan(options: argparse.Namespace) -> int:
+    """Print what a reference motion requires; write the torques that follow it."""
+    if not 1e-9 <= options.period < float("inf"):
+        problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
+        raise InputError("plan check", [problem])
+    if options.csv is not None:
+        require_free(options.csv, "plan check", force=options.force, option="--csv")
+    scene = load(options.scene)
+    plan = examine(reference_motion(scene, samples), scene)
+    write = as_json if options.json else table
+    print(write(plan, time_scaling(plan)).rstrip())
+    if options.csv is not None:
+        write_torques(plan, options.csv, options.period)
+    return 1 if plan.problems else 0
+
+
+def run_sweep(options: argparse.Namespace) -> None:
+    """Run a study of many runs, or draw the results of one."""
+    if str(options.study) == PLOT:
+        _draw_sweep(options)
+        return
+    if options.folder is not None:
+        options.parser.error("DIR is an argument of `sweep plot`; give --out DIR")
+    if options.scheduler and options.workers:
+        options.parser.error("--workers is for this machine; a scheduler has workers of its own")
+    out = options.out or options.study.with_name(f"{options.study.stem}_sweep")
+    if not options.resume:
+        free_out(options, out)
+    study = SweepStudy.read(options.study)
+    client = connect(options.scheduler) if options.scheduler else None
+    try:
+        found = run_study(
+            study, out, client=client, workers=options.workers or 0, resume=options.resume
+        )
+    finally:
+        if client is not None:
+            client.close(timeout=5)
+    print(summary(found))
+    print(f"Results in {out}; `sst-ros sweep plot {out}` draws them.")
+
+
+def _draw_sweep(options: argparse.Namespace) -> None:
+    if options.folder is None or options.scheduler or options.workers or options.resume:
+        options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
+    draw = function("sweeps.sweep_pictures:draw")  # Matplotlib, which a sweep does not need
+    for path in draw(read_sweep(options.folder), options.out or options.folder):
+        print(path)
+
+
+def run_identification(options: argparse.Namespace) -> None:
+    """Identify a scene from a recorded run, or design a motion that determines its parameters."""
+    designing = options.bag == DESIGN
+    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
+    form = DESIGN if designing else "BAG"
+    wrong = [
+        Problem(f"--{name}", getattr(options, name), f"is no option of identify {form}")
+        for name in (others if designing else ours)
+        if getattr(options, name) is not None
+    ]
+    if designing != (options.designed is not None):
+        allowed = "must be given after design, and only there"
+        wrong.append(Problem("SCENE", options.designed, allowed))
+    if wrong:
+        raise InputError("identify", wrong)
+    if options.out is not None:
+        free_out(options, options.out)
+    names = ours if designing else others
+    chosen = {name: value for name in names if (value := getattr(options, name)) is not None}
+    if designing:
+        motion = design(load(options.designed), options.parameters, **chosen)
+        lines, scene = motion.table(), motion.scene
+    else:
+        found = identify(options.bag, parameters=options.parameters, **chosen)
+        lines, scene = found.table(), found.scene
+    print(lines, end="")
+    if options.out is not None:
+        with writing(options.out.parent, "identify"):
+            options.out.write_text(dump(scene), encoding="utf-8")
+        print(f"wrote {options.out}")

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that evaluate and draw: recorded runs, the integration methods, the demo."""
+
+from __future__ import annotations
+
+import argparse
+
+from sst_ros import demo
+from sst_ros.cli.commands import free_out, refuse
+from sst_ros.control.controller import MODES
+from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.host.output import results_folder
+from sst_ros.plot import compare, pictures
+from sst_ros.recording import signals
+from sst_ros.report import accuracy
+from sst_ros.report.reference_solution import EXTENDED, MPMATH
+from sst_ros.report.run import report
+from sst_ros.report.text import table, text
+from sst_ros.scene.scene import names
+
+
+def report_run(options: argparse.Namespace) -> None:
+    """Evaluate a recorded run."""
+    out = free_out(options, results_folder(options.bag, "report"))
+    summary = report(options.bag, out, damaged=options.damaged)
+    if options.verbose:
+        print(table(summary))
+    print(text(summary, str(out)), end="")
+
+
+def report_accuracy(options: argparse.Namespace) -> None:
+    """Measure the error and the run time of every method."""
+    out = free_out(options, "accuracy_out")
+    kind = MPMATH if options.mpmath else EXTENDED
+    scenes = names() if options.all else options.scene or names()
+    accuracy.report(scenes, out, kind=kind)
+
+
+def draw_pictures(options: argparse.Namespace) -> int:
+    """Draw recorded runs, or list the pictures."""
+    if options.list:
+        for name, picture in pictures.PICTURES.items():
+            print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
+        print(f"{'with --compare':<18}{', '.join(compare.PICTURES)}")
+        return 0
+    bags = [*options.bags, *options.compare]
+    if not bags or (len(bags) > 1 and not options.compare):
+        options.parser.error("name one BAG, or several with --compare")
+    out = free_out(options, results_folder(bags[0], "plots"))
+    runs = [signals.read(bag) for bag in bags]
+    if options.compare:
+        print(compare.table(runs))
+        paths, missing = compare.draw(runs, out, options.only)
+    else:
+        paths, missing = pictures.draw(runs[0], out, options.only)
+    for path in paths:
+        print(path)
+    for name, why in missing.items():
+        print(f"{name}: {why}")
+    return 0 if paths else 1
+
+
+def run_demo(options: argparse.Namespace) -> int:
+    """Run the paper's examples by the nodes, or follow a motion."""
+    if options.kind != "feedforward":
+        given = {"--scene": options.scene, "--mode": options.mode}
+        allowed = "is an option of `demo feedforward`"
+        if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
+            raise InputError("demo", wrong)
+        return demo.demo(free_out(options, "demo_out"))
+    for mode in options.mode or ():
+        if mode not in MODES:
+            allowed = f"must be one of {', '.join(MODES)}{suggestion(mode, MODES)}"
+            refuse(options, "--mode", mode, allowed)
+    out = free_out(options, "demo_out/feedforward")
+    return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that run a scene or map it: motion, compiled code, workspace, view in the browser.
+
+Matplotlib and the page are imported by name where they are asked for: the rest runs without them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from sst_ros.cli.commands import free_out, function, refuse
+from sst_ros.errors import SstError, suggestion
+from sst_ros.extras import require
+from sst_ros.host import child_process
+from sst_ros.host.cache_folder import cache_folder, configured_folder
+from sst_ros.host.output import require_free
+from sst_ros.integration import code_cache, codegen
+from sst_ros.mechanism import workspace
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import load
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulation import INTEGRATORS
+from sst_ros.view.source import Replay, simulator
+
+PICTURES = (".png", ".pdf", ".svg")
+TABLES = (".parquet", ".csv")
+MOST_SAMPLES = 10_000_000
+
+
+def compile_code(options: argparse.Namespace) -> None:
+    """Compile the code of a scene into the cache."""
+    if options.integrator not in INTEGRATORS:
+        allowed = f"must be one of {', '.join(INTEGRATORS)}"
+        allowed += suggestion(options.integrator, INTEGRATORS)
+        refuse(options, "--integrator", options.integrator, allowed)
+    if codegen.numba_version() is None:
+        require("numba")
+        raise SstError("numba is switched off by SST_ROS_NUMBA=0")
+    if (folder := cache_folder()) != configured_folder():
+        raise SstError("compiled code would not be kept; see the warning above")
+    simulated = load(options.scene)
+    for method in code_cache.make(simulated, options.integrator):
+        print(f"{method}: compiled, in {folder}", flush=True)
+    if not code_cache.is_there(simulated, options.integrator):
+        raise SstError("another process is compiling: try again when it has ended")
+
+
+def map_workspace(options: argparse.Namespace) -> None:
+    """Draw the workspace of a scene and print its singular poses."""
+    scene = load(options.scene)
+    out = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
+    if out.suffix not in PICTURES:
+        refuse(options, "--out", str(out), f"must end in {' or '.join(PICTURES)}")
+    free_out(options, out)
+    require("matplotlib")
+    geometry = Geometry.of(scene)
+    directions, _ = workspace.triangle_directions(geometry, divisions=60)
+    chart = workspace.over_orientations(geometry, directions, turns=180, progress=True)
+    print(workspace.report_singularities(geometry, chart))
+    figure = function("plot.workspace:plot_workspace")(chart, titles=[scene.name])
+    function("plot.style:save_figure")(figure, out)
+    print(out)
+
+
+def run_simulation(options: argparse.Namespace) -> int:
+    """Simulate a scene; write and draw its trajectory."""
+    out, picture = options.out, None
+    if out is not None:
+        if out.suffix not in TABLES:
+            refuse(options, "--out", str(out), f"must end in {' or '.join(TABLES)}")
+        free_out(options, out)
+        require("pyarrow" if out.suffix == ".parquet" else "pandas")
+    if options.samples is not None and not 1 <= options.samples <= MOST_SAMPLES:
+        allowed = f"must be a whole number from 1 to {MOST_SAMPLES}"
+        refuse(options, "--samples", options.samples, allowed)
+    if options.plot:
+        picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
+        require_free(picture, "simulate", force=options.force)
+        require("matplotlib")
+    trajectory = simulate(
+        options.scene,
+        duration=options.duration,
+        method=options.method,
+        tolerance=options.tolerance,
+        progress=True,
+    )
+    if options.samples is not None:
+        begin, end = trajectory.t[0], trajectory.t[-1]
+        trajectory = trajectory.at(np.linspace(begin, end, options.samples + 1))
+    gamma = ", ".join(f"{angle:.9f}" for angle in trajectory.gamma[-1])
+    print(f"{trajectory.scene.name}: {trajectory.message}")
+    print(f"simulated        {trajectory.t[-1]:.9g} s, {len(trajectory)} samples")
+    print(f"method           {trajectory.method}")
+    print(f"gamma at the end {gamma} rad")
+    print(f"error estimate   {trajectory.error_estimate:.1e} rad")
+    print(f"energy residual  {trajectory.energy_residual:.1e} J")
+    print(f"loop closure     {trajectory.closure_error:.1e}")
+    if out is not None:
+        if out.suffix == ".csv":
+            trajectory.to_pandas().to_csv(out, index=False)
+        else:
+            trajectory.save(out, overwrite=options.force)
+        print(out)
+    if picture is not None:
+        function("plot.style:save_figure")(trajectory.plot(), picture)
+        print(picture)
+    return 0 if trajectory.success else 1
+
+
+def view(options: argparse.Namespace) -> int:
+    """Serve the page of a bag, of a running simulator, or of one that is started for it."""
+    if options.bag is not None and options.scene is not None:
+        refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
+    if options.bag is not None:
+        return _replay(options)
+    require("rclpy")
+    if options.scene is None:
+        return _view_live(options)
+    load(options.scene)
+    with simulator(options.scene):
+        return _view_live(options)
+
+
+def _view_live(options: argparse.Namespace) -> int:
+    given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
+    space = f"__ns:={options.namespace}"
+    status: int = function("nodes.process:run")(
+        ["viewer", "--ros-args", "-r", space, *child_process.words(given)]
+    )
+    return status
+
+
+def _replay(options: argparse.Namespace) -> int:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    page = function("view.page:Page")(Replay(options.bag), options.host, options.port)
+    page.announce(opened=options.open)
+    while not stop.wait(1.0):  # a wait without end could not be interrupted
+        pass
+    page.close()
+    return 0
