@@ -1,34 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control loop: a controller, a plant and the channel between them, in lockstep.
+"""A control loop in lockstep, what may be wrong with it, and how fast it may be.
 
-The channel has encoders, noise and a delay of commands.
+A controller has a model of the plant, which may be wrong, and a channel to it, with encoders, noise
+and a delay of commands. The largest stable bandwidth of computed torque is found by bisection,
+beside the theory of `sampled_data`.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.controller import Controller, ControllerSettings, ControlStopped, Measurement
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
+from sst_ros.scene.yaml_document import from_values, values_of
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
+from studies.sampled_data import largest_stable, stability_limit
 
 WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
 
 EXACT_TOLERANCE = 1e-13
 """Local error of the simulation whose torques are a function of time."""
 
+OFFSET = 1e-8
+"""Error at the start [rad] of a search for a limit: so small that the plant is linear around it."""
+
+SHARE = 0.2
+"""Part by which the model's bodies are too heavy or too light."""
+
 _SAMPLES = 20
+_TICKS, _TICKS_OF_DELAY = 600, 200
+_FIRST, _FACTOR, _ACCURACY = 0.5, 1.15, 2e-3
+_GONE, _LOST = 1e-3, 1e2 * OFFSET
 
 
 @dataclass(frozen=True)
@@ -103,6 +118,57 @@ def _counted(angle: float, step: float) -> float:
 
 
 @dataclass(frozen=True)
+class ModelError:
+    """One error of a controller.
+
+    Attributes:
+        name: its name in tables.
+        model: the controller's model, of the plant's scene.
+        channel: what stands between the plant and the controller.
+
+    """
+
+    name: str
+    model: Callable[[Scene], Scene] = lambda scene: scene
+    channel: Channel = field(default_factory=Channel)
+
+    def changes(self, plant: Scene) -> bool:
+        """Whether this plant can have it: friction that is not there cannot be unknown."""
+        return self.channel != Channel() or self.model(plant) != plant
+
+
+def make_heavier(scene: Scene, factor: float) -> Scene:
+    """Return a scene whose bodies weigh `factor` times as much, in the same places.
+
+    Masses and inertias go together: a mass that does not fit its inertia is no rigid body. So
+    every torque of inertia and of weight is `factor` times as large.
+    """
+    document = values_of(scene)
+    bodies = [document["star"], *document["actuated_links"], *document["intermediate_links"]]
+    for body in [*bodies, *filter(None, [document.get("payload")])]:
+        body["mass"] *= factor
+        for part in body.get("inertia", ()):
+            body["inertia"][part] *= factor
+    if "actuators" in document:
+        document["actuators"]["rotor_inertia"] *= factor
+    return from_values(Scene, document, scene.name)
+
+
+def model_errors() -> Iterator[ModelError]:
+    """Yield every error that is studied, none first."""
+    yield ModelError("nominal")
+    yield ModelError(f"inertia +{SHARE:.0%}", partial(make_heavier, factor=1.0 + SHARE))
+    yield ModelError(f"inertia -{SHARE:.0%}", partial(make_heavier, factor=1.0 - SHARE))
+    yield ModelError("friction unknown", partial(replace, friction=None))
+    yield ModelError("gravity missing", partial(replace, gravity=None))
+    for delay in range(1, 6):
+        yield ModelError(f"delay {delay}", channel=Channel(delay=delay))
+    for counts in (65536, 16384):
+        yield ModelError(f"encoder {counts}", channel=Channel(counts=counts))
+    yield ModelError("noise", channel=Channel(noise=(1e-4, 1e-2)))
+
+
+@dataclass(frozen=True)
 class ControlLoop:
     """A controller and a plant.
 
@@ -157,13 +223,13 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
             measured = Measurement(*channel.measure(joints.gamma, joints.gamma_dot))
             command = controller.command(time, measured)
             torque = channel.delayed(command.torque)
-            wanted = command.desired
+            desired = command.desired
             rows.append(
-                (time, *wanted.gamma, *wanted.gamma_dot, *joints.gamma, *joints.gamma_dot,
+                (time, *desired.gamma, *desired.gamma_dot, *joints.gamma, *joints.gamma_dot,
                  *command.feedforward, *command.feedback, *torque)
             )  # fmt: skip
             limited.append(command.saturated)
-            if math.dist(wanted.gamma, joints.gamma) > loop.lost:
+            if math.dist(desired.gamma, joints.gamma) > loop.lost:
                 raise ControlStopped(f"off by more than {loop.lost:g} rad", time)
         except (RunStopped, ControlStopped) as error:
             failure = str(error)
@@ -211,9 +277,61 @@ def unheld_error(scene: Scene, motion: ReferenceMotion) -> tuple[float, float]:
         at_start(scene, motion), "dop853", tolerance=EXACT_TOLERANCE,
         step_budget=WHOLE_MOTION_BUDGET,
     )  # fmt: skip
-    worst, step = 0.0, round(motion.duration * NANOSECONDS / _SAMPLES)
+    largest, step = 0.0, round(motion.duration * NANOSECONDS / _SAMPLES)
     for _ in range(_SAMPLES):
         state = simulation.step(torque, step)
-        wanted = motion.at(state.time_ns / NANOSECONDS).gamma
-        worst = max(worst, float(np.abs(np.subtract(wanted, state.joints.gamma)).max()))
-    return worst, simulation.error_estimate
+        desired = motion.at(state.time_ns / NANOSECONDS).gamma
+        largest = max(largest, float(np.abs(np.subtract(desired, state.joints.gamma)).max()))
+    return largest, simulation.error_estimate
+
+
+class RestMotion(ReferenceMotion):
+    """A motion that stays where another one begins."""
+
+    def __init__(self, motion: ReferenceMotion, duration: float) -> None:
+        super().__init__(duration, (0.0, duration))
+        start, zero = motion.at(0.0), (0.0, 0.0, 0.0)
+        self._pose = Reference(start.quaternion, zero, zero, start.gamma, zero, zero)
+
+    def _inside(self, time: float) -> Reference:
+        return self._pose
+
+
+def ideal_plant(scene: Scene) -> Scene:
+    """Return the plant of the theory: no friction, which acts between samples too, and no lag."""
+    actuators = scene.actuators
+    if actuators is not None:
+        # A limit that is never met: actuators that change nothing are refused.
+        actuators = replace(actuators, torque_limit=1e6, time_constant=None)
+    return replace(scene, friction=None, actuators=actuators)
+
+
+def bandwidth_in_theory(loop: ControlLoop) -> float:
+    """Return the limit of the sampled double integrator, `stability_limit` [rad/s]."""
+    limit = stability_limit(loop.settings.damping_ratio, loop.channel.delay)
+    return limit * NANOSECONDS / loop.period_ns
+
+
+def bandwidth_limit(loop: ControlLoop) -> float:
+    """Find the largest stable bandwidth [rad/s] in mode computed_torque by bisection.
+
+    The pose at the start of the motion is held at rest; the model is exact.
+    """
+    first = _FIRST * bandwidth_in_theory(loop)
+    return largest_stable(lambda bandwidth: is_stable(loop, bandwidth), first, _FACTOR, _ACCURACY)
+
+
+def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
+    """Return whether a small error is less in the last quarter of a run than in the second."""
+    ticks = _TICKS + _TICKS_OF_DELAY * loop.channel.delay
+    rest = RestMotion(loop.motion, ticks * loop.period_ns / NANOSECONDS)
+    settings = replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
+    held = replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)
+    track, _, failure = run_loop(held)
+    if failure:
+        return False
+    second, last = (
+        float(np.sqrt(np.mean(track.error[part] ** 2)))
+        for part in (slice(ticks // 4, ticks // 2), slice(3 * ticks // 4, None))
+    )
+    return last < max(second, _GONE * OFFSET)

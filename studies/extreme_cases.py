@@ -22,6 +22,7 @@ from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import Vector3
 from studies.extreme_scenes import (
     BREAKAWAY,
     CREEP_PUSH,
@@ -35,7 +36,6 @@ from studies.extreme_scenes import (
     RIGHT,
     Changes,
     SampledPd,
-    Triple,
     at_edge,
     at_largest_beta,
     at_the_pole,
@@ -56,7 +56,7 @@ from studies.extreme_scenes import (
     start,
 )
 
-Torque = Triple | Callable[[int, Any], Triple]
+Torque = Vector3 | Callable[[int, Any], Vector3]
 
 LOOSE = 1e-6
 """Tolerance of the run whose error estimate is checked."""
@@ -116,7 +116,7 @@ class Case:
         """Make the scene."""
         return changed(self.changes() if callable(self.changes) else self.changes, self.base)
 
-    def torque_at(self, simulation: Simulation) -> Triple:
+    def torque_at(self, simulation: Simulation) -> Vector3:
         """Return the torques of the control period that begins now [N m]."""
         if not callable(self.torque):
             return self.torque

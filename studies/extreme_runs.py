@@ -37,8 +37,8 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_of
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import Vector3
 from studies.extreme_cases import Case, apart
-from studies.extreme_scenes import Triple
 from studies.loop_runs import run_in_loop
 
 LOOSER = 1e-4
@@ -352,7 +352,7 @@ def compare_row(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bo
     return ("bits and end" if agree else "another end than the simulation"), agree
 
 
-def _spans(case: Case) -> Iterator[tuple[int, int, Triple]]:
+def _spans(case: Case) -> Iterator[tuple[int, int, Vector3]]:
     """Yield first step, number of steps and torque of the spans of constant torque."""
     if callable(case.torque):
         for k in range(case.steps):

@@ -19,21 +19,21 @@ from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import Vector3
 from studies.sampled_data import pole
 
-Triple = tuple[float, float, float]
 Changes = Mapping[str, Any]
 
 MS = 1_000_000
 RIGHT, QUARTER = math.pi / 2, math.pi / 4
-REST: Triple = (0.0, 0.0, 0.0)
-PUSH: Triple = (0.4, 0.5, 0.3)
-POSE: Triple = (0.7, 0.8, 0.75)
+REST: Vector3 = (0.0, 0.0, 0.0)
+PUSH: Vector3 = (0.4, 0.5, 0.3)
+POSE: Vector3 = (0.7, 0.8, 0.75)
 UNBOUNDED: Changes = {"workspace": {"at_edge": "ignore"}}
 FREE: Changes = {"stroke": {"at_end": "ignore"}, **UNBOUNDED}
 SINGULAR: Changes = {**FREE, "star.alpha_deg": (210, 75, 75)}
 """Parallel singularities inside the workspace, limits ignored."""
-RESTS: Triple = (0.9, 0.7, 0.8)
+RESTS: Vector3 = (0.9, 0.7, 0.8)
 """Where the springs of `sprung` hold the actuators [rad]."""
 BREAKAWAY, CREEP_PUSH = 2.0, (0.3, 0.4, 0.2)
 """Static friction, and torques below it [N m]."""
@@ -44,7 +44,9 @@ def changed(changes: Changes, base: str = "example2_heavy") -> Scene:
     return load(base).with_values(changes)
 
 
-def start(gamma: Triple, gamma_dot: Triple = REST, orientation: ArrayLike | None = None) -> Changes:
+def start(
+    gamma: Vector3, gamma_dot: Vector3 = REST, orientation: ArrayLike | None = None
+) -> Changes:
     """Start at angles [rad] and rates [rad/s], in an assembly near an orientation."""
     initial: dict[str, Any] = {"gamma": gamma, "gamma_dot": gamma_dot}
     return {"initial": initial if orientation is None else {**initial, "orientation": orientation}}
@@ -158,7 +160,7 @@ def at_largest_beta(off: float) -> Changes:
     return {**start(POSE), "workspace": {"beta_max_deg": math.degrees(beta + off)}}
 
 
-def at_the_pole(rate: Triple) -> Changes:
+def at_the_pole(rate: Vector3) -> Changes:
     """Rotate the base so that its centre, where E starts, is the z axis of {B}: phi = 0."""
     x = np.array([1.0, -1.0, 0.0]) / math.sqrt(2.0)
     z = np.full(3, math.sqrt(1.0 / 3.0))
@@ -166,7 +168,7 @@ def at_the_pole(rate: Triple) -> Changes:
     return {**FREE, **start((QUARTER, QUARTER, QUARTER), rate), "base.v": turn.T}
 
 
-def in_triangle(v: ArrayLike, share: Triple) -> Changes:
+def in_triangle(v: ArrayLike, share: Vector3) -> Changes:
     """Take a base triangle, and go from the middle of its arcs at a share of them each second."""
     geometry = Geometry.of(changed({"base.v": v}))
     a, b, c = (0.5 * float(arc) for arc in geometry.arc)
@@ -190,19 +192,19 @@ def short_arc(degrees: float) -> Changes:
     return in_triangle(v, (0.1, 0.2, -0.1))
 
 
-def pushed(scale: float) -> Triple:
+def pushed(scale: float) -> Vector3:
     """Return the torques of the reference motion times `scale` [N m]."""
     a, b, c = PUSH
     return (a * scale, b * scale, c * scale)
 
 
-def noise(k: int, _: Any) -> Triple:
+def noise(k: int, _: Any) -> Vector3:
     """Return reproducible noise of 1 N m for period k."""
     generator = random.Random(k)
     return (generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0))
 
 
-def square_wave(k: int, _: Any) -> Triple:
+def square_wave(k: int, _: Any) -> Vector3:
     """Return torques that jump by twice their size every second period."""
     sign = 1.0 if k % 4 < 2 else -1.0
     return (2.0 * sign, -1.5 * sign, 1.0 * sign)
@@ -227,7 +229,7 @@ class SampledPd:
         self._inertia = mass_matrix(changed(OFF_POSE))
         self._sizes: list[float] = []
 
-    def __call__(self, k: int, simulation: Simulation) -> Triple:
+    def __call__(self, k: int, simulation: Simulation) -> Vector3:
         """Return the torques of period k, and keep the size of the error at its start."""
         joints = simulation.state.joints
         off, rate = joints.gamma - np.array(POSE), np.array(joints.gamma_dot)

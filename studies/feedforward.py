@@ -3,7 +3,7 @@
 
 Loops run in lockstep on `Simulation`: state at the start of a period, command, one step under it.
 All have the plant of one scene and its reference motion; the errors are in the controller's model,
-or in the channel between them (`model_errors`).
+or in the channel between them (`control_loop.model_errors`).
 
 **Theory.** With an exact model the error of feedforward alone is that of the hold, and falls with
 the period as `sampled_data` derives. With equal gains, the error of gamma obeys one linear equation
@@ -43,10 +43,20 @@ from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
-from studies.bandwidth_limits import bandwidth_in_theory, bandwidth_limit, ideal_plant
-from studies.control_loop import Channel, ControlLoop, held_error, run_loop, unheld_error
+from studies.control_loop import (
+    SHARE,
+    Channel,
+    ControlLoop,
+    ModelError,
+    bandwidth_in_theory,
+    bandwidth_limit,
+    held_error,
+    ideal_plant,
+    model_errors,
+    run_loop,
+    unheld_error,
+)
 from studies.feedforward_figure import draw_feedforward
-from studies.model_errors import SHARE, ModelError, model_errors
 from studies.sampled_data import ORDERS, slope
 
 if TYPE_CHECKING:
@@ -284,7 +294,7 @@ def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> F
 
     """
     study = feedforward_study(plan, workers=workers, shown=True)
-    print(text(study), flush=True)
+    print(page(study), flush=True)
     write(out, "feedforward", csv=study.loops, document=document(study), page=page(study),
           figures={"feedforward": figure(study)})  # fmt: skip
     return study
@@ -362,16 +372,6 @@ def notes(study: FeedforwardStudy) -> Iterator[str]:
         yield f"[{number}] {row.error}, {row.mode}{at}: {row.failure}"
     for name in study.left_out:
         yield f"Left out: {name}, which this scene cannot have."
-
-
-def text(study: FeedforwardStudy) -> str:
-    """Format a study for the terminal."""
-    lines = [
-        title(study), "", "RMS error of gamma [rad], by model error and bandwidth of the feedback",
-        rms_table(study).to_string(index=False), "", *notes(study), "", *findings(study),
-        provenance(),
-    ]  # fmt: skip
-    return "\n".join(lines) + "\n"
 
 
 def page(study: FeedforwardStudy) -> str:
