@@ -79,7 +79,7 @@ def _orders() -> None:
 def _energy(seconds: int) -> None:
     scene = replace(scenes.load("gravity_payload"), friction=None)
     simulation = Simulation(scene, "dop853", tolerance=1e-14, compiled=True)
-    stored = simulation.dynamics.stored_energy(simulation.sample[0])
+    stored = simulation.dynamics.total_energy(simulation.sample[0])
     scale, worst = max(abs(stored), 1.0), 0.0
     for _ in range(seconds * 100):
         simulation.step((0.0, 0.0, 0.0), 10_000_000)

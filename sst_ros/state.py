@@ -22,7 +22,7 @@ TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
 
 
-def clamped(torque: Vector3, limit: float | None) -> Vector3:
+def clamp(torque: Vector3, limit: float | None) -> Vector3:
     """Clamp torques [N m] to the limit of the actuators, where they have one."""
     if limit is None:
         return torque

@@ -387,7 +387,7 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
                max(lag, 1e-8), f"a decay of {1.0 / lag:.0e} 1/s in the state")
           for lag in (1e-3, 1e-6, 1e-9)),
     ]
-    yield "Compliant stops", "", [
+    yield "Elastic stops", "", [
         *(Case(f"stops of {stiffness:g} N m/rad", bouncing(stiffness), REST, 30, 10 * MS,
                *ENERGY, 1e-8, "the torque has a kink; contact takes pi sqrt(m / k)",
                loose=loose, estimate=why)

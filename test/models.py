@@ -98,7 +98,7 @@ def rigid_body(numbers, size: float) -> np.ndarray:
 def assembly_of(geometry: Geometry, gamma, rotation) -> Assembly:
     """Describe the assembly R at actuator angles gamma; R closes the loops."""
     r = kinematics.carriage_directions(geometry, gamma)
-    mu, beta, det_j2, admissible = kinematics.described(geometry, r, np.asarray(rotation))
+    mu, beta, det_j2, admissible = kinematics.describe_assemblies(geometry, r, np.asarray(rotation))
     return Assembly(rotation, mu, beta, float(det_j2), bool(admissible))
 
 

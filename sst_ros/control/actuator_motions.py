@@ -21,12 +21,12 @@ from sst_ros.control.reference import (
     ReferenceMotion,
     equal_pieces,
     minimum_jerk,
-    timed,
+    minimum_jerk_over,
 )
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.generic_math import axpy, scaled
+from sst_ros.mechanism.generic_math import axpy, multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.motions import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
@@ -172,7 +172,7 @@ class ActuatorMotion(ReferenceMotion):
         super().__init__(pieces[-1], pieces)
         self._path, self._geometry = path, geometry
         self._coordinates = ActuatorSpaceMap(geometry)
-        self._times = list(_spaced(path, pieces))
+        self._times = list(_space(path, pieces))
         self._gammas = [path(time)[0] for time in self._times]
         try:
             branch = continuation.follow(geometry, self._gammas, rotation_matrix(start))
@@ -200,7 +200,7 @@ class ActuatorMotion(ReferenceMotion):
             raise SingularConfiguration(said, 0.0) from None
 
 
-def _spaced(path: Path, pieces: tuple[float, ...]) -> Iterator[float]:
+def _space(path: Path, pieces: tuple[float, ...]) -> Iterator[float]:
     """Yield times from the first to the last between which gamma moves by no more than STEP."""
     yield pieces[0]
     last, before = path(pieces[0])[0], pieces[0]
@@ -233,8 +233,8 @@ def straight_path(start: Vector3, goal: ToAngles) -> Path:
     span = axpy(1.0, goal.gamma, -1.0, start)
 
     def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        s, rate, acceleration = timed(time, goal.duration)
-        return axpy(1.0, start, s, span), scaled(rate, span), scaled(acceleration, span)
+        s, rate, acceleration = minimum_jerk_over(time, goal.duration)
+        return axpy(1.0, start, s, span), multiply(rate, span), multiply(acceleration, span)
 
     return path
 
@@ -300,7 +300,7 @@ class MotionSamples:
     quaternion: Quaternion
 
 
-def waypoints(
+def through_points(
     geometry: Geometry,
     start: Quaternion,
     times: Sequence[float],
@@ -360,11 +360,11 @@ def waypoints(
         raise InputError("trajectory", [problem])
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
-    begun = moved(geometry, start, here, gamma[0])
+    begun = follow_assembly(geometry, start, here, gamma[0])
     return _along(geometry, begun, Quintic(at, gamma, rates, seconds), tuple(at.tolist()))
 
 
-def recorded(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
+def through_samples(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
     """Return the motion of a recording, quintic between samples; it may begin and end moving.
 
     Raises:
@@ -381,7 +381,9 @@ def recorded(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
     return _along(geometry, samples.quaternion, spline, pieces)
 
 
-def moved(geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike) -> Quaternion:
+def follow_assembly(
+    geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike
+) -> Quaternion:
     """Follow the assembly from one gamma straight to another."""
     rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
     x, y, z, w = quaternion_of(rotation).tolist()

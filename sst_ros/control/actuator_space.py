@@ -24,8 +24,8 @@ from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
     RATE,
-    compiled,
-    compiled_for_arrays,
+    compile_for_arrays,
+    compile_program,
 )
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -34,10 +34,10 @@ from sst_ros.mechanism.generic_math import (
     axpy,
     cross,
     dot,
+    multiply,
+    rotate_back,
     rotation_rows,
-    scaled,
     sqrt,
-    turned_back,
 )
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.state import Quaternion, Vector3
@@ -60,10 +60,12 @@ class ActuatorSpaceMap:
             Leg(tuple(w), tuple(v), cross(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
             for w, v, e in rows
         ]
-        self._actuators = compiled(trace(self._of_star, (*QUATERNION, *RATE, *BODY_ACCELERATION)))
-        self._star = compiled(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
-        self._posture = compiled(trace(self._of_posture, QUATERNION))
-        self._newton = compiled(trace(self.newton_step, (*QUATERNION, *_CARRIAGES)))
+        self._actuators = compile_program(
+            trace(self._of_star, (*QUATERNION, *RATE, *BODY_ACCELERATION))
+        )
+        self._star = compile_program(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
+        self._posture = compile_program(trace(self._of_posture, QUATERNION))
+        self._newton = compile_program(trace(self.newton_step, (*QUATERNION, *_CARRIAGES)))
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
@@ -122,7 +124,7 @@ class ActuatorSpaceMap:
     @cached_property
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:
         """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
-        return compiled_for_arrays(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
+        return compile_for_arrays(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
@@ -139,7 +141,7 @@ class ActuatorSpaceMap:
         sines = [sqrt(at.u) for _, at in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
         j2 = [
-            scaled(1.0 / sine, cross(at.along, at.p))
+            multiply(1.0 / sine, cross(at.along, at.p))
             for sine, (_, at) in zip(sines, legs, strict=True)
         ]
         beta = (joint_angle(at, 2, leg.across, leg.v) for leg, at in legs)
@@ -149,22 +151,22 @@ class ActuatorSpaceMap:
         """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot; numbers of any kind."""
         rows, gamma_dot, gamma_ddot = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
-        rate = _solved(reach, gamma_dot)
+        rate = _solve(reach, gamma_dot)
         moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         rest = [kernel.rest_accelerations(at, rate)[1] for at in moving]
         missing = [total - part for total, part in zip(gamma_ddot, rest, strict=True)]
-        return (*rate, *_solved(reach, missing))
+        return (*rate, *_solve(reach, missing))
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
         """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
         q = inputs[:4]
         rows = rotation_rows(q)
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
-        local = [turned_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
+        local = [rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
         residual = [dot(r, e) for r, e in zip(local, arcs, strict=True)]
         # R exp(turn): the residual changes by turn . (e x r).
         slope = [cross(e, r) for r, e in zip(local, arcs, strict=True)]
-        tx, ty, tz = (-0.5 * part for part in _solved(slope, residual))
+        tx, ty, tz = (-0.5 * part for part in _solve(slope, residual))
         x, y, z, w = q
         moved = (
             x + w * tx + y * tz - z * ty,
@@ -176,7 +178,7 @@ class ActuatorSpaceMap:
         return (*(part / length for part in moved), *residual)
 
 
-def _solved(rows: list[Any], right: Any) -> tuple[Any, ...]:
+def _solve(rows: list[Any], right: Any) -> tuple[Any, ...]:
     """Solve rows . x = right by Cramer's rule."""
     others = (cross(rows[1], rows[2]), cross(rows[2], rows[0]), cross(rows[0], rows[1]))
     determinant = dot(rows[0], others[0])
@@ -221,13 +223,13 @@ class OrientationObserver:
             BranchEnds: a parallel singularity lies between, or no assembly has these angles.
 
         """
-        found = self._stepped(gamma)
+        found = self._step(gamma)
         if found is None:
-            found = self._followed(gamma)
+            found = self._follow(gamma)
         self._quaternion, self._gamma = found, gamma
         return found
 
-    def _stepped(self, gamma: Vector3) -> Quaternion | None:
+    def _step(self, gamma: Vector3) -> Quaternion | None:
         """Newton's method in one step; None where it might reach another assembly mode."""
         step, sigma = math.dist(gamma, self._gamma), self._sigma
         if step > continuation.SAFE * sigma * sigma:
@@ -244,7 +246,7 @@ class OrientationObserver:
         self._sigma = next_sigma
         return found
 
-    def _followed(self, gamma: Vector3) -> Quaternion:
+    def _follow(self, gamma: Vector3) -> Quaternion:
         rotation = continuation.advance(
             self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
         )

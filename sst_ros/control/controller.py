@@ -36,18 +36,18 @@ from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
-    added,
+    add,
     axpy,
     cross,
     dot,
+    multiply,
     relative_quaternion,
     rotation_rows,
-    scaled,
 )
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, choice, number
-from sst_ros.state import Quaternion, State, Vector3, clamped
+from sst_ros.state import Quaternion, State, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
@@ -257,7 +257,7 @@ class Controller:
             feedforward = self._at_desired(desired)
         summed: Vector3 = ZERO
         if mode == "computed_torque":
-            total, summed = self._computed(desired, measured, error)
+            total, summed = self._compute_torque(desired, measured, error)
             feedback = axpy(1.0, total, -1.0, feedforward)
         elif mode != "feedforward":
             rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
@@ -265,9 +265,9 @@ class Controller:
             feedback = _by_joint(self.inertia, acceleration)
         if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
             feedforward = self._at_desired(self._motion.at(time + 0.5 * self._period_s))
-        return self._limited(feedforward, feedback, desired, error, summed)
+        return self._finish(feedforward, feedback, desired, error, summed)
 
-    def _limited(
+    def _finish(
         self,
         feedforward: Vector3,
         feedback: Vector3,
@@ -275,9 +275,9 @@ class Controller:
         error: Vector3,
         summed: Vector3,
     ) -> Command:
-        total = added(feedforward, feedback)
+        total = add(feedforward, feedback)
         _require_finite(total, "torque")
-        torque = clamped(total, self._limit)
+        torque = clamp(total, self._limit)
         if dot(axpy(1.0, total, -1.0, torque), error) <= 0.0:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
         return Command(torque, feedforward, feedback, desired, torque != total)
@@ -285,7 +285,7 @@ class Controller:
     def _at_desired(self, at: Reference) -> Vector3:
         return self._inverse.reference_torque(at)
 
-    def _computed(
+    def _compute_torque(
         self, desired: Reference, measured: Measurement, error: Vector3
     ) -> tuple[Vector3, Vector3]:
         """Torque of computed_torque, and the error to integrate."""
@@ -293,7 +293,7 @@ class Controller:
         rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
         acceleration, summed = self._feedback(error, rates)
         now = self._observer.coordinates.of_actuators(
-            quaternion, measured.gamma, measured.gamma_dot, added(desired.gamma_ddot, acceleration)
+            quaternion, measured.gamma, measured.gamma_dot, add(desired.gamma_ddot, acceleration)
         )
         body_acceleration = now.body_acceleration
         if self._settings.space == "so3":
@@ -311,12 +311,12 @@ class Controller:
         moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
         phi = rotation_vector(between)
         acceleration, summed = self._feedback(phi, axpy(1.0, rate, -1.0, now.body_rate))
-        return added(moving, acceleration), summed
+        return add(moving, acceleration), summed
 
     def _feedback(self, error: Vector3, rates: Vector3) -> tuple[Vector3, Vector3]:
         """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
         leaning = axpy(1.0, error, self._settings.integral_rate, self._sum)
-        return added(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
+        return add(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
 
     def _gains(self) -> tuple[Vector3, Vector3]:
         """Gains kp [1/s^2] and kd [1/s] of accelerations."""
@@ -325,8 +325,8 @@ class Controller:
             kp = _three(np.divide(given.stiffness, of))
             kd = _three(np.divide(given.damping, of))
         else:
-            kp = scaled(given.bandwidth**2, (1.0, 1.0, 1.0))
-            kd = scaled(2.0 * given.damping_ratio * given.bandwidth, (1.0, 1.0, 1.0))
+            kp = multiply(given.bandwidth**2, (1.0, 1.0, 1.0))
+            kd = multiply(2.0 * given.damping_ratio * given.bandwidth, (1.0, 1.0, 1.0))
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
         if given.integral_rate >= min(kd) and given.integral_rate > 0.0:
             allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"

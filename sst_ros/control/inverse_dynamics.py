@@ -15,8 +15,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import State
-from sst_ros.state import Quaternion, Vector3
+from sst_ros.state import Quaternion, State, Vector3
 
 SINGULAR = 1e-10
 """sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""
@@ -37,7 +36,7 @@ class InverseDynamics:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         dynamics = Dynamics.of(scene)
-        self._moved = dynamics.moved
+        self._has_moment_topic = dynamics.has_moment_topic
         self._program = dynamics.inverse
 
     def torque(
@@ -62,7 +61,12 @@ class InverseDynamics:
             InputError: an argument is not finite, or the quaternion has no direction.
 
         """
-        given = (*quaternion, *body_rate, *body_acceleration, *(moment if self._moved else ()))
+        given = (
+            *quaternion,
+            *body_rate,
+            *body_acceleration,
+            *(moment if self._has_moment_topic else ()),
+        )
         try:
             first, second, third, determinant, *squares = self._program(*given)
         except (ArithmeticError, ValueError):

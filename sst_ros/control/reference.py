@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
-from sst_ros.mechanism.generic_math import axpy, scaled
+from sst_ros.mechanism.generic_math import axpy, multiply
 from sst_ros.state import Quaternion, Vector3
 
 REST: Vector3 = (0.0, 0.0, 0.0)
@@ -100,10 +100,10 @@ class StoppingMotion(ReferenceMotion):
 
         return Reference(
             at.quaternion,
-            scaled(speed, at.body_rate),
+            multiply(speed, at.body_rate),
             second(at.body_rate, at.body_acceleration),
             at.gamma,
-            scaled(speed, at.gamma_dot),
+            multiply(speed, at.gamma_dot),
             second(at.gamma_dot, at.gamma_ddot),
         )
 
@@ -119,7 +119,7 @@ def minimum_jerk(u: float) -> tuple[float, float, float]:
     )
 
 
-def timed(time: float, duration: float) -> tuple[float, float, float]:
+def minimum_jerk_over(time: float, duration: float) -> tuple[float, float, float]:
     """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
     s, rate, acceleration = minimum_jerk(time / duration)
     return s, rate / duration, acceleration / (duration * duration)

@@ -12,17 +12,23 @@ from scipy.spatial.transform import Rotation
 from sst_ros.control.actuator_motions import (
     ActuatorMotion,
     MotionSamples,
-    moved,
-    recorded,
+    follow_assembly,
     straight_path,
     sweep_path,
-    waypoints,
+    through_points,
+    through_samples,
 )
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.reference import PIECES, Reference, ReferenceMotion, equal_pieces, timed
+from sst_ros.control.reference import (
+    PIECES,
+    Reference,
+    ReferenceMotion,
+    equal_pieces,
+    minimum_jerk_over,
+)
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration
-from sst_ros.mechanism.generic_math import axpy, quaternion_product, scaled
+from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
@@ -69,11 +75,11 @@ class GeodesicMotion(StarMotion):
 
     def star(self, time: float) -> StarState:
         """See `StarMotion.star`; the axis is the same in {B} and in {E}."""
-        s, rate, acceleration = timed(time, self.duration)
+        s, rate, acceleration = minimum_jerk_over(time, self.duration)
         half = 0.5 * s * self._angle
         part = math.sin(half) / self._angle if self._angle else 0.0
-        q = quaternion_product(self._start, (*scaled(part, self._vector), math.cos(half)))
-        return q, scaled(rate, self._vector), scaled(acceleration, self._vector)
+        q = quaternion_product(self._start, (*multiply(part, self._vector), math.cos(half)))
+        return q, multiply(rate, self._vector), multiply(acceleration, self._vector)
 
 
 class SpiralMotion(StarMotion):
@@ -97,7 +103,7 @@ class SpiralMotion(StarMotion):
 
     def star(self, time: float) -> StarState:
         """See `StarMotion.star`."""
-        s, rate, acceleration = timed(time, self.duration)
+        s, rate, acceleration = minimum_jerk_over(time, self.duration)
         a, b, c = s * self._theta, s * self._phi, s * (self._psi - self._theta)
         q = quaternion_product(
             quaternion_product(_about_z(a), (0.0, math.sin(0.5 * b), 0.0, math.cos(0.5 * b))),
@@ -114,10 +120,7 @@ class SpiralMotion(StarMotion):
         dy = self._theta * (self._phi * cb * sc + third * sb * cc) - self._phi * third * sc
         dz = -self._theta * self._phi * sb
         turning = axpy(acceleration, (x, y, z), rate * rate, (dx, dy, dz))
-        return quaternion_product(self._start, q), scaled(rate, (x, y, z)), turning
-
-
-__all__ = ["MotionSamples", "ReferenceMotion", "recorded", "reference_motion", "waypoints"]
+        return quaternion_product(self._start, q), multiply(rate, (x, y, z)), turning
 
 
 def reference_motion(
@@ -127,10 +130,10 @@ def reference_motion(
 
     Args:
         scene: has a `motion`.
-        samples: reads a bag by its path, as `report.recorded_motion.samples` does.
+        samples: reads a bag by its path, as `recording.recorded_motion.samples` does.
 
     Raises:
-        InputError: the scene has no motion, or one that cannot be made; see `waypoints`.
+        InputError: the scene has no motion, or one that cannot be made; see `through_points`.
         AssemblyError: the initial gamma has no unique admissible assembly.
         SingularConfiguration: the motion meets a parallel singularity.
 
@@ -143,7 +146,7 @@ def reference_motion(
         if samples is None:
             allowed = "a recorded motion cannot be read here"
             raise InputError(scene.name, [Problem("motion.recorded", motion.recorded.bag, allowed)])
-        return recorded(geometry, samples(motion.recorded.bag))
+        return through_samples(geometry, samples(motion.recorded.bag))
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
     start = (x, y, z, w)
@@ -158,7 +161,7 @@ def reference_motion(
     if motion.sweep:
         centre = motion.sweep.centre or gamma
         if centre != gamma:
-            start = moved(geometry, start, gamma, centre)
+            start = follow_assembly(geometry, start, gamma, centre)
         path, pieces = sweep_path(motion.sweep, centre)
     else:
         assert motion.to_angles is not None
@@ -171,7 +174,7 @@ def _through(scene: Scene, geometry: Geometry, start: Quaternion) -> ReferenceMo
     assert scene.motion is not None
     points = scene.motion.waypoints
     try:
-        return waypoints(
+        return through_points(
             geometry,
             start,
             [point.time for point in points],

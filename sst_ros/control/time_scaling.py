@@ -22,7 +22,7 @@ import numpy as np
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.plan import ActuatorDemand, LimitDistance, MotionPlan, limits, maximum
 from sst_ros.dynamics import kernel
-from sst_ros.mechanism.generic_math import scaled
+from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array
 from sst_ros.state import Vector3
 
@@ -143,7 +143,7 @@ class _Torques:
         at = self._plan.motion.at(time)
         rate, acceleration = at.body_rate, at.body_acceleration
         return self._inverse.torque(
-            at.quaternion, scaled(factor, rate), scaled(factor * factor, acceleration)
+            at.quaternion, multiply(factor, rate), multiply(factor * factor, acceleration)
         )
 
 

@@ -59,12 +59,12 @@ def tree(geometry: Geometry) -> tuple[Joint, ...]:
     return tuple(joint for k in range(3) for joint in _leg(geometry, k))
 
 
-def actuated(leg: int) -> str:
+def name_actuated(leg: int) -> str:
     """Name of the actuated link of a leg, 1 to 3; its frame is {1k} = [r, w x r, w]."""
     return f"actuated_{leg}"
 
 
-def intermediate(leg: int) -> str:
+def name_intermediate(leg: int) -> str:
     """Name of the intermediate link of a leg, 1 to 3; its frame is {2k} = [r, t x r, t]."""
     return f"intermediate_{leg}"
 
@@ -86,9 +86,9 @@ def _leg(geometry: Geometry, k: int) -> tuple[Joint, Joint, Joint]:
     back = (-float(e[0]), -float(e[1]), -float(e[2]))
     leg = LEGS[k]
     return (
-        Joint(f"gamma_{leg}", BASE, actuated(leg), base, (0.0, 0.0, 1.0)),
-        Joint(f"mu_{leg}", actuated(leg), intermediate(leg), np.eye(3), (-1.0, 0.0, 0.0)),
-        Joint(f"beta_{leg}", intermediate(leg), STARS[k], star, back),
+        Joint(f"gamma_{leg}", BASE, name_actuated(leg), base, (0.0, 0.0, 1.0)),
+        Joint(f"mu_{leg}", name_actuated(leg), name_intermediate(leg), np.eye(3), (-1.0, 0.0, 0.0)),
+        Joint(f"beta_{leg}", name_intermediate(leg), STARS[k], star, back),
     )
 
 
@@ -180,11 +180,11 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
         colour = LEG_COLOURS[k]
         # A quarter arc from the motor at w to the carriage at r, just above the base.
         middle = base + 1.5 * thick
-        found[actuated(leg)] = [
+        found[name_actuated(leg)] = [
             Arc(x, -np.eye(3)[1], np.pi / 2, middle, thick, colour),
             Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
         ]
-        found[intermediate(leg)] = [
+        found[name_intermediate(leg)] = [
             Rod(x * (base - thick), x * star, 0.9 * thick, STEEL),
             Box(star * x, 3.0 * thick * np.array([1.0, 1.3, 1.3]), colour),
         ]

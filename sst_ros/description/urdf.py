@@ -2,8 +2,8 @@
 """A scene as URDF, for robot_state_publisher, RViz and engines that read it.
 
 The tree's joints are those of joint_states, the passive ones included, so that the loops of what is
-shown are as closed as those of the simulation. URDF has no loops, no springs, no elastic or impact
-ends and no Stribeck friction: a simulation of the file must add them. No shape is meant for
+shown are as closed as those of the simulation. URDF has no loops, no springs, no elastic
+stops and no Stribeck friction: a simulation of the file must add them. No shape is meant for
 collisions.
 
 The actuators can be hardware of ros2_control, which drives them over topics by the plug-in
@@ -30,8 +30,8 @@ from sst_ros.description.tree import (
     Colour,
     Joint,
     Shape,
-    actuated,
-    intermediate,
+    name_actuated,
+    name_intermediate,
     shapes,
     tree,
 )
@@ -75,8 +75,8 @@ def bodies(scene: Scene) -> list[Body]:
         found.append(_payload(scene.payload))
     for k, leg in enumerate(LEGS):
         for name, link, radius in (
-            (actuated(leg), scene.actuated_links[k], base.radius),
-            (intermediate(leg), scene.intermediate_links[k], star.radius),
+            (name_actuated(leg), scene.actuated_links[k], base.radius),
+            (name_intermediate(leg), scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
                 found.append(_body(name, link.mass, link.centre, link.inertia, radius))
@@ -104,7 +104,7 @@ def _rotor(scene: Scene, leg: int) -> Body:
     behind = scene.actuators.gear_ratio**2 * scene.actuators.rotor_inertia
     tensor = np.diag([behind / 2.0, behind / 2.0, behind])
     mass = _mass(tensor, scene.base.radius)
-    return Body(f"rotor_{leg}", actuated(leg), mass, np.zeros(3), tensor, assumed=True)
+    return Body(f"rotor_{leg}", name_actuated(leg), mass, np.zeros(3), tensor, assumed=True)
 
 
 def _mass(tensor: Array, radius: float) -> float:

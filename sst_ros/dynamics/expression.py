@@ -65,10 +65,10 @@ class Expression:
     def __add__(self, other: Value) -> Value:
         if _is(other, 0.0):
             return self
-        if _negated(other) is not None:
-            return self - _negated(other)
-        if _negated(self) is not None and not _is_constant(other):
-            return other - _negated(self)
+        if _drop_minus(other) is not None:
+            return self - _drop_minus(other)
+        if _drop_minus(self) is not None and not _is_constant(other):
+            return other - _drop_minus(self)
         return self.graph.node("add", self, other)
 
     __radd__ = __add__
@@ -78,7 +78,7 @@ class Expression:
             return self
         if other is self:
             return 0.0
-        inner = _negated(other)
+        inner = _drop_minus(other)
         return self + inner if inner is not None else self.graph.node("sub", self, other)
 
     def __rsub__(self, other: Value) -> Value:
@@ -90,7 +90,7 @@ class Expression:
                 return 0.0
             if abs(other) == 1.0:
                 return self if other > 0.0 else -self
-        mine, theirs = _negated(self), _negated(other)
+        mine, theirs = _drop_minus(self), _drop_minus(other)
         if mine is not None and theirs is not None:
             return mine * theirs
         if mine is not None:
@@ -107,20 +107,20 @@ class Expression:
                 return self * (1.0 / other)
         if other is self:
             return 1.0
-        mine = _negated(self)
+        mine = _drop_minus(self)
         return -(mine / other) if mine is not None else self.graph.node("div", self, other)
 
     def __rtruediv__(self, other: Value) -> Value:
         return 0.0 if _is(other, 0.0) else self.graph.node("div", other, self)
 
     def __neg__(self) -> Value:
-        inner = _negated(self)
+        inner = _drop_minus(self)
         return inner if inner is not None else self.graph.node("neg", self)
 
     def __bool__(self) -> bool:
         raise TypeError("a traced number has no truth value: branch on constants only")
 
-    def traced(self, op: str, *args: Value) -> Value:
+    def apply(self, op: str, *args: Value) -> Value:
         """Note a function of this expression, or of `args`."""
         return self.graph.node(op, *(args or (self,)))
 
@@ -148,9 +148,9 @@ class Program:
 
     def first(self, count: int) -> Program:
         """Return the program of the first `count` outputs alone."""
-        return Program(self.inputs, self.steps, self.outputs[:count]).pruned()
+        return Program(self.inputs, self.steps, self.outputs[:count]).prune()
 
-    def pruned(self) -> Program:
+    def prune(self) -> Program:
         """Return the program without steps that no output needs."""
         inputs, needed = len(self.inputs), set[int]()
         waiting = [out.number for out in self.outputs if isinstance(out, Operand)]
@@ -163,14 +163,14 @@ class Program:
         kept = sorted(needed)
         numbers = {old: new for new, old in enumerate([*range(inputs), *kept])}
 
-        def moved(operand: float | Operand) -> float | Operand:
+        def renumber(operand: float | Operand) -> float | Operand:
             return Operand(numbers[operand.number]) if isinstance(operand, Operand) else operand
 
         steps = (self.steps[number - inputs] for number in kept)
         return Program(
             self.inputs,
-            tuple((op, tuple(map(moved, operands))) for op, operands in steps),
-            tuple(map(moved, self.outputs)),
+            tuple((op, tuple(map(renumber, operands))) for op, operands in steps),
+            tuple(map(renumber, self.outputs)),
         )
 
     def source(self, name: str) -> str:
@@ -209,7 +209,7 @@ def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) 
         return Operand(value.index) if isinstance(value, Expression) else float(value)
 
     steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
-    return Program(inputs, steps, tuple(map(operand, outputs))).pruned()
+    return Program(inputs, steps, tuple(map(operand, outputs))).prune()
 
 
 def _is_constant(value: Value) -> bool:
@@ -220,7 +220,7 @@ def _is(value: Value, number: float) -> bool:
     return not isinstance(value, Expression) and float(value) == number
 
 
-def _negated(value: Value) -> Value:
+def _drop_minus(value: Value) -> Value:
     """Return x where value is -x, else None."""
     if not isinstance(value, Expression):
         return None
@@ -269,9 +269,9 @@ def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -
         "sqrt": lambda: 0.5 / here,
         "tanh": lambda: 1.0 - here * here,
         "exp": lambda: here,
-        "sin": lambda: x.traced("cos"),
-        "cos": lambda: -x.traced("sin"),
-        "positive": lambda: x.traced("step"),
+        "sin": lambda: x.apply("cos"),
+        "cos": lambda: -x.apply("sin"),
+        "positive": lambda: x.apply("step"),
         "step": lambda: 0.0,
     }
     return 0.0 if not isinstance(d[0], Expression) and d[0] == 0.0 else inner[op]() * d[0]

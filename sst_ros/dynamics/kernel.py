@@ -38,16 +38,16 @@ from sst_ros.mechanism.generic_math import (
     Rows,
     Scalar,
     Triple,
-    added,
+    add,
     axpy,
     cross,
     dot,
+    multiply,
     quaternion_rate,
+    rotate_back,
     rotation_rows,
-    scaled,
     solve_symmetric,
     sqrt,
-    turned_back,
 )
 from sst_ros.state import Joints
 
@@ -161,7 +161,7 @@ def balance(
         force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
         force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
         force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
-        toward_a = scaled(c_inertia, g)
+        toward_a = multiply(c_inertia, g)
         toward_gamma = axpy(a_inertia, g, c_inertia, p)
         if leg.loads is not None:
             at_gamma, at_mu, at_beta = joint_torques(leg.loads, at, leg.across, leg.v, field)
@@ -244,16 +244,16 @@ def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> T
     )
     total = cross(spin, rate)
     if model.gravity is not None:
-        total = added(total, cross(model.weight, field_of(model, rows)))
+        total = add(total, cross(model.weight, field_of(model, rows)))
     for external in (model.moment, moment):
         if external is not None:
-            total = added(total, turned_back(rows, external))
+            total = add(total, rotate_back(rows, external))
     return total
 
 
 def field_of(model: Model, rows: Rows) -> Triple:
     """Gravity in {E}."""
-    return ZERO if model.gravity is None else turned_back(rows, model.gravity)
+    return ZERO if model.gravity is None else rotate_back(rows, model.gravity)
 
 
 def _quotient(torque: Scalar, u: Scalar) -> Scalar:
@@ -279,7 +279,7 @@ def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
 
 
 def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
-    """Potential energy [J]: weight, springs and elastic ends."""
+    """Potential energy [J]: weight, springs and elastic stops."""
     x, y, z, w, wx, wy, wz = state[:7]
     rows = rotation_rows((x, y, z, w))
     field = field_of(model, rows)

@@ -31,8 +31,8 @@ class JointSpring(NamedTuple):
     rest: float
 
 
-class CompliantStops(NamedTuple):
-    """Compliant stops at the ends of the stroke, 0 and arc."""
+class ElasticStops(NamedTuple):
+    """Elastic stops at the ends of the stroke, 0 and arc."""
 
     arc: float
     stiffness: float
@@ -47,7 +47,7 @@ class LegLoads(NamedTuple):
         springs: at the joints gamma, mu, beta.
         drive: mass times centre of the actuated link in {1k} [kg m].
         link: mass times centre of the intermediate link in {2k} [kg m].
-        stops: compliant stops of the stroke.
+        stops: elastic stops of the stroke.
 
     """
 
@@ -55,7 +55,7 @@ class LegLoads(NamedTuple):
     springs: tuple[JointSpring | None, JointSpring | None, JointSpring | None]
     drive: Triple
     link: Triple
-    stops: CompliantStops | None
+    stops: ElasticStops | None
 
 
 class LegMotion(NamedTuple):
@@ -111,7 +111,7 @@ def joint_torques(
 def spring_and_weight_energy(
     loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
 ) -> Scalar:
-    """Energy [J] in springs, compliant stops and the weight of the links."""
+    """Energy [J] in springs, elastic stops and the weight of the links."""
     total: Scalar = 0.0
     for kind, spring in enumerate(loads.springs):
         if spring is not None:
@@ -123,13 +123,13 @@ def spring_and_weight_energy(
             total = total + 0.5 * loads.stops.stiffness * depth * depth
     if any(loads.drive) or any(loads.link):
         first, second = _directions(leg)
-        total = total - dot(_combined(loads.drive, *first), field)
-        total = total - dot(_combined(loads.link, *second), field)
+        total = total - dot(_combine(loads.drive, *first), field)
+        total = total - dot(_combine(loads.link, *second), field)
     return total
 
 
 def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> Scalar:
-    """Power [W] that friction and the damping of compliant stops take out."""
+    """Power [W] that friction and the damping of elastic stops take out."""
     total: Scalar = 0.0
     for kind, friction in enumerate(loads.friction):
         if friction is not None:
@@ -176,8 +176,8 @@ def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Sca
     if not (any(loads.drive) or any(loads.link)):
         return 0.0, 0.0
     first, second = _directions(leg)
-    on_link = cross(_combined(loads.link, *second), field)
-    on_both = cross(_combined(loads.drive, *first), field)
+    on_link = cross(_combine(loads.link, *second), field)
+    on_both = cross(_combine(loads.drive, *first), field)
     total = (on_link[0] + on_both[0], on_link[1] + on_both[1], on_link[2] + on_both[2])
     return dot(total, leg.axis), -dot(on_link, first[0])
 
@@ -191,8 +191,8 @@ def _directions(
     return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
 
 
-def stop_torque(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
-    """Torque of compliant stops; the damping grows from zero with the depth (Hunt-Crossley)."""
+def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+    """Torque of elastic stops; the damping grows from zero with the depth (Hunt-Crossley)."""
     low, high = positive(-gamma), positive(gamma - stops.arc)
     if not stops.damping:
         return stops.stiffness * (low - high)
@@ -200,7 +200,7 @@ def stop_torque(stops: CompliantStops, gamma: Scalar, gamma_dot: Scalar) -> Scal
     return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
 
 
-def _combined(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
+def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
     first, second, third = (c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))
     return (first, second, third)
 
@@ -310,7 +310,7 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     joints, springs = scene.friction, scene.springs
     friction = (joints.gamma, joints.mu, joints.beta) if joints else (None, None, None)
     by_joint = tuple(
-        _joined([s for s in springs if s.joint == f"{kind}_{k + 1}"])
+        _join([s for s in springs if s.joint == f"{kind}_{k + 1}"])
         for kind in ("gamma", "mu", "beta")
     )
     drive = link = ZERO
@@ -319,7 +319,7 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     stops = None
     if scene.stroke.stiffness is not None:
         damping = damping_of(scene.stroke)
-        stops = CompliantStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
+        stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
     heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
     if not (any(friction) or any(by_joint) or heavy or stops):
         return None
@@ -327,7 +327,7 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
 
 
 def damping_of(stroke: Stroke) -> float:
-    """Damping of compliant stops [s/rad], as given or from the restitution at the impact rate.
+    """Damping of elastic stops [s/rad], as given or from the restitution at the impact rate.
 
     For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v into the
     stop to e v out of it, with d = c v,
@@ -360,7 +360,7 @@ def _inverse_langevin(y: float) -> float:
             high = x
 
 
-def _joined(springs: list[Any]) -> JointSpring | None:
+def _join(springs: list[Any]) -> JointSpring | None:
     stiffness = sum(spring.stiffness for spring in springs)
     if not springs:
         return None

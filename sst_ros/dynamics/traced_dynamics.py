@@ -43,17 +43,17 @@ class Dynamics:
 
     """
 
-    def __init__(self, model: kernel.Model, *, moved: bool = False) -> None:
-        self.model, self.moved = model, moved
+    def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:
+        self.model, self.has_moment_topic = model, has_moment_topic
         lagging = model.time_constant is not None
         self.state = (*QUATERNION, *RATE, *(LAG if lagging else ()))
-        self.drive = (*TORQUE, *(MOMENT if moved else ()))
+        self.drive = (*TORQUE, *(MOMENT if has_moment_topic else ()))
 
     @staticmethod
     def of(scene: Scene) -> Dynamics:
         """Give those of a scene: traced once for all scenes that have the same constants."""
-        moved = scene.moment is not None and scene.moment.topic
-        return recent(kernel.model_of(scene), moved=moved)
+        has_moment_topic = scene.moment is not None and scene.moment.topic
+        return recent(kernel.model_of(scene), has_moment_topic=has_moment_topic)
 
     @cached_property
     def program(self) -> Program:
@@ -63,12 +63,12 @@ class Dynamics:
     @cached_property
     def derivative(self) -> Function:
         """The program as a function of plain floats."""
-        return compiled(self.program)
+        return compile_program(self.program)
 
     @cached_property
     def joints(self) -> Function:
         """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven."""
-        return compiled(self.joints_program)
+        return compile_program(self.joints_program)
 
     @cached_property
     def joints_program(self) -> Program:
@@ -81,15 +81,17 @@ class Dynamics:
 
         Of the first seven numbers of the state, W_dot, and a moment if it comes from a topic.
         """
-        more = MOMENT if self.moved else ()
-        return compiled(trace(self._inverse, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
+        more = MOMENT if self.has_moment_topic else ()
+        return compile_program(
+            trace(self._inverse, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more))
+        )
 
     @cached_property
     def energies(self) -> Function:
         """Kinetic and potential energy [J] and power put in [W], of state and drive."""
-        return compiled(trace(self._energies, (*self.state, *self.drive)))
+        return compile_program(trace(self._energies, (*self.state, *self.drive)))
 
-    def stored_energy(self, state: Sequence[float]) -> float:
+    def total_energy(self, state: Sequence[float]) -> float:
         """Kinetic and potential energy [J] of a state, whose further numbers are not looked at."""
         kinetic, potential, _ = self.energies(*state[: len(self.state)], *(0.0,) * len(self.drive))
         return kinetic + potential
@@ -181,7 +183,7 @@ class ODE:
 
     @cached_property
     def _linearised(self) -> Function:
-        return compiled(self.jacobian)
+        return compile_program(self.jacobian)
 
     @property
     def joints(self) -> Program:
@@ -202,7 +204,7 @@ class ODE:
             rows = zip(self._torque.amplitude, self._torque.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
             if self._limit is not None:
-                torque = tuple(_clamped(tau, self._limit) for tau in torque)
+                torque = tuple(_clamp(tau, self._limit) for tau in torque)
             rest = rest if self._phases else drive
         moment = (rest[0], rest[1], rest[2]) if rest else None
         model = self._dynamics.model
@@ -212,7 +214,7 @@ class ODE:
         return (*slope, kernel.power(model, state, torque, moment))
 
 
-def _clamped(torque: Any, limit: float) -> Any:
+def _clamp(torque: Any, limit: float) -> Any:
     """Clamp a torque, of any kind of number."""
     return limit - positive(2.0 * limit - positive(torque + limit))
 
@@ -223,7 +225,7 @@ def ode_with_work(dynamics: Dynamics) -> ODE:
     return ODE(dynamics, work=True)
 
 
-def compiled(program: Program) -> Function:
+def compile_program(program: Program) -> Function:
     """Turn a program into a Python function of its inputs.
 
     The function raises ArithmeticError or ValueError where a float has no value.
@@ -234,7 +236,7 @@ def compiled(program: Program) -> Function:
     return function
 
 
-def compiled_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
+def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element."""
     names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
     names |= {"atan2": np.arctan2, "max": np.maximum}

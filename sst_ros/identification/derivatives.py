@@ -26,7 +26,7 @@ from sst_ros.identification.sine_components import BAND
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kinematics import turned
+from sst_ros.mechanism.kinematics import rotate
 
 States = tuple[Array, Array, Array]
 """Quaternions (n, 4), W (n, 3) and W_dot (n, 3) in {E}."""
@@ -120,7 +120,7 @@ def orientations(geometry: Geometry, gamma: Array, quaternion: Array | None, fir
         t = geometry.e @ np.swapaxes(rotation, -1, -2)
         residual = np.sum(r * t, axis=-1)
         step = np.linalg.solve(cross(t, r), -residual[..., None])[..., 0]
-        rotation = turned(rotation, step)
+        rotation = rotate(rotation, step)
         if np.abs(step).max(initial=0.0) < 1e-9:  # quadratic: the next would be rounding
             break
     return np.asarray(quaternion_of(rotation))

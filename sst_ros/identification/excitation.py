@@ -29,7 +29,7 @@ from sst_ros.identification.regressor import Regressor
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kinematics import turned
+from sst_ros.mechanism.kinematics import rotate
 from sst_ros.scene.scene import Scene
 
 SHARE = 0.9
@@ -181,7 +181,7 @@ class _Cost:
         """Yield how far numbers lie beyond SHARE of their range, over the range."""
         geometry, actuators = self._geometry, self._scene.actuators
         r = kinematics.carriage_directions(geometry, gamma)
-        mu, beta, det_j2, _ = kinematics.described(geometry, r, rotation)
+        mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotation)
         for values, high in ((gamma, geometry.arc), (beta, np.full(3, geometry.beta_max))):
             yield (np.abs(values / high - 0.5) - 0.5 * SHARE).ravel()
         yield (LEAST_SINE - np.sin(mu)).ravel()
@@ -205,7 +205,7 @@ class _Cost:
                 t = self._geometry.e @ np.swapaxes(rotation, -1, -2)
                 slope = cross(t, r) + 1e-12 * np.eye(3)  # no exception at a singularity
                 step = np.linalg.solve(slope, -np.sum(r * t, axis=-1)[..., None])[..., 0]
-                rotation = turned(rotation, np.clip(step, -0.5, 0.5))
+                rotation = rotate(rotation, np.clip(step, -0.5, 0.5))
         return np.asarray(rotation)
 
 

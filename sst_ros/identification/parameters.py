@@ -19,7 +19,7 @@ from sst_ros.identification.scene_numbers import JOINT_KINDS, at, opened, set_nu
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import from_values, replaced, values_of
+from sst_ros.scene.yaml_document import from_values, replace_values, values_of
 
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" for part in INERTIA))
@@ -117,7 +117,7 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
             changed[f"{body}.centre"] = [h / mass for h in centre] if mass else [0.0] * 3
         elif not name.startswith("offset"):
             changed[name] = number
-    document = replaced(values_of(scene), changed)
+    document = replace_values(values_of(scene), changed)
     _drop_friction(document)
     notes = document.setdefault("provenance", {})
     known = {re.sub(r"\[\d\]", "", name).split(".")[0] for name in found}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import with_jacobian
 from sst_ros.dynamics.model import joint_angle
-from sst_ros.dynamics.traced_dynamics import QUATERNION, compiled_for_arrays
+from sst_ros.dynamics.traced_dynamics import QUATERNION, compile_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.measured_motion import Measured, measured_motion
 from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
@@ -151,4 +151,4 @@ def observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
             *(radius * row[2] for row in rows),
         )
 
-    return compiled_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))
+    return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))

@@ -21,7 +21,7 @@ from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
     RATE,
-    compiled_for_arrays,
+    compile_for_arrays,
 )
 from sst_ros.identification.parameters import with_symbols
 from sst_ros.integration.parametric_model import VariedNumber
@@ -81,7 +81,7 @@ class Regressor:
 
     @cached_property
     def _function(self) -> Any:
-        return compiled_for_arrays(self.program)
+        return compile_for_arrays(self.program)
 
     def _torques(self, *inputs: Any) -> tuple[Any, ...]:
         varied = [present(symbol) for symbol in inputs[10:]]

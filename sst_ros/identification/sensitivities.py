@@ -9,7 +9,7 @@ With y' = f(y, t, p) the sensitivity S = dy/dp obeys the variational equation
 derivatives are those of the traced equation of motion, exact to rounding, and are integrated with
 the motion, so that one error control holds for both.
 
-Where a compliant stop is met or left its torque is zero on both sides: f is continuous, and S as
+Where an elastic stop is met or left its torque is zero on both sides: f is continuous, and S as
 well. A jump (saltation) would follow from a jump of f alone (Leine and Nijmeijer, Dynamics and
 Bifurcations of Non-Smooth Mechanical Systems, Springer 2004, section 7.2).
 """
@@ -29,7 +29,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compiled
+from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compile_program
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.regressor import present
@@ -43,7 +43,7 @@ TOLERANCE = 1e-12
 """Relative and absolute, of a step; the latter over the size of a parameter for its column."""
 
 AT_STOPS = 0.1
-"""Of the tolerance where stops are compliant: derivatives jump there, and a step across loses its
+"""Of the tolerance where stops are elastic: derivatives jump there, and a step across loses its
 order."""
 
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
@@ -147,7 +147,7 @@ class Sensitivities:
         program = with_jacobian(
             self._derivative, (*self._state, *TORQUE, *symbols), (*self._state, *symbols)
         )
-        return compiled(program)
+        return compile_program(program)
 
     def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
         size = len(self._state)
@@ -188,7 +188,7 @@ class Sensitivities:
 
 
 def damping_slope(scene: Scene) -> float:
-    """Return the derivative of the damping of compliant stops by the restitution [s/rad].
+    """Return the derivative of the damping of elastic stops by the restitution [s/rad].
 
     From s = d (1 + e), L(s/2) = (1 - e) / (1 + e) with Langevin's function L, see
     `damping_of`: ds/de = -4 / ((1 + e)^2 L'(s/2)), L'(x) = 1/x^2 - 1/sinh(x)^2.

@@ -7,9 +7,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compiled
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compile_program
 from sst_ros.scene.loads import SineTorque
-from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamped
+from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
 
 
 class StateFeedback:
@@ -69,7 +69,7 @@ class AppliedTorque:
         if callable(torque):
             return torque
         first, second, third = torque
-        return clamped((first, second, third), self.limit)
+        return clamp((first, second, third), self.limit)
 
     def limit_of(self, torque: SineTorque) -> float | None:
         """Return the limit of the actuators where it clamps a sine [N m]."""
@@ -97,12 +97,12 @@ class AppliedTorque:
             torque = torque(time, y)
         elif isinstance(torque, SineTorque):
             torque = torque.at(time)
-        return clamped(torque(time) if callable(torque) else torque, self.limit)
+        return clamp(torque(time) if callable(torque) else torque, self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
         if self._rhs is None:
-            self._rhs = compiled(self._ode.program)
+            self._rhs = compile_program(self._ode.program)
         assert self._torque is not None
         size = len(self._ode.state)
         torque = self.at(self._torque, self._start + t, inputs[:size])

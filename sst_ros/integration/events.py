@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events inside a step: when a joint reaches a limit, or meets or leaves a compliant stop.
+"""Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop.
 
-The force of a compliant stop has a kink where contact begins and ends, so steps end there.
+The force of an elastic stop has a kink where contact begins and ends, so steps end there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CONTACT_BAND = 1e-9
 
 
 def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield begin and end of contact at the compliant stops of a scene, one limit each."""
+    """Yield begin and end of contact at the elastic stops of a scene, one limit each."""
     if scene.stroke.at_end == "elastic":
         for k in range(3):
             for end in (0.0, float(geometry.arc[k])):
@@ -53,7 +53,7 @@ def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> fl
 
 
 def free_range(events: Sequence[Limit]) -> list[Limit]:
-    """Return limits of the range in which no compliant stop can be in contact."""
+    """Return limits of the range in which no elastic stop can be in contact."""
     inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
     return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]
 

@@ -143,7 +143,7 @@ class GaussMotion:
         y = tuple(self.at(times).T)
         torque: Any = tuple(self.torque(times).T)
         work = float(np.sum(weights * kernel.power(model, y, torque)))
-        start, stop = map(self._dynamics.stored_energy, self.at(np.array([0.0, end])).tolist())
+        start, stop = map(self._dynamics.total_energy, self.at(np.array([0.0, end])).tolist())
         return stop - start - work
 
     def torque(self, times: Array) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compiled_for_arrays
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_distances import limit_distances
 from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
@@ -78,7 +78,7 @@ class ParametricModel:
         self._varied = dict(zip(varied, (f"p{i}" for i in range(len(varied))), strict=True))
         self._fixed = {place: float(np.ravel(value)[0]) for place, value in numbers.items()}
         dynamics = Dynamics.of(self.scene)
-        self._moved = dynamics.moved
+        self._has_moment_topic = dynamics.has_moment_topic
         self._functions: dict[tuple[str, ...], Callable[..., tuple[Any, ...]]] = {}
         self.ode = ODE(dynamics, self.scene.torque if profile else None)
         self._limits = self.limits(Geometry.of(self.scene))
@@ -122,7 +122,7 @@ class ParametricModel:
 
         def slope(*inputs: Expression) -> tuple[Any, ...]:
             at = self.constants(inputs[len(known) :])
-            ode = ODE(Dynamics(at.model, moved=self._moved), at.torque)
+            ode = ODE(Dynamics(at.model, has_moment_topic=self._has_moment_topic), at.torque)
             return ode.derivative(*inputs[: len(known)])
 
         return trace(slope, (*known, *self.names))
@@ -153,7 +153,7 @@ class ParametricModel:
 
         if names not in self._functions:
             program = trace(values, (*QUATERNION, *RATE, *self.names))
-            self._functions[names] = compiled_for_arrays(program)
+            self._functions[names] = compile_for_arrays(program)
         return self._functions[names]
 
     @property

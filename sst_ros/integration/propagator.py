@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Propagation of a scene's state through periods: steps, limits, contact at compliant stops."""
+"""Propagation of a scene's state through periods: steps, limits, contact at elastic stops."""
 
 from __future__ import annotations
 

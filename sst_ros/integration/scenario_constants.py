@@ -51,7 +51,7 @@ def _plain(value: Any) -> Any:
 
 
 def _damped(stroke: Any) -> Any:
-    """Compliant stops with the damping that their restitution gives, row by row if it varies."""
+    """Elastic stops with the damping that their restitution gives, row by row if it varies."""
     varied = (stroke.restitution, stroke.impact_rate)
     if not any(isinstance(value, np.ndarray) for value in varied):
         return stroke

@@ -24,7 +24,7 @@ from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import cross
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
-from sst_ros.mechanism.kinematics import ROUNDING, turned
+from sst_ros.mechanism.kinematics import ROUNDING, rotate
 
 SAFE = 0.18
 """Largest step in gamma [rad] over sigma^2 that cannot leave the branch."""
@@ -104,14 +104,14 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     if rotation is None:
         rotation = kinematics.admissible(geometry, points[0]).rotation
     rotations = np.empty((len(points), 3, 3))
-    rotations[0] = turned(np.array(rotation, dtype=float), np.zeros(3))
+    rotations[0] = rotate(np.array(rotation, dtype=float), np.zeros(3))
     r = kinematics.carriage_directions(geometry, points[0])
     if np.abs(np.sum(r * (geometry.e @ rotations[0].T), axis=1)).max() > 1e-9:
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
         rotations[row] = _segment(geometry, points[row - 1], points[row], rotations[row - 1], row)
-    return _described(geometry, points, rotations)
+    return _describe(geometry, points, rotations)
 
 
 def advance(geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike) -> Array:
@@ -164,13 +164,13 @@ def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
             best, least = rotation, worst
         if worst < ROUNDING:
             break
-        rotation = turned(rotation, np.linalg.solve(cross(t, r), -residual))
+        rotation = rotate(rotation, np.linalg.solve(cross(t, r), -residual))
     return best
 
 
-def _described(geometry: Geometry, gamma: Array, rotation: Array) -> Branch:
+def _describe(geometry: Geometry, gamma: Array, rotation: Array) -> Branch:
     r = kinematics.carriage_directions(geometry, gamma)
-    mu, beta, det_j2, _ = kinematics.described(geometry, r, rotation)
+    mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotation)
     mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
     slope = cross(geometry.e @ rotation.transpose(0, 2, 1), r)
     sigma = np.asarray(np.linalg.svd(slope, compute_uv=False)[:, 2], dtype=float)

@@ -45,8 +45,8 @@ def positive(x: Any) -> Any:
     """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
     if type(x) is float:
         return x if x > 0.0 else 0.0
-    if hasattr(x, "traced"):
-        return x.traced("positive")
+    if hasattr(x, "apply"):
+        return x.apply("positive")
     return np.where(np.real(x) > 0, x, 0.0) if isinstance(x, _ARRAYS) else max(x, 0)
 
 
@@ -55,8 +55,8 @@ def atan2(y: Any, x: Any) -> Any:
     if type(y) is float and type(x) is float:
         return math.atan2(y, x)
     for number in (y, x):
-        if hasattr(number, "traced"):
-            return number.traced("atan2", y, x)
+        if hasattr(number, "apply"):
+            return number.apply("atan2", y, x)
     if np.iscomplexobj(y) or np.iscomplexobj(x):
         angle = np.arctan2(np.real(y), np.real(x))
         turned_x, turned_y = (
@@ -69,8 +69,8 @@ def atan2(y: Any, x: Any) -> Any:
 
 def _other(name: str, *arguments: Any) -> Any:
     first = arguments[0]
-    if hasattr(first, "traced"):
-        return first.traced(name)
+    if hasattr(first, "apply"):
+        return first.apply(name)
     if isinstance(first, (*_ARRAYS, int)):
         return getattr(np, {"atan2": "arctan2"}.get(name, name))(*arguments)
     import mpmath
@@ -122,12 +122,12 @@ def quaternion_rate(q: Quadruple, rate: Triple) -> tuple[Scalar, ...]:
     )
 
 
-def added(a: Triple, b: Triple) -> Triple:
+def add(a: Triple, b: Triple) -> Triple:
     """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-def scaled(factor: Scalar, a: Triple) -> Triple:
+def multiply(factor: Scalar, a: Triple) -> Triple:
     """Return factor a."""
     return (factor * a[0], factor * a[1], factor * a[2])
 
@@ -154,7 +154,7 @@ def solve_symmetric(
     return (fx / xx - l21 * x2 - l31 * x3, x2, x3)
 
 
-def turned_back(rows: Rows, vector: Triple) -> Triple:
+def rotate_back(rows: Rows, vector: Triple) -> Triple:
     """R^T times a vector of {B}."""
     x, y, z = vector
     first, second, third = (x * rows[0][i] + y * rows[1][i] + z * rows[2][i] for i in range(3))

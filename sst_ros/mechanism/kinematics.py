@@ -69,7 +69,7 @@ def rotations(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     rotation, residual = _polish(r[owner], _of(e, owner), columns(cross(t1, s), t1, s))
     good = residual <= ROUNDING
     owner, rotation = _distinct(r, e, owner[good], rotation[good])
-    return (*_arranged(owner, rotation), isolated)
+    return (*_arrange(owner, rotation), isolated)
 
 
 def _of(e: Array, rows: Any) -> Array:
@@ -103,7 +103,7 @@ def _product(a: Array, b: Array) -> Array:
     return result
 
 
-def _turned_forms(count: int) -> tuple[Array, Array]:
+def _turn_forms(count: int) -> tuple[Array, Array]:
     """Angles x0 and matrices that turn a quartic form's coefficients from x to x - x0."""
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
@@ -116,7 +116,7 @@ def _turned_forms(count: int) -> tuple[Array, Array]:
     return angles, matrices
 
 
-_TURN, _TURNED = _turned_forms(5)
+_TURN, _TURNED = _turn_forms(5)
 
 
 def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
@@ -171,7 +171,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
         last = np.sqrt(dot(step, step))
         if last.max() > _LONGEST_TURN:
             step = step * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
-        rotation = turned(rotation, step)
+        rotation = rotate(rotation, step)
     return best, least
 
 
@@ -191,7 +191,7 @@ def _newton_step(slope: Array, residual: Array) -> Array:
     return np.asarray(step)
 
 
-def turned(rotation: Array, step: Array) -> Array:
+def rotate(rotation: Array, step: Array) -> Array:
     """Turn R, shape (..., 3, 3), by small rotation vectors `step` in {B} and keep it orthonormal.
 
     The turn is exact to second order, which is all that Newton's method asks for.
@@ -221,13 +221,13 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
         close = np.abs(new - old).max(axis=(1, 2)) < _NEAR
         if close.any():
             at = later[close]
-            middle = turned(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
+            middle = rotate(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
             t = _of(e, owner[at]) @ middle.transpose(0, 2, 1)
             fresh[at] = _largest(dot(r[owner[at]], t)) > ROUNDING
     return owner[fresh], rotation[fresh]
 
 
-def _arranged(owner: Index, rotation: Array) -> tuple[Index, Array]:
+def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     """Sort, and set the partner R Rot(z, pi) beside each root."""
     s = np.round(rotation[:, :, 2], 6)
     order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
@@ -339,7 +339,7 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
         raise AssemblyError("gamma must be rows of three finite numbers", angles)
     r = carriage_directions(geometry, angles)
     configuration, rotation, isolated = rotations(r, geometry.e)
-    mu, beta, det_j2, admissible = described(
+    mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
     arrays = frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated)
@@ -380,7 +380,7 @@ def _apart(assembly: Assembly, near: ArrayLike) -> float:
     return float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def described(
+def describe_assemblies(
     geometry: Geometry, r: Array, rotation: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Passive angles mu, beta (..., 3) [rad], det J2 and admissibility (...) of assemblies.

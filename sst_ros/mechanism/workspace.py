@@ -122,7 +122,7 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
     """Measure assemblies: gamma [rad], shape (..., 3), with R, shape (..., 3, 3)."""
     angles, matrices = np.array(gamma, dtype=float), np.asarray(rotation, dtype=float)
     r = kinematics.carriage_directions(geometry, angles)
-    mu, beta, det_j2, admissible = kinematics.described(geometry, r, matrices)
+    mu, beta, det_j2, admissible = kinematics.describe_assemblies(geometry, r, matrices)
     t = geometry.e @ np.swapaxes(matrices, -1, -2)
     n = cross(r, t)
     c = np.sum(n * geometry.w, axis=-1)
@@ -177,7 +177,7 @@ def over_orientations(
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         parts.append(measures(geometry, gamma, rotation))
     frozen(directions, psi)
-    return OrientationMap(geometry, directions, psi, _joined(parts))
+    return OrientationMap(geometry, directions, psi, _join(parts))
 
 
 def over_gamma(geometry: Geometry, points: int = 24, progress: bool = False) -> GammaMap:
@@ -240,7 +240,7 @@ def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array,
     return s / np.linalg.norm(s, axis=1)[:, None], np.array(faces, dtype=np.intp)
 
 
-def _joined(parts: list[Measures]) -> Measures:
+def _join(parts: list[Measures]) -> Measures:
     names = Measures.__dataclass_fields__
     return Measures(*frozen(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.control.reference_motions import MotionSamples
+from sst_ros.control.actuator_motions import MotionSamples
 from sst_ros.errors import InputError, Problem
 
 

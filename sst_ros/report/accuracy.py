@@ -42,7 +42,7 @@ precision. The reference's own error is twice the difference of two step sizes; 
 only if it is 100 times larger than that. Times are of the integration alone, the shortest of
 several runs, without compilation. Fixed steps use no error estimate. Tolerances include the coarse
 solution that `Simulation` integrates for its estimate of the global error, three steps for each,
-and one loop in Python around them. Compliant stops have kinks: fixed steps step over them, and
+and one loop in Python around them. Elastic stops have kinks: fixed steps step over them, and
 tolerances are given to `Simulation`, which locates each; it is the reference there too. Errors are
 the largest over the run.
 

@@ -130,7 +130,7 @@ def ideal(recording: Recording) -> Comparison | None:
 def ticks_of(recording: Recording) -> TickSequence:
     """Return the recorded ticks."""
     ticks, torque = recording.ticks, recording.ticks.torque
-    if Dynamics.of(recording.scene).moved and ticks.moment is not None:
+    if Dynamics.of(recording.scene).has_moment_topic and ticks.moment is not None:
         torque = np.hstack([torque, ticks.moment])
     return TickSequence(ticks.start_ns, ticks.end_ns, torque)
 

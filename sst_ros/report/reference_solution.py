@@ -2,7 +2,7 @@
 """A scene as an initial value problem, and its reference solution, with the error of that.
 
 Torques are continuous functions of time, not held over control periods: zero where the scene has
-none. The span ends at the first limit that stops the run. Compliant stops and torque limits have
+none. The span ends at the first limit that stops the run. Elastic stops and torque limits have
 kinks; there `Simulation`, which locates them, is the reference. Elsewhere the step size is halved
 in double precision until the solution stops improving; then DOP853 solves with that step in
 extended precision. The reference's own error is twice the difference of two step sizes.

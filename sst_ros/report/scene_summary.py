@@ -100,7 +100,7 @@ def _ends(scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _topics(dynamics: Dynamics) -> Iterator[tuple[str, str]]:
-    yield "in", "~/commands" + (", ~/external_moment" if dynamics.moved else "")
+    yield "in", "~/commands" + (", ~/external_moment" if dynamics.has_moment_topic else "")
     topics = "joint_states, ~/orientation, ~/euler_zyz, ~/applied_torques, ~/scene, /diagnostics"
     yield "out", topics
 
@@ -145,7 +145,7 @@ TERMS: dict[str, tuple[str, ...]] = {
     "rotors": ("actuators", "rotor_inertia", "gear_ratio"),
     "torque limit": ("actuators", "torque_limit"),
     "actuator lag": ("actuators", "time_constant"),
-    "elastic ends": ("stroke", "stiffness"),
+    "elastic stops": ("stroke", "stiffness"),
 }
 """Section of a scene that has each term, and the fields of that section where not all are its."""
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from sst_ros.runtime.settings import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.state import NANOSECONDS, State, Vector3, clamped, finite_vector, nanoseconds
+from sst_ros.state import NANOSECONDS, State, Vector3, clamp, finite_vector, nanoseconds
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
@@ -136,7 +136,7 @@ class TorqueInput:
             return ZERO
         first, second, third = simulation.state.joints.gamma_dot
         damping = -self._damping
-        return clamped((damping * first, damping * second, damping * third), self._limit)
+        return clamp((damping * first, damping * second, damping * third), self._limit)
 
     def answer(self, stamp_ns: int | None) -> Vector3 | None:
         """Return the torques that answer the sample of this stamp [N m], None without an answer.
@@ -200,7 +200,7 @@ class TorqueInput:
             self._drop(refused)
 
     def _accept(self, torque: Vector3, now_ns: int) -> Vector3:
-        self._held = clamped(torque, self._limit)
+        self._held = clamp(torque, self._limit)
         self.clamped += self._held != torque
         self.received += 1
         self._since, self.begun = now_ns, True

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from sst_ros.control.actuator_motions import MotionSamples
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Command, Controller, Measurement
 from sst_ros.control.plan import check
-from sst_ros.control.reference import Reference, StoppingMotion
-from sst_ros.control.reference_motions import MotionSamples, ReferenceMotion, reference_motion
+from sst_ros.control.reference import Reference, ReferenceMotion, StoppingMotion
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, TrackingSums
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics

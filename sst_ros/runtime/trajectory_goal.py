@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from sst_ros.control.actuator_motions import waypoints
+from sst_ros.control.actuator_motions import through_points
 from sst_ros.control.controller import Measurement
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.errors import InputError, Problem
@@ -49,7 +49,7 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
         raise InputError("joint_trajectory", problems)
     places = [list(message.joint_names).index(name) for name in ACTUATORS]
     points = message.points
-    return waypoints(
+    return through_points(
         geometry,
         begin.quaternion,
         [nanoseconds(point.time_from_start) / NANOSECONDS for point in points],

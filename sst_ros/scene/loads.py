@@ -147,7 +147,7 @@ class Actuators(Section):
 class Stroke(Section):
     """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
 
-    Elastic (compliant) stops give the torque stiffness depth (1 + damping rate inwards), never a
+    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a
     pull. Their damping is given as such, or by the restitution at one impact rate.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Desired motions of a scene as data; `control.motions` makes them move.
+"""Desired motions of a scene as data; `control.reference_motions` makes them reference motions.
 
 Every motion begins at rest and ends at rest, except a recorded one, which begins and ends as the
 recording does. A motion that names no start begins in the initial pose of the scene.

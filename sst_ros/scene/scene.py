@@ -28,7 +28,7 @@ from sst_ros.scene.loads import (
 )
 from sst_ros.scene.motions import DesiredMotion
 from sst_ros.scene.schema import Section, Spec, notes, number, section, sections, specs, text
-from sst_ros.scene.yaml_document import from_values, plain, read, replaced, values_of
+from sst_ros.scene.yaml_document import from_values, plain, read, replace_values, values_of
 
 Matrix = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ class Scene(Section):
 
         """
         try:
-            changed = replaced(values_of(self), values)
+            changed = replace_values(values_of(self), values)
         except KeyError as error:
             key = error.args[0]
             problem = Problem(str(key), values[key], "names nothing in this scene")

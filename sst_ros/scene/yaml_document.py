@@ -16,7 +16,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
 
 
-def replaced(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a document with other values; a list without an index means all of its entries.
 
     So does a single value in place of a list of numbers.
@@ -235,7 +235,7 @@ def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> 
         return _notes(node, key, problems)
     value = _plain(node)
     try:
-        return accept(spec, _typed(spec, node, value))
+        return accept(spec, _read_scalar(spec, node, value))
     except ValueError:
         problems.append(Problem(key, value, spec.refusal(value), _line(node)))
         return None
@@ -265,7 +265,7 @@ def _plain(node: yaml.Node | None) -> Any:
     return None
 
 
-def _typed(spec: Spec, node: yaml.Node, value: Any) -> Any:
+def _read_scalar(spec: Spec, node: yaml.Node, value: Any) -> Any:
     """Convert the text of a plain flag or whole number, by the rules of YAML 1.2."""
     if spec.kind == "flag" and node.tag.endswith(":bool"):
         return {"true": True, "false": False}.get(value.lower(), value)

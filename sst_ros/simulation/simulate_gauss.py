@@ -16,7 +16,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, clamped
+from sst_ros.state import NANOSECONDS, clamp
 
 _FINEST_PER_SECOND, _FINEST = 256, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
@@ -101,7 +101,7 @@ def _traced(scene: Scene, law: Any, period: int | None) -> SineTorque | tuple[fl
     if scene.stroke.at_end not in ("stop", "ignore"):
         raise NotSmooth(f"collocation does not take a stroke with at_end: {scene.stroke.at_end}")
     if isinstance(law, ConstantTorque):
-        return clamped(law.torque, limit)
+        return clamp(law.torque, limit)
     if limit is not None and max(map(abs, law.sine.amplitude)) > limit:
         raise NotSmooth("collocation does not take a sine that the torque limit cuts")
     return law.sine

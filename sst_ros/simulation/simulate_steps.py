@@ -18,7 +18,7 @@ from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.simulation.torque import TorqueTable
 from sst_ros.simulation.torque_profile import FeedbackFunction, SineProfile, TorqueProfile, three
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, State, Vector3, clamped
+from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 SAMPLES = 200
 """Intervals of a motion without `t_eval`."""
@@ -186,7 +186,7 @@ class SteppedMotion:
             return (lag,) * 3
         known = isinstance(law, TorqueProfile)
         torque = law(0.0) if known else law(0.0, self._samples[0])
-        return clamped(torque, scene.torque_limit if scene else None)
+        return clamp(torque, scene.torque_limit if scene else None)
 
 
 def _checked(function: FeedbackFunction) -> Callable[[float, State], Vector3]:

@@ -183,7 +183,7 @@ class Simulation:
 
         """
         propagator, h = self._propagator, dt_ns / NANOSECONDS
-        held = tuple(moment) if self.dynamics.moved else ()
+        held = tuple(moment) if self.dynamics.has_moment_topic else ()
         while count > 0:
             at = self._now
             start = at.time_ns / NANOSECONDS
@@ -225,7 +225,7 @@ class Simulation:
         self._propagator.reset()
         self._now = self._before = _Instant(0, self._start)
         self._shown = self._now, self._as_state(self._now)
-        self._energy = self.dynamics.stored_energy(self._start.y)
+        self._energy = self.dynamics.total_energy(self._start.y)
         return self.state
 
     def load_code(self, dt_ns: int) -> None:
@@ -234,7 +234,7 @@ class Simulation:
         Otherwise the step that changes the method loads it, which takes tenths of a second, or
         compiles it, which takes up to half a minute. The state does not change.
         """
-        moment = (0.0, 0.0, 0.0) if self.dynamics.moved else ()
+        moment = (0.0, 0.0, 0.0) if self.dynamics.has_moment_topic else ()
         self._propagator.load(self._now.point, dt_ns / NANOSECONDS, moment)
 
     @property
@@ -294,7 +294,7 @@ class Simulation:
     def energy_residual(self) -> float:
         """Energy now, less energy at the start, less the work done on the manipulator [J]."""
         y = self._now.point.y
-        return self.dynamics.stored_energy(y) - self._energy - y[-1]
+        return self.dynamics.total_energy(y) - self._energy - y[-1]
 
     @property
     def closure_residual(self) -> float:
@@ -308,7 +308,7 @@ class Simulation:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
         r = kinematics.carriage_directions(self.geometry, self.state.joints.gamma)
         rotation = rotation_matrix(self.state.quaternion)
-        _, _, determinant, _ = kinematics.described(self.geometry, r, rotation)
+        _, _, determinant, _ = kinematics.describe_assemblies(self.geometry, r, rotation)
         return {"sin_mu": float(np.sin(self.state.joints.mu).min()), "det_j2": float(determinant)}
 
     def _as_state(self, at: _Instant) -> State:

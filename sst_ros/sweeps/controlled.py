@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from sst_ros.control.controller import ControllerSettings
-from sst_ros.control.reference_motions import ReferenceMotion, reference_motion
+from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, integer, number, specs

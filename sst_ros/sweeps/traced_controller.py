@@ -20,7 +20,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression
 from sst_ros.mechanism.generic_math import (
     ZERO,
-    added,
+    add,
     atan2,
     axpy,
     cross,
@@ -150,7 +150,7 @@ class TracedController(NamedTuple):
         across = np.cross(geometry.w, geometry.v)
         carriages: list[Any] = []
         for k, angle in enumerate(gamma):
-            c, s = angle.traced("cos"), sin(angle)
+            c, s = angle.apply("cos"), sin(angle)
             pairs = zip(geometry.v[k].tolist(), across[k].tolist(), strict=True)
             carriages += [c * x + s * y for x, y in pairs]
         q: tuple[Any, ...] = memory["observed"]
@@ -175,7 +175,7 @@ class TracedController(NamedTuple):
             feedback = _tuple(m * a for m, a in zip(at.gains["inertia"], acceleration, strict=True))
         if settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
             feedforward = at.given["held_feedforward"]
-        total = added(feedforward, feedback)
+        total = add(feedforward, feedback)
         torque, limited, free = total, 0.0, 1.0
         if self.limited:
             torque = _tuple(_clamped(tau, at.gains["limit"][0]) for tau in total)
@@ -191,7 +191,7 @@ class TracedController(NamedTuple):
     def _computed(self, model: kernel.Model, at: _Sample) -> tuple[Any, Any]:
         """Torque of computed_torque, and the error to integrate."""
         acceleration, summed = _feedback(at.error, at.rates, at)
-        wanted = added(at.given["gamma_ddot"], acceleration)
+        wanted = add(at.given["gamma_ddot"], acceleration)
         space = ActuatorSpaceMap(Geometry.of(self.loop.model))
         now = space.star_accelerations(*at.observed, *at.gamma_dot, *wanted)
         body_rate, body_acceleration = _tuple(now[:3]), _tuple(now[3:])
@@ -207,7 +207,7 @@ class TracedController(NamedTuple):
             summed = _rotation_vector(between)
             slope = axpy(1.0, rate, -1.0, body_rate)
             acceleration, summed = _feedback(summed, slope, at)
-            body_acceleration = added(moving, acceleration)
+            body_acceleration = add(moving, acceleration)
         torque, _ = kernel.actuator_torque(model, at.observed, body_rate, body_acceleration)
         return torque, summed
 
@@ -219,7 +219,7 @@ def _feedback(error: Any, rates: Any, at: _Sample) -> tuple[Any, Any]:
         leaning = axpy(1.0, error, gains["integral_rate"][0], at.memory["integral"])
     proportional = _tuple(k * e for k, e in zip(gains["kp"], leaning, strict=True))
     derivative = _tuple(k * e for k, e in zip(gains["kd"], rates, strict=True))
-    return added(proportional, derivative), error
+    return add(proportional, derivative), error
 
 
 def _rotation_vector(q: tuple[Any, ...]) -> Any:
@@ -241,7 +241,7 @@ def _size(value: Any) -> Any:
 
 def _above(value: Any) -> Any:
     """1 where a number is positive, else 0."""
-    return value.traced("step") if isinstance(value, Expression) else float(value > 0.0)
+    return value.apply("step") if isinstance(value, Expression) else float(value > 0.0)
 
 
 def _tuple(values: Iterable[Any]) -> Any:

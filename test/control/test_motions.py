@@ -11,7 +11,8 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.reference_motions import MotionSamples, recorded, reference_motion, waypoints
+from sst_ros.control.actuator_motions import MotionSamples, through_points, through_samples
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work, workspace
@@ -201,7 +202,7 @@ def test_an_assembly_is_followed_and_not_the_nearest_or_the_first():
     ends = set()
     for assembly in found:
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
-        motion = waypoints(geometry, (x, y, z, w), [1.0], [assembly_gamma(geometry, assembly)])
+        motion = through_points(geometry, (x, y, z, w), [1.0], [assembly_gamma(geometry, assembly)])
         end = rotation_matrix(motion.at(1.0).quaternion)
         here = kinematics.inverse(geometry, assembly.rotation)[0]
         truth = continuation.follow(
@@ -229,7 +230,7 @@ def test_a_parallel_singularity_in_the_way_is_told_with_its_time():
     here, there = (kinematics.inverse(geometry, r)[0] for r in (before, rotation))
     x, y, z, w = quaternion_of(before).tolist()
     with pytest.raises(SingularConfiguration, match=r"parallel singularity before t = 0\.\d+ s"):
-        waypoints(geometry, (x, y, z, w), [1.0], [(here + 3.0 * (there - here)).tolist()])
+        through_points(geometry, (x, y, z, w), [1.0], [(here + 3.0 * (there - here)).tolist()])
 
 
 def test_a_recorded_motion_is_what_was_recorded():
@@ -244,7 +245,7 @@ def test_a_recorded_motion_is_what_was_recorded():
         np.array([state.joints.gamma_dot for state in states]),
         states[0].quaternion,
     )
-    motion = recorded(Geometry.of(scene), samples)
+    motion = through_samples(Geometry.of(scene), samples)
     again, worst = Simulation(scene, tolerance=1e-13), []
     for _ in range(100):
         middle = again.step(torque, period // 2)
@@ -303,7 +304,7 @@ def test_points_that_make_no_motion_are_refused_with_the_reason(named, arguments
     geometry = Geometry.of(scene)
     x, y, z, w = initial_state(scene, geometry)[:4]
     with pytest.raises(InputError, match=named):
-        waypoints(geometry, (x, y, z, w), *arguments)
+        through_points(geometry, (x, y, z, w), *arguments)
 
 
 @pytest.mark.parametrize(
@@ -327,5 +328,7 @@ def test_arrays_and_lists_of_points_are_one():
     geometry = Geometry.of(scene)
     x, y, z, w = initial_state(scene, geometry)[:4]
     rows = ([0.5, 1.0], [[0.8, 0.8, 0.7], [0.9, 0.7, 0.8]], [[0.1, 0.2, 0.1], [0.0] * 3])
-    motions = [waypoints(geometry, (x, y, z, w), *given) for given in (rows, map(np.array, rows))]
+    motions = [
+        through_points(geometry, (x, y, z, w), *given) for given in (rows, map(np.array, rows))
+    ]
     assert motions[0].at(0.7) == motions[1].at(0.7)

@@ -12,7 +12,7 @@ from loaded_scenes import loaded
 from models import assembly_of, seeded_samples
 
 from sst_ros.__main__ import main
-from sst_ros.description.tree import LEGS, STAR, STARS, actuated, intermediate
+from sst_ros.description.tree import LEGS, STAR, STARS, name_actuated, name_intermediate
 from sst_ros.description.urdf import roll_pitch_yaw, urdf
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
@@ -21,7 +21,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load, names
 
 EXACT = 2e-14  # a product of nine rotations, each rounded
-LINKS = {STAR, *map(actuated, LEGS), *map(intermediate, LEGS)}
+LINKS = {STAR, *map(name_actuated, LEGS), *map(name_intermediate, LEGS)}
 
 
 class Read:
@@ -67,8 +67,8 @@ def test_poses_of_all_links(isotropic):
         expected = dict.fromkeys(STARS, sample.rotation)
         for k, leg in enumerate(LEGS):
             r, t, w = at.r[k], at.t[k], at.w[k]
-            expected[actuated(leg)] = np.stack([r, np.cross(w, r), w], axis=1)
-            expected[intermediate(leg)] = np.stack([r, np.cross(t, r), t], axis=1)
+            expected[name_actuated(leg)] = np.stack([r, np.cross(w, r), w], axis=1)
+            expected[name_intermediate(leg)] = np.stack([r, np.cross(t, r), t], axis=1)
         for link, rotation in expected.items():
             assert np.abs(read.rotation(angles, link) - rotation).max() < EXACT
 

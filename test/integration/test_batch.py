@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sst_ros import Simulation, load_scene, simulate
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compiled
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compile_program
 from sst_ros.errors import InputError, RunStopped
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
@@ -228,7 +228,7 @@ def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
 
 
 def test_rates_of_distances_are_their_slopes_over_time(batch):
-    program, state = compiled(batch.limit_distances), [0.1, -0.2, 0.3, 0.9, 0.5, -0.4, 0.7]
+    program, state = compile_program(batch.limit_distances), [0.1, -0.2, 0.3, 0.9, 0.5, -0.4, 0.7]
     x, y, z, w, *rate = np.divide(state, [*[np.linalg.norm(state[:4])] * 4, 1.0, 1.0, 1.0])
     turned = Rotation.from_quat([x, y, z, w])
     ends = [

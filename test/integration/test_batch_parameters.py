@@ -9,7 +9,7 @@ from loaded_scenes import IGNORE, REST, loaded
 from models import seeded_samples
 
 from sst_ros import Simulation, load_scene
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compiled
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compile_program
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
@@ -215,9 +215,11 @@ def test_programs_have_the_bits_of_those_of_each_row(seed):
     for row in range(3):
         own = Batch(batch.scenario(row), RK4, profile=True)
         at, drive = (0.1, *STATE), (*DRIVE, *columns[3:, row])
-        assert compiled(batch.program)(*at, *drive) == compiled(own.program)(*at, *DRIVE)
-        inside = compiled(batch.limit_distances)(*STATE[:7], *columns[3:, row])
-        assert inside == compiled(own.limit_distances)(*STATE[:7])
+        assert compile_program(batch.program)(*at, *drive) == compile_program(own.program)(
+            *at, *DRIVE
+        )
+        inside = compile_program(batch.limit_distances)(*STATE[:7], *columns[3:, row])
+        assert inside == compile_program(own.limit_distances)(*STATE[:7])
 
 
 def test_what_is_the_same_in_all_rows_costs_nothing():
@@ -280,7 +282,9 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
     for row in (0, 17, 999):
         own = Batch(together.scenario(row), RK4, profile=True)
         at = (0.1, *STATE[:7])
-        assert compiled(together.program)(*at, *columns[:, row]) == compiled(own.program)(*at)
+        assert compile_program(together.program)(*at, *columns[:, row]) == compile_program(
+            own.program
+        )(*at)
     parameters["torque.amplitude"][500] = 0.0
     built.clear()
     Batch(EXAMPLE2, RK4, profile=True, parameters=parameters)

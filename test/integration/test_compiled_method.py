@@ -147,7 +147,7 @@ def linearised(scene, torque, t, y, drive):
 def test_jacobians_are_exact(what, seed):
     """Against the complex step through the kernel itself, which has no difference to cancel.
 
-    At rest of contact: the elastic ends are not in touch, where complex steps have no meaning.
+    At rest of contact: the elastic stops are not in touch, where complex steps have no meaning.
     """
     (sample,) = seeded_samples(seed + 80, 1)
     scene = loaded() if what == "loaded" else sample.scene
@@ -155,7 +155,7 @@ def test_jacobians_are_exact(what, seed):
     y = [*start(scene, 7)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
     y = [x + 0.003 * (seed + 1) * (-1) ** i for i, x in enumerate(y)]
     slope, by_time, matrix = linearised(scene, None, 0.0, [*y, 0.0], (*DRIVE, *MOMENT))
-    moment = MOMENT if dynamics.moved else None
+    moment = MOMENT if dynamics.has_moment_topic else None
     size = len(y)
     truth = np.zeros((size, size))
     for j in range(size):

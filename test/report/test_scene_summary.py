@@ -11,7 +11,7 @@ import pytest
 from mechanism.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
-from sst_ros.dynamics.traced_dynamics import Dynamics, compiled
+from sst_ros.dynamics.traced_dynamics import Dynamics, compile_program
 from sst_ros.report.scene_summary import (
     TERMS,
     WIDTH,
@@ -64,7 +64,7 @@ def test_the_plain_scene_costs_what_a_kernel_without_optional_terms_costs():
 def test_the_kernel_without_optional_terms_is_the_same_physics():
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
     for name in ("example2_heavy", "general"):
-        bare = compiled(program_of(load(name)))(*inputs)
+        bare = compile_program(program_of(load(name)))(*inputs)
         assert Dynamics.of(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
 
 

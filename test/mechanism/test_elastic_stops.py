@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compliant stops: the restitution that their damping has, and contacts at the same time."""
+"""Elastic stops: the restitution that their damping has, and contacts at the same time."""
 
 from dataclasses import replace
 

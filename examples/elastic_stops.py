@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Compliant stops at the ends of the stroke
+Elastic stops at the ends of the stroke
 =========================================
 
 The actuators of the scene ``impacts`` bounce off stiff stops with Hunt-Crossley damping.
@@ -24,4 +24,4 @@ for k in range(3):
     axes[k].set_ylabel(f"γ{'₁₂₃'[k]} [deg]")
 axes[2].set_xlabel("time t [s]")
 axes[0].set_title("Ends of the stroke dotted")
-figure.savefig("compliant_stops.png")
+figure.savefig("elastic_stops.png")
