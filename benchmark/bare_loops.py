@@ -32,10 +32,9 @@ import rclpy
 
 from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.host import scheduling
-from sst_ros.nodes import middleware, topics
-from sst_ros.nodes.messages import StateMessages, TorqueLog, finite, stamp
+from sst_ros.nodes import process, topics
 from sst_ros.nodes.polling import Reader
-from sst_ros.nodes.publications import LOG_NS
+from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
@@ -83,12 +82,13 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
 
     It takes the stamp of the sample [ns].
     """
-    middleware.configure()
+    process.configure_middleware()
     rclpy.init()
     node = rclpy.create_node("sst_simulator")
-    named = (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER_ZYZ, topics.APPLIED_TORQUES)
-    publishers = [topic.publisher(node, 1000) for topic in named]
-    readers = [Reader(node, topic) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)[:read]]
+    names = ("joint_states", "orientation", "euler_zyz", "applied_torques")
+    publishers = [topics.SIMULATOR[name].publisher(node, 1000) for name in names]
+    inputs = ("commands", "commands_stamped")[:read]
+    readers = [Reader(node, topics.SIMULATOR[name]) for name in inputs]
     messages, log = StateMessages(), TorqueLog(LOG_TICKS, TICK_NS)
     numbers = finite(*Simulation("swing").sample)
     states = (messages.joint_states, messages.orientation, messages.euler_zyz)

@@ -119,9 +119,8 @@ def node(given: Given, executable: str, parameters: Given, *, ends: bool = True)
 def simulator(given: Given, parameters: Given, *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded."""
     if recorded:
-        always = (one for one in topics.SIMULATOR if one.use == topics.PUBLISHES and not one.when)
         waits = {
-            "wait_for_subscribers": ",".join(topic.name for topic in always),
+            "wait_for_subscribers": ",".join(topics.SAMPLED),
             "subscriber_timeout": _WAIT_S,
         }
         parameters = {**parameters, **waits}
@@ -132,7 +131,7 @@ def recorder(given: Given) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
     inside = ("/" + given["namespace"].strip("/")).rstrip("/")
     names = {
-        topic: topic if topic == topics.DIAGNOSTICS.name else inside + topic
+        topic: topic if topic == topics.SIMULATOR["diagnostics"].name else inside + topic
         for topic in default_topics()
     }
     if given["bag"] == "sst":

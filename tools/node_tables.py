@@ -13,17 +13,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from sst_ros.nodes import inverse_dynamics, simulation_interfaces, topics
+from sst_ros.nodes import arguments, inverse_dynamics, simulation_interfaces, topics
 from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.runtime import diagnostics
-from sst_ros.runtime.settings import (
-    ControllerNodeParameters,
-    PlayerParameters,
-    RecorderParameters,
-    SimulatorParameters,
-    ViewerParameters,
-    default_topics,
-)
+from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.schema import Section, Spec, specs
 
 SIMULATOR = "sst_simulator"
@@ -49,17 +42,9 @@ class Described(NamedTuple):
     endpoints: tuple[Endpoint, ...]
 
 
-NODES = (
-    Described("simulator", SIMULATOR, SimulatorParameters, topics.SIMULATOR),
-    Described("torque_player", "sst_torque_player", PlayerParameters, topics.PLAYER),
-    Described(
-        "inverse_dynamics",
-        "sst_inverse_dynamics",
-        ControllerNodeParameters,
-        topics.INVERSE_DYNAMICS,
-    ),
-    Described("recorder", "sst_recorder", RecorderParameters, topics.RECORDER),
-    Described("viewer", "sst_viewer", ViewerParameters, topics.VIEWER),
+NODES = tuple(
+    Described(command, f"sst_{command}", parameters, tuple(topics.NODES[command].values()))
+    for command, (_, parameters) in arguments.COMMANDS.items()
 )
 
 

@@ -6,12 +6,11 @@ Imports no ROS: `--help` and a misspelt option need none.
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import json
 import re
-import textwrap
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +24,12 @@ USE_SIM_TIME = "use_sim_time"
 _FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
 
-_WITH_VALUE = (
-    *("-p", "--param", "--params-file", "-r", "--remap", "-e", "--enclave"),
-    *("--log-level", "--log-config-file", "--log-file-name"),
+_ROS = (
+    *(("-p", "--param"), ("--params-file",), ("-r", "--remap"), ("-e", "--enclave")),
+    *(("--log-level",), ("--log-config-file",), ("--log-file-name",)),
 )
+"""ROS arguments with a value, by all their names."""
 _FLAGS = re.compile(r"--(enable|disable)-(rosout|stdout|external-lib)-logs")
-_YAML = {True: "true", False: "false"}
-
 
 COMMANDS: dict[str, tuple[str, type[Section]]] = {
     "simulator": ("Simulator", settings.SimulatorParameters),
@@ -50,22 +48,7 @@ def wants_help(words: Sequence[str]) -> bool:
 
 def help_text(command: str) -> str:
     """Return the parameters of a node with defaults, units and bounds."""
-    _, parameters = COMMANDS[command]
-    defaults = parameters()
-    text = [
-        f"usage: {command} [--PARAMETER VALUE ...] [--ros-args ROS_ARGUMENT ...]",
-        "",
-        f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:",
-        "",
-    ]
-    for name, spec in specs(parameters).items():
-        value = getattr(defaults, name)
-        shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
-        text.append(f"  --{name.replace('_', '-')}")
-        about = f"{spec.doc}; {spec.allowed()}; default: {shown}"
-        text += textwrap.wrap(about, 92, initial_indent=" " * 6, subsequent_indent=" " * 6)
-    text.append("  --use-sim-time\n      follow /clock; must be true or false; default: false")
-    return "\n".join(text)
+    return _parser(command).format_help().rstrip()
 
 
 def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
@@ -75,32 +58,23 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
         InputError: lists every word that is no argument of the node, with the closest one.
 
     """
-    known = {**specs(COMMANDS[command][1]), USE_SIM_TIME: Spec("flag", "follow /clock")}
+    known = _known(command)
     plain, ros = _split(words)
-    problems = [*_faults(ros, known)]
+    problems = [*_ros_faults(ros, known)]
+    # A parameter is an option by its name, too: --publish_rate.
+    dashed = [re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), word) for word in plain]
+    given, unknown = _parser(command).parse_known_args(dashed)
+    problems += [Problem(word, word, _advice(word, known)) for word in unknown]
     options: list[str] = []
-    index = 0
-    while index < len(plain):
-        word, index = plain[index], index + 1
-        name, equals, value = word.partition("=")
-        key = name.removeprefix("--").replace("-", "_")
-        if not name.startswith("--") or key not in known:
-            problems.append(Problem(word, word, _advice(word, key, known)))
+    for name, word in vars(given).items():
+        spec, option = known[name], _option(name)
+        if word is None and spec.kind != "flag":
+            problems.append(Problem(option, None, f"needs a value, which {spec.allowed()}"))
             continue
-        spec = known[key]
-        if not equals:
-            following = plain[index] if index < len(plain) else None
-            if spec.kind == "flag" and following not in _YAML.values():
-                value = "true"
-            elif following is None or following.startswith("--"):
-                problems.append(Problem(word, None, f"needs a value, which {spec.allowed()}"))
-                continue
-            else:
-                value, index = following, index + 1
         try:
-            options += ["-p", f"{key}:={_as_yaml(spec, value)}"]
+            options += ["-p", f"{name}:={_as_yaml(spec, 'true' if word is None else word)}"]
         except ValueError:
-            problems.append(Problem(word, value, spec.allowed()))
+            problems.append(Problem(option, word, spec.allowed()))
     if problems:
         raise InputError(command, problems)
     return ["--ros-args", *ros, *options] if ros or options else []
@@ -109,8 +83,8 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
 def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
     """Return one line for each parameter file that has no parameters for the node of the words."""
     node, namespace = f"sst_{command}", ""
-    _, ros = _split(words)
-    for rule in _values(ros, ("-r", "--remap")):
+    given, _ = _ros_parser().parse_known_args(_split(words)[1])
+    for rule in given.remap:
         if found := re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule):
             if found[1] == "ns":
                 namespace = found[2].strip("/")
@@ -118,7 +92,7 @@ def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
                 node = found[2]
     full = "/" + "/".join(filter(None, (namespace, node)))
     lines = []
-    for path in _values(ros, ("--params-file",)):
+    for path in given.params_file:
         patterns = ["/" + pattern.strip("/") for pattern in _nodes_of(_document(path))]
         if not any(_matches(pattern, full) for pattern in patterns):
             names = ", ".join(patterns)
@@ -158,40 +132,64 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return plain, ros
 
 
-def _faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]:
-    index = 0
-    while index < len(ros):
-        word, index = ros[index], index + 1
-        if _FLAGS.fullmatch(word):
-            continue
-        name, equals, value = word.partition(":=")
-        if name.startswith("--") and equals and name.split(":")[0] in _WITH_VALUE:
-            word = name
-        elif word in _WITH_VALUE and index < len(ros):
-            value, index = ros[index], index + 1
-        else:
-            allowed = f"is no ROS argument: known are {', '.join(_WITH_VALUE)}"
-            yield Problem(word, value or None, allowed)
-            continue
-        if word in ("-p", "--param"):
-            key, assigned, _ = value.partition(":=")
-            key = key.rpartition(":")[2]
-            if not assigned:
-                yield Problem(word, value, "must be NAME:=VALUE")
-            elif key not in known and not is_foreign(key):
-                yield unknown_parameter(key, [*known])
-        elif word == "--params-file":
-            try:
-                if not [*_nodes_of(_document(value))]:
-                    raise ValueError("no ros__parameters")
-            except (OSError, ValueError, yaml.YAMLError) as error:
-                reason = str(error).splitlines()[0]
-                allowed = "must be a parameter file, NODE: {ros__parameters: {NAME: VALUE}}"
-                yield Problem(word, value, f"{allowed} ({reason})")
+def _known(command: str) -> dict[str, Spec]:
+    return {**specs(COMMANDS[command][1]), USE_SIM_TIME: Spec("flag", "follow /clock")}
 
 
-def _values(ros: Sequence[str], names: Sequence[str]) -> list[str]:
-    return [value for word, value in pairwise(ros) if word in names]
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _parser(command: str) -> argparse.ArgumentParser:
+    """Make the parser of plain options; it leaves words to be checked, so that all are."""
+    parser = argparse.ArgumentParser(
+        prog=command,
+        usage="%(prog)s [--PARAMETER VALUE ...] [--ros-args ROS_ARGUMENT ...]",
+        description=f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:",
+        add_help=False,
+        allow_abbrev=False,
+        argument_default=argparse.SUPPRESS,
+    )
+    defaults = COMMANDS[command][1]()
+    for name, spec in _known(command).items():
+        value = getattr(defaults, name, False)
+        shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
+        text = f"{spec.doc}; {spec.allowed()}; default: {shown}".replace("%", "%%")
+        parser.add_argument(_option(name), nargs="?", metavar="VALUE", help=text)
+    return parser
+
+
+def _ros_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for names in _ROS:
+        parser.add_argument(*names, nargs="?", action="append", default=[])
+    return parser
+
+
+def _ros_faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]:
+    given, unknown = _ros_parser().parse_known_args(ros)
+    listed = ", ".join(name for names in _ROS for name in names)
+    for word in unknown:
+        if not _FLAGS.fullmatch(word):
+            yield Problem(word, None, f"is no ROS argument: known are {listed}")
+    for name, values in vars(given).items():
+        if None in values:
+            yield Problem(_option(name), None, "needs a value")
+    for value in filter(None, given.param):
+        key, assigned, _ = value.partition(":=")
+        key = key.rpartition(":")[2]
+        if not assigned:
+            yield Problem("-p", value, "must be NAME:=VALUE")
+        elif key not in known and not is_foreign(key):
+            yield unknown_parameter(key, [*known])
+    for path in filter(None, given.params_file):
+        try:
+            if not [*_nodes_of(_document(path))]:
+                raise ValueError("no ros__parameters")
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            reason = str(error).splitlines()[0]
+            allowed = "must be a parameter file, NODE: {ros__parameters: {NAME: VALUE}}"
+            yield Problem("--params-file", path, f"{allowed} ({reason})")
 
 
 def _document(path: str) -> Any:
@@ -218,17 +216,16 @@ def _matches(pattern: str, full: str) -> bool:
     return re.fullmatch("".join(parts), full) is not None
 
 
-def _advice(word: str, key: str, known: dict[str, Spec]) -> str:
-    if word in ("-p", "-r", "--params-file", "--log-level", "--remap", "--param"):
+def _advice(word: str, known: dict[str, Spec]) -> str:
+    """Say what a word that is no option may have been meant as."""
+    if any(word in names for names in _ROS):
         return "goes behind --ros-args"
-    name = key.partition(":")[0].strip("_")
+    name = re.split("[=:]", word)[0].strip("-_").replace("-", "_")
     close = difflib.get_close_matches(name, known, 1)
-    if close and not word.startswith("--") and name == close[0]:
-        return f"did you mean --{close[0].replace('_', '-')} VALUE?"
-    options = [f"--{name.replace('_', '-')}" for name in (close or known)]
-    return (
-        f"did you mean {options[0]}?" if close else f"is no option: known are {', '.join(options)}"
-    )
+    if not close:
+        return f"is no option: known are {', '.join(map(_option, known))}"
+    value = " VALUE" if name == close[0] and not word.startswith("--") else ""
+    return f"did you mean {_option(close[0])}{value}?"
 
 
 def _as_yaml(spec: Spec, word: str) -> str:

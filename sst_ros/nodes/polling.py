@@ -17,8 +17,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from sst_ros.nodes.graph import COUNT_NS
-from sst_ros.nodes.topics import Endpoint
+from sst_ros.nodes.topics import COUNT_NS, Endpoint
 from sst_ros.runtime.torque_input import MOST_WAITING
 
 

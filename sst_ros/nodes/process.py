@@ -6,25 +6,39 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import importlib
+import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Protocol
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 
 from sst_ros.errors import InputError, SstError
 from sst_ros.host.child_process import orphaned
-from sst_ros.nodes import arguments, middleware, shared_memory, signals
+from sst_ros.nodes import arguments, signals
 
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+_FIRST_RCLPY_ON_FAST_DDS_3 = 9
+"""Of ROS 2 Kilted."""
 _POLL_S = 0.1
 """Longest delay of a signal. The executor would take half a millisecond for each look."""
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
+_ACKNOWLEDGE_S = 1.2
+"""A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 _CLEAN_UP_S = 10.0
 """Longer than any clean-up of the middleware, also on a busy machine."""
 _STDERR = 2
@@ -60,8 +74,7 @@ def run(words: Sequence[str]) -> int:
     if arguments.wants_help(given):
         print(arguments.help_text(command))
         return 0
-    middleware.configure()
-    shared_memory.remove_dead()
+    configure_middleware()
     try:
         ros = arguments.ros_arguments(command, given)
         for line in arguments.params_file_warnings(command, ros):
@@ -152,6 +165,46 @@ def spin(worker: Worker) -> None:
             worker.close()
         finally:
             with _bounded():
-                middleware.finish(worker.node.publishers)
+                _wait_for_subscribers(worker.node.publishers)
                 callbacks.shut_down()
                 worker.node.destroy_node()
+
+
+def configure_middleware() -> None:
+    """Select our profile of Fast DDS, unless the user has selected one. Before `rclpy.init`.
+
+    By default a reliable writer asks its readers every 3 s what has arrived, and then removes 1500
+    samples at once while the publisher waits: one to three milliseconds, hence missed ticks. Five
+    times a second it takes a fifteenth of that; more often it would cost a thread that wakes for
+    each topic.
+
+    By default a reliable writer also wakes its thread for events after each message and reader, to
+    ignore requests for it for a time of zero: half of what publishing costs. With 50 ms (the
+    element's name is spelt as Fast DDS spells it) the thread wakes 20 times a second; a message
+    that was lost is repeated that much later.
+
+    Other middleware ignores the profile.
+    """
+    names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+    if any(os.environ.get(name) for name in names):
+        return
+    try:
+        major = int(version("rclpy").partition(".")[0])
+    except (PackageNotFoundError, ValueError):
+        major = _FIRST_RCLPY_ON_FAST_DDS_3
+    # Both the variable and the setting have other names in Fast DDS 2.
+    generation = 3 if major >= _FIRST_RCLPY_ON_FAST_DDS_3 else 2
+    os.environ[names[generation - 2]] = str(Path(__file__).with_name(f"fast_dds_{generation}.xml"))
+
+
+def _wait_for_subscribers(publishers: Iterable[Publisher[Any]]) -> None:
+    """Wait a while until the subscribers have received what was published."""
+    deadline = time.monotonic() + _ACKNOWLEDGE_S
+    for publisher in publishers:
+        left = max(0.0, deadline - time.monotonic())
+        publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+def every(node: Node, seconds: float, callback: Callable[[], None]) -> Timer:
+    """Call back by a clock that does not stand still with simulated time."""
+    return node.create_timer(seconds, callback, clock=_STEADY)

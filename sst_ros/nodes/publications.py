@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of the simulator, as the output of the run loop.
+"""What the simulator publishes: numbers of a state as messages, and the topics they go to.
+
+Messages are bytes, which `Publisher.publish` takes: CDR, little-endian (OMG DDS-XTypes, XCDR1).
+Their layout is made once, afterwards only numbers are written: to convert a message object each
+time costs three times as much as the rest of publishing it (docs/nodes.md has the figures).
 
 Publishing happens in the thread of the run, after the step, in the slack before the next deadline;
 a topic without subscribers is left out.
@@ -12,8 +16,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -21,29 +26,239 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from sst_ros.description.urdf import urdf
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.nodes import topics
-from sst_ros.nodes.clocks import PublishedClock
-from sst_ros.nodes.graph import COUNT_NS
-from sst_ros.nodes.messages import NotFinite, Numbers, StateMessages, TorqueLog, finite, stamp
+from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, HasState
+from sst_ros.runtime.torque_input import ACTUATORS, ZERO, HasState
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.simulation import State
-from sst_ros.state import IDLE_FRAME_ID, Vector3
+from sst_ros.simulation.simulation import NANOSECONDS, State
+from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, Vector3
 
-_HISTORY_S = 2
-_FAST = 10
-_LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180
 of a wake."""
+MOMENTS = ("moment_x", "moment_y", "moment_z")
+_HISTORY_S = 2
+_FAST = 10
+_LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
+_DISCOVERY_S = 5.0
+"""A participant of DDS whose first announcements were lost announces itself again within 3 s."""
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+_STAMP = struct.Struct("<iI")
+_AT_REST = (0.0,) * len(JOINTS)
+_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
 
+Numbers = tuple[Sequence[float], Sequence[float], Sequence[float]]
+"""Of a state: quaternion (x, y, z, w); nine angles [rad], then nine rates [rad/s], by kind and leg;
+torques of the actuators [N m]."""
 Message = Callable[[bytes, Numbers], bytes]
 """Makes a message of the bytes of a stamp and the numbers of a state."""
-_AT_REST = (0.0,) * len(JOINTS)
+
+
+def stamp(nanoseconds: int) -> bytes:
+    """Return the bytes of a builtin_interfaces Time or Duration."""
+    return _STAMP.pack(*divmod(nanoseconds, NANOSECONDS))
+
+
+def clock_message(nanoseconds: int) -> bytes:
+    """Return a rosgraph_msgs/Clock."""
+    return _ENCAPSULATION + stamp(nanoseconds)
+
+
+def _layout(*fields: str | int, align: int = 8) -> bytes:
+    """Return what stands between the stamp of a header and doubles that follow the fields.
+
+    A string is its length with the closing zero, its characters, zero; an int is the length of a
+    sequence. Numbers lie at multiples of their size, counted from the end of the encapsulation.
+    """
+    data = bytearray(_STAMP.size)
+    for field in fields:
+        data += bytes(-len(data) % 4)
+        if isinstance(field, int):
+            data += struct.pack("<I", field)
+        else:
+            encoded = field.encode() + b"\x00"
+            data += struct.pack("<I", len(encoded)) + encoded
+    return bytes(data[_STAMP.size :]) + bytes(-len(data) % align)
+
+
+class NotFinite(SstError):
+    """A state has a number that is not finite; it is not published."""
+
+
+def finite(y: Sequence[float], joints: Sequence[float], torque: Sequence[float]) -> Numbers:
+    """Return the numbers of a state, for numbers y that begin with the quaternion.
+
+    Raises:
+        NotFinite: one of them is not finite.
+
+    """
+    quaternion = y[:4]
+    # One number that is not finite makes the sum so.
+    if not math.isfinite(sum(joints) + sum(quaternion) + sum(torque)):
+        raise NotFinite(f"not finite, so not published: {quaternion}, {joints}, {torque}")
+    return quaternion, joints, torque
+
+
+class StateMessages:
+    """Bytes of joint_states, orientation and euler_zyz, for the bytes of a stamp and the numbers.
+
+    Each is one call of a struct: field by field takes 1.7 times as long.
+
+    Args:
+        frame_id: of joint_states; the others are in base_link.
+
+    """
+
+    def __init__(self, frame_id: str = "") -> None:
+        count = len(JOINTS)
+        self._names, self._base = _layout(frame_id, count, *JOINTS, count), _layout(BASE_FRAME)
+        stamped = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s"
+        more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
+        self._joints = struct.Struct(f"{stamped}{len(self._names)}s{count}d{more}{more}").pack
+        self._quaternion, self._angles = (
+            struct.Struct(f"{stamped}{len(self._base)}s{numbers}d").pack for numbers in (4, 3)
+        )
+
+    def joint_states(self, at: bytes, numbers: Numbers) -> bytes:
+        """Return a JointState; the effort is the torque over the step that ended."""
+        _, joints, torque = numbers
+        angles, rates, count = joints[:9], joints[9:], len(JOINTS)
+        return self._joints(
+            _ENCAPSULATION, at, self._names, *angles, count, *rates, count, *torque, *_PASSIVE
+        )
+
+    def orientation(self, at: bytes, numbers: Numbers) -> bytes:
+        """Return a QuaternionStamped."""
+        return self._quaternion(_ENCAPSULATION, at, self._base, *numbers[0])
+
+    def euler_zyz(self, at: bytes, numbers: Numbers) -> bytes:
+        """Return a Vector3Stamped of the ZYZ angles theta, phi, psi [rad]."""
+        return self._angles(_ENCAPSULATION, at, self._base, *zyz_angles(numbers[0]))
+
+
+def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
+    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `frames.zyz_angles`.
+
+    z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
+    """
+    x, y, z, w = quaternion
+    sine, cosine = math.hypot(x, y), math.hypot(z, w)
+    total = math.atan2(z, w) if cosine else 0.0
+    difference = math.atan2(-x, y) if sine else 0.0
+    if sine and cosine:
+        theta, psi = total + difference, total - difference
+    else:
+        theta, psi = 0.0, 2.0 * (total - difference)
+    # In (-pi, pi], as atan2 gives it.
+    if not -math.pi < theta <= math.pi:
+        theta -= math.copysign(2.0 * math.pi, theta)
+    if not -math.pi < psi <= math.pi:
+        psi -= math.copysign(2.0 * math.pi, psi)
+    return theta, 2.0 * math.atan2(sine, cosine), psi
+
+
+class TorqueLog:
+    """applied_torques: torque and moment of every tick since the last publication.
+
+    Point i holds over tick i; its time is the end of that tick, relative to the header's stamp.
+    """
+
+    def __init__(self, usual: int, period_ns: int, *, moments: bool = False) -> None:
+        self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
+        self._period_ns, self._moments = period_ns, moments
+        self._rows: list[tuple[float, ...]] = []
+        # Made for the usual number of ticks, and for none, where there is no run.
+        self._layouts = {count: self._lay_out(count) for count in (0, usual)}
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def clear(self) -> None:
+        """Forget the rows."""
+        self._rows.clear()
+
+    def append(self, torque: Sequence[float], moment: Sequence[float], ticks: int = 1) -> None:
+        """Log the torque [N m] and the moment [N m] of some ticks."""
+        row = (*torque, *moment) if self._moments else tuple(torque)
+        self._rows.extend([row] * ticks)
+
+    def take(self, stamp_ns: int) -> bytes:
+        """Return the message of the ticks logged since stamp_ns and clear the log."""
+        count = len(self._rows)
+        pack, head, behind = self._layouts.get(count) or self._lay_out(count)
+        values: list[Any] = [_ENCAPSULATION, stamp(stamp_ns), head]
+        for row, after in zip(self._rows, behind, strict=True):
+            values += row
+            values.append(after)
+        self._rows.clear()
+        return pack(*values)
+
+    def _lay_out(self, count: int) -> tuple[Callable[..., bytes], bytes, list[bytes]]:
+        """Return what packs a message, what stands before its rows and what behind each.
+
+        A point has no positions, velocities and accelerations, then the row, then its time.
+        """
+        begin = 0, 0, 0, len(self._names)
+        named = BASE_FRAME, len(self._names), *self._names, count
+        head = _layout(*named, *begin) if count else _layout(*named, align=1)
+        times = (stamp((point + 1) * self._period_ns) for point in range(count))
+        behind = [time + struct.pack("<4I", *begin) for time in times]
+        row = f"{len(self._names)}d"
+        rows = f"{row}{_STAMP.size + 16}s" * (count - 1) + f"{row}{_STAMP.size}s" * bool(count)
+        form = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s{len(head)}s{rows}"
+        return struct.Struct(form).pack, head, behind
+
+
+def follows_clock(node: Node) -> bool:
+    """Whether use_sim_time is set."""
+    return bool(node.get_parameter("use_sim_time").value)
+
+
+class PublishedClock:
+    """Publishes /clock; there must be no other publisher.
+
+    Raises:
+        InputError: /clock is published already, or the node itself follows it.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        origin, name = node.get_fully_qualified_name(), "publish_clock"
+        if follows_clock(node):
+            allowed = "a node with use_sim_time follows /clock and cannot be its source"
+            raise InputError(origin, [Problem(name, True, allowed)])
+        deadline = time.monotonic() + _DISCOVERY_S
+        others: list[str] = []
+        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
+            others = topics.publishers(node, "/clock")
+            time.sleep(0.02)
+        if others:
+            allowed = f"/clock is published already, by {', '.join(others)}"
+            raise InputError(origin, [Problem(name, True, allowed)])
+        self._publisher = topics.SIMULATOR["clock"].publisher(node)
+        self.now_ns = node.get_clock().now().nanoseconds
+
+    def publish(self, now_ns: int) -> None:
+        """Publish the time."""
+        self.now_ns = now_ns
+        self.repeat()
+
+    def repeat(self) -> None:
+        """Publish the time again, for late subscribers."""
+        self._publisher.publish(clock_message(self.now_ns))
+
+    def rivals(self) -> list[str]:
+        """Names of other nodes that publish /clock."""
+        found = topics.publishers(self._node, "/clock")
+        own = self._node.get_fully_qualified_name()
+        if own in found:
+            found.remove(own)
+        return found
 
 
 class SimulatorTopics:
@@ -55,29 +270,29 @@ class SimulatorTopics:
     """
 
     def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
-        self._node = node
+        self._node, own = node, topics.SIMULATOR
         self._clock = PublishedClock(node) if given.publish_clock else None
         history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         self._joints, self._orientation, self._euler, self._torques = (
             topic.publisher(node, depth)
             for topic in (
-                topics.JOINT_STATES,
-                topics.ORIENTATION,
-                topics.EULER_ZYZ,
-                topics.APPLIED_TORQUES,
+                own["joint_states"],
+                own["orientation"],
+                own["euler_zyz"],
+                own["applied_torques"],
             )
         )
         self._read: list[Publisher[Any]] = []
         self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
-        self._phase = topics.PHASE.publisher(node)
-        self._scene = topics.SCENE.publisher(node)
+        self._phase = own["phase"].publisher(node)
+        self._scene = own["scene"].publisher(node)
         self._scene.publish(String(data=dump(scene)))
         if given.publish_description:
-            self._description = topics.ROBOT_DESCRIPTION.publisher(node)
+            self._description = own["robot_description"].publisher(node)
             self._description.publish(String(data=urdf(scene)))
-        self.diagnostics = topics.DIAGNOSTICS.publisher(node)
+        self.diagnostics = own["diagnostics"].publisher(node)
         self._awaited = self._named(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO

@@ -8,7 +8,6 @@ an executor, measured in two processes at once.
 
 from __future__ import annotations
 
-import importlib
 import threading
 import time
 from collections.abc import Iterable
@@ -32,8 +31,8 @@ from rosbags.interfaces import (
 
 from sst_ros.errors import SstError
 from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.clocks import STEADY
 from sst_ros.nodes.polling import NeverSpun, take
+from sst_ros.nodes.process import every
 from sst_ros.nodes.topics import Endpoint
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
@@ -44,19 +43,11 @@ _LOOK_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 
 
-def _last(name: str) -> str:
-    return name.rpartition("/")[2]
-
-
 _DECLARED = {
-    _last(one.name): one
-    for one in (*topics.SIMULATOR, topics.REFERENCE, topics.TRACKING_ERROR, topics.JOINT_TRAJECTORY)
+    name: one
+    for name, one in {**topics.CONTROLLER, **topics.SIMULATOR}.items()
     if one.use in (topics.PUBLISHES, topics.SUBSCRIBES)
 }
-_ALWAYS = {
-    _last(one.name) for one in topics.SIMULATOR if one.use == topics.PUBLISHES and not one.when
-}
-"""Topics that a simulator publishes in every run."""
 
 
 class RecordingIncomplete(SstError):
@@ -103,7 +94,8 @@ class Recorder:
         given = parameters.declare(self.node, RecorderParameters)
         self._wanted = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
         self._foreign = {topic for topic in self._wanted if _last(topic) not in _DECLARED}
-        self._required = {topic for topic in self._wanted if _last(topic) in _ALWAYS}
+        sampled = set(map(_last, topics.SAMPLED))
+        self._required = {topic for topic in self._wanted if _last(topic) in sampled}
         self._recorded: dict[str, RecordedTopic] = {}
         self._unknown: set[str] = set()
         self._ready = False
@@ -112,8 +104,8 @@ class Recorder:
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
         self._bag = BagWriter(Path(dated if given.output == "-" else given.output))
         self.node.get_logger().info(f"recording to {self._bag.path}")
-        self.node.create_timer(_LOOK_PERIOD_S, self._look, clock=STEADY)
-        self.node.create_timer(_TAKE_PERIOD_S, self._take, clock=STEADY)
+        every(self.node, _LOOK_PERIOD_S, self._look)
+        every(self.node, _TAKE_PERIOD_S, self._take)
 
     def close(self) -> None:
         """Take what has arrived and close the bag.
@@ -186,9 +178,8 @@ class Recorder:
             return
         # That of a topic of ours does not depend on the order of discovery.
         qos = _qos(latched=own.latched, reliable=True) if own else _offered_qos(offers)
-        package, _, name = type_name.split("/")
         subscription = self.node.create_subscription(
-            getattr(importlib.import_module(f"{package}.msg"), name),
+            topics.message_type(type_name),
             topic,
             lambda _: None,
             qos,
@@ -246,3 +237,7 @@ def _bag_qos(asked: QoSProfile) -> Qos:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]

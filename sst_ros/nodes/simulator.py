@@ -3,35 +3,48 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.timer import Timer
+from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import scheduling
-from sst_ros.nodes import graph, parameters, simulation_interfaces, topics
-from sst_ros.nodes.clocks import FOLLOWED_STEP_NS, STEADY, FollowedClock, follows_clock
-from sst_ros.nodes.compiled_code import CodeCompiler
-from sst_ros.nodes.messages import diagnostics
+from sst_ros.host.cache_folder import cache_folder
+from sst_ros.integration import code_cache, codegen
+from sst_ros.nodes import parameters, simulation_interfaces, topics
 from sst_ros.nodes.polling import Reader
-from sst_ros.nodes.publications import SimulatorTopics
-from sst_ros.nodes.services import Services
+from sst_ros.nodes.process import every
+from sst_ros.nodes.publications import SimulatorTopics, follows_clock
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.runtime.torque_input import ZERO, MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+_DELAY_S = 5.0
+"""Delay of the compiler: the first seconds of a real-time run have the processor alone."""
 _WATCH_S = 0.1
 _END_S = 0.5
 """Wait for the thread of the run, where a step does not end."""
+FOLLOWED_STEP_NS = 200_000_000
+"""Steps of a followed clock up to this length are simulated; longer ones are dropped time."""
+_LONGEST_WAIT_S = 0.05
 
 
 class Simulator:
@@ -58,9 +71,9 @@ class Simulator:
         )
         period_s = given.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
-        Services(self.node, self._loop)
+        serve(self.node, self._loop)
         simulation_interfaces.offer(self.node, self._loop, self.done.set)
-        self.node.create_timer(1.0, self._report, clock=STEADY)
+        every(self.node, 1.0, self._report)
         self._read_gauges()
         self._loop.post(self._quiet)
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
@@ -118,17 +131,16 @@ class Simulator:
         )
 
     def _create_pacer(self) -> Pacer:
-        given = self.parameters
+        speed = self._run.period_ns, self.parameters.real_time_factor
         if follows_clock(self.node):
-            clock = FollowedClock(self.node)
-            return Pacer(given.period_ns, given.real_time_factor, clock, FOLLOWED_STEP_NS)
-        return Pacer(given.period_ns, given.real_time_factor, SteadyTime())
+            return Pacer(*speed, FollowedClock(self.node), FOLLOWED_STEP_NS)
+        return Pacer(*speed, SteadyTime())
 
     def _readers(self, simulated: Scene) -> list[Reader]:
-        inputs = [topics.COMMANDS, topics.COMMANDS_STAMPED]
+        names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
-            inputs.append(topics.EXTERNAL_MOMENT)
-        return [Reader(self.node, topic) for topic in inputs]
+            names.append("external_moment")
+        return [Reader(self.node, topics.SIMULATOR[name]) for name in names]
 
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
@@ -173,14 +185,13 @@ class Simulator:
         """Publish the diagnostics, log what is new, request gauges for the next time."""
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
         own = self.node.get_fully_qualified_name()
-        commands = [topic.at(own) for topic in (topics.COMMANDS, topics.COMMANDS_STAMPED)]
+        commands = [topics.SIMULATOR[name].at(own) for name in ("commands", "commands_stamped")]
         publishers = sum(map(self.node.count_publishers, commands))
         level, text, news = self._diagnostics.status(publishers, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
-        stamp_ns = self.node.get_clock().now().nanoseconds
         values = self._diagnostics.values(publishers)
-        message = diagnostics(f"{own}: run", stamp_ns, _LEVELS[level], text, values)
+        message = topics.diagnostics(self.node, "run", _LEVELS[level], text, values)
         self._topics.diagnostics.publish(message)
         scheduling.tidy()
         if self._loop.phase is not Phase.FINISHED:
@@ -193,11 +204,11 @@ class Simulator:
         if follows_clock(self.node) and self._topics.now_ns() == 0:
             yield "use_sim_time is set and there is no /clock: the run waits for it"
         for topic in commands:
-            for name in graph.publishers(self.node, topic, best_effort=True):
+            for name in topics.publishers(self.node, topic, best_effort=True):
                 yield f"{topic} of {name} is best effort and not received: publish it reliably"
         own = self.node.get_fully_qualified_name()
         # Not by the names of the graph: a node that has ended may stay there.
-        if self.node.count_publishers(topics.PHASE.at(own)) > 1:
+        if self.node.count_publishers(topics.SIMULATOR["phase"].at(own)) > 1:
             yield f"another node is named {own}, too"
 
 
@@ -208,3 +219,123 @@ def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
     except (InputError, TypeError):
         return {}
     return {"duration": simulated.duration or 0.0}
+
+
+def serve(node: Node, loop: RunLoop) -> None:
+    """Offer the services and the topic by which a run is controlled; the run loop decides."""
+
+    def offer(name: str, request_of: Callable[[Any], Callable[[], Reply]]) -> None:
+        def answer(request: Any, response: Any) -> Any:
+            response.success, response.message = loop.ask(request_of(request))
+            return response
+
+        service = topics.SIMULATOR[name]
+        qos = topics.SERVICE_QOS
+        node.create_service(service.kind, service.name, answer, qos_profile=qos)
+
+    def set_state(message: JointState) -> None:
+        """Take the angles and rates of the actuators; the log has the reply."""
+        try:
+            gamma = by_name(message.name, message.position, "angles [rad] in position")
+            gamma_dot = ZERO
+            if len(message.velocity):
+                gamma_dot = by_name(message.name, message.velocity, "rates [rad/s] in velocity")
+        except MessageRefused as refused:
+            node.get_logger().warning(f"set_state refused: {refused}")
+            return
+        reply = loop.ask(partial(loop.set_state, gamma, gamma_dot))
+        text = f"set_state: {reply.message}"
+        if reply.success:  # rclpy refuses two severities from one line
+            node.get_logger().info(text)
+        else:
+            node.get_logger().warning(text)
+
+    offer("pause", lambda request: partial(loop.pause, request.data))
+    offer("step", lambda _: loop.step)
+    offer("reset", lambda _: loop.reset)
+    topics.SIMULATOR["set_state"].subscription(node, set_state)
+
+
+class CodeCompiler:
+    """Finds the compiled code of a scene, or has it made for the next start.
+
+    To compile in this process would delay the run by half a minute, at the start or when the
+    integrator changes its method.
+
+    Attributes:
+        available: all code of the scene is there.
+
+    """
+
+    def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
+        self._node, self._given = node, given
+        self._timer: Timer | None = None
+        self.available = False
+        log = node.get_logger()
+        if codegen.numba_version() is None:
+            log.info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
+        elif code_cache.is_there(scene, given.integrator):
+            self.available = True
+            log.info(f"compiled code from {cache_folder()}")
+        else:
+            log.info("plain Python, the same bits but slower: the scene is not compiled yet")
+            self._timer = every(node, _DELAY_S, self.start)
+
+    def start(self) -> None:
+        """Start the compiler once, unless another process compiles; also at the end of the node."""
+        if self._timer is None:
+            return
+        self._node.destroy_timer(self._timer)
+        self._timer = None
+        if _is_compiling():
+            self._node.get_logger().info("another process compiles: this one does not")
+            return
+        given = self._given
+        command = ["compile", given.scene, "--integrator", given.integrator]
+        compiler = subprocess.Popen(
+            [sys.executable, "-m", "sst_ros", *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # the next start needs the code, even if this run has ended
+            preexec_fn=lambda: os.nice(19),
+        )
+        text = f"process {compiler.pid} compiles the scene for the next start"
+        self._node.get_logger().info(text)
+
+
+def _is_compiling() -> bool:
+    """Whether a process has the lock of `code_cache.make`."""
+    try:
+        with (cache_folder() / "lock").open("r") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # not compiled yet
+        return False
+    return False
+
+
+class FollowedClock:
+    """The ROS clock of a node with use_sim_time, as a time source of the pacer."""
+
+    def __init__(self, node: Node) -> None:
+        self._clock = node.get_clock()
+        self._moved = threading.Event()
+        threshold = JumpThreshold(
+            min_forward=Duration(nanoseconds=1),
+            min_backward=Duration(nanoseconds=-1),
+            on_clock_change=True,
+        )
+        self._jumps = self._clock.create_jump_callback(
+            threshold, post_callback=lambda _: self._moved.set()
+        )
+
+    def now_ns(self) -> int:
+        """Return the time [ns]; 0 before the first /clock."""
+        return int(self._clock.now().nanoseconds)
+
+    def sleep(self, seconds: float, /) -> None:
+        """Wait for the next /clock."""
+        self._moved.wait(_LONGEST_WAIT_S)
+        self._moved.clear()

@@ -1,67 +1,171 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic and service of every node, declared once: nodes open them, docs and tests list them.
+"""Topics, services and actions of the nodes: one table that they, the docs and the policies follow.
 
-In names ~ stands for the name of the node.
+Who is at the other end of a topic, and goals of actions that end later than they are accepted.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped, Vector3Stamped, WrenchStamped
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory
+from rclpy.task import Future
 
 from sst_ros.runtime.torque_input import MOST_WAITING
+from sst_ros.state import NANOSECONDS
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 EXECUTES = "executes"
 
+# Use, name, type; how many messages are kept for slow readers, 0 for two seconds of them; `latched`
+# where the last one is kept for late joiners. Then what it carries, and the condition under which
+# it exists. In names ~ stands for the name of the node, {simulator} for the parameter.
+_TABLE = """
+[simulator]
+publishes joint_states sensor_msgs/msg/JointState 0
+    gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the step
+    that ended [N m]; frame_id `idle` where it is no sample of a run
+publishes ~/orientation geometry_msgs/msg/QuaternionStamped 0
+    orientation of {E} in {B}, frame_id `base_link`
+publishes ~/euler_zyz geometry_msgs/msg/Vector3Stamped 0
+    the same as ZYZ angles theta, phi, psi [rad]
+publishes ~/applied_torques trajectory_msgs/msg/JointTrajectory 0
+    torques of every step since the last message [N m], with the sample after 50 ms of simulated
+    time and when the run pauses or ends; where the scene takes a moment from a topic also moment_x,
+    moment_y, moment_z in {B}
+publishes ~/scene std_msgs/msg/String 1 latched
+    the scene, as YAML
+publishes ~/phase std_msgs/msg/String 1 latched
+    waiting, running, paused, finished, or `fault: ` with the reason
+publishes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
+    diagnostics of the run, at 1 Hz
+publishes /clock rosgraph_msgs/msg/Clock 1
+    simulated time
+    if publish_clock is true
+publishes robot_description std_msgs/msg/String 1 latched
+    the scene as URDF
+    if publish_description is true, the default
+subscribes ~/commands std_msgs/msg/Float64MultiArray MOST_WAITING
+    torques of gamma_1..3 [N m], held until the next
+subscribes ~/commands_stamped sensor_msgs/msg/JointState MOST_WAITING
+    the same by name, in effort [N m]; the stamp is that of the joint_states it answers
+subscribes ~/external_moment geometry_msgs/msg/WrenchStamped MOST_WAITING
+    moment on the star, torque in {B} [N m]; the force is not used
+    if the scene has moment: {topic: true}
+subscribes ~/set_state sensor_msgs/msg/JointState 10
+    state to continue from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3;
+    refused while running, in fault, and where it is not admissible
+serves ~/pause std_srvs/srv/SetBool
+    pause the run, or resume it; idempotent
+serves ~/step std_srvs/srv/Trigger
+    advance a paused run by one sample; refused while running
+serves ~/reset std_srvs/srv/Trigger
+    back to the initial state, also out of a fault; stamps continue
+
+[torque_player]
+publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
+    the profile's torques [N m] for the hold that each joint_states begins
+    if stamped is false
+publishes {simulator}/commands_stamped sensor_msgs/msg/JointState 1000
+    the same, by name and stamp
+    if stamped is true
+subscribes joint_states sensor_msgs/msg/JointState 1000
+    samples that are answered, from the first on
+subscribes {simulator}/phase std_msgs/msg/String 1 latched
+    ends the player at a fault
+
+[inverse_dynamics]
+publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
+    torques [N m] that answer each joint_states
+    if stamped is false
+publishes {simulator}/commands_stamped sensor_msgs/msg/JointState 1000
+    the same, by name and stamp
+    if stamped is true
+publishes ~/reference sensor_msgs/msg/JointState 1000
+    desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m]; the stamp is that of the
+    joint_states it belongs to
+publishes ~/tracking_error sensor_msgs/msg/JointState 1000
+    desired - measured [rad], [rad/s]; effort: feedback [N m]; stamp as of ~/reference
+publishes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
+    diagnostics of the control, at 1 Hz
+subscribes joint_states sensor_msgs/msg/JointState 1
+    samples that are answered; the newest counts
+subscribes {simulator}/phase std_msgs/msg/String 10 latched
+    begins anew at a reset, ends at a fault and at the end of the run
+subscribes ~/joint_trajectory trajectory_msgs/msg/JointTrajectory 10
+    motion to follow, from now on and in place of the present one; refused as a whole where it
+    cannot be followed, and where motion is not topic
+executes ~/follow_joint_trajectory control_msgs/action/FollowJointTrajectory
+    the same with tolerances, feedback and a result
+    if control_msgs is installed
+
+[viewer]
+subscribes joint_states sensor_msgs/msg/JointState 64
+    states that are shown
+subscribes {simulator}/scene std_msgs/msg/String 1 latched
+    manipulator that is drawn
+subscribes {simulator}/phase std_msgs/msg/String 1 latched
+    phase of the run
+subscribes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
+    diagnostics of the run
+publishes {simulator}/commands std_msgs/msg/Float64MultiArray 10
+    torques of the page's sliders [N m], 20 times a second
+    if a slider was moved and no other node publishes commands
+calls {simulator}/pause std_srvs/srv/SetBool
+    the button Pause, or Resume
+calls {simulator}/step std_srvs/srv/Trigger
+    the button Step
+calls {simulator}/reset std_srvs/srv/Trigger
+    the button Reset
+
+[recorder]
+"""
+
 SERVICE_QOS = QoSProfile(depth=1000)
 """Of services and of our clients: with ten, the default, the eleventh request that waits displaces
 the first, and so does the eleventh reply. All clients of a service receive all of its replies."""
+COUNT_NS = 20_000_000
+"""A run counts the other ends of its topics this often, not at each tick: to count the subscribers
+of four topics takes as long as a tick."""
+UNNAMED = "a node whose name is not known yet"
+_UNKNOWN = "_UNKNOWN_"
+"""Part of the names that DDS has for nodes whose discovery is not finished."""
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """One topic or service of a node.
+    """One topic, service or action of a node.
 
     Attributes:
         use: PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action.
-        name: its name; {simulator} stands for the player's parameter.
-        kind: type of its messages; by name, where its package is in no wheel.
-        doc: what it carries.
+        name: its name, with ~ and {simulator}.
+        type_name: type of its messages, as ROS writes it.
         depth: messages kept for slow readers; 0 for two seconds of them.
         latched: the last message is kept for late joiners.
         when: the condition under which it exists; always where empty.
+        doc: what it carries.
 
     """
 
     use: str
     name: str
-    kind: Any
+    type_name: str
+    depth: int
+    latched: bool
+    when: str
     doc: str
-    depth: int = 10
-    latched: bool = False
-    when: str = ""
 
     @property
-    def type_name(self) -> str:
-        """The type as ROS writes it."""
-        if isinstance(self.kind, str):
-            return self.kind
-        package, form, *_ = self.kind.__module__.split(".")
-        return f"{package}/{form}/{self.kind.__name__}"
+    def kind(self) -> Any:
+        """Type of its messages."""
+        return message_type(self.type_name)
 
     def at(self, node: str) -> str:
         """Return its full name at the node of this full name."""
@@ -70,17 +174,17 @@ class Endpoint:
 
     def publisher(self, node: Node, depth: int = 0, *, simulator: str = "") -> Publisher[Any]:
         """Create its publisher."""
-        return node.create_publisher(self.kind, self.resolved(simulator), self._qos(depth))
+        return node.create_publisher(self.kind, self.resolve(simulator), self._qos(depth))
 
     def subscription(
         self, node: Node, callback: Callable[[Any], None], *, simulator: str = ""
     ) -> Subscription[Any]:
         """Create its subscription."""
         return node.create_subscription(
-            self.kind, self.resolved(simulator), callback, self._qos(self.depth)
+            self.kind, self.resolve(simulator), callback, self._qos(self.depth)
         )
 
-    def resolved(self, simulator: str) -> str:
+    def resolve(self, simulator: str) -> str:
         """Return its name with that of the simulator's node."""
         return self.name.replace("{simulator}", simulator)
 
@@ -89,217 +193,83 @@ class Endpoint:
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
-JOINT_STATES = Endpoint(
-    PUBLISHES,
-    "joint_states",
-    JointState,
-    "gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the "
-    "step that ended [N m]; frame_id `idle` where it is no sample of a run",
-    depth=0,
-)
-ORIENTATION = Endpoint(
-    PUBLISHES,
-    "~/orientation",
-    QuaternionStamped,
-    "orientation of {E} in {B}, frame_id `base_link`",
-    depth=0,
-)
-EULER_ZYZ = Endpoint(
-    PUBLISHES, "~/euler_zyz", Vector3Stamped, "the same as ZYZ angles theta, phi, psi [rad]", 0
-)
-APPLIED_TORQUES = Endpoint(
-    PUBLISHES,
-    "~/applied_torques",
-    JointTrajectory,
-    "torques of every step since the last message [N m], with the sample after 50 ms of simulated "
-    "time and when the run pauses or ends; where the scene takes a moment from a topic also "
-    "moment_x, moment_y, moment_z in {B}",
-    depth=0,
-)
-SCENE = Endpoint(PUBLISHES, "~/scene", String, "the scene, as YAML", 1, latched=True)
-PHASE = Endpoint(
-    PUBLISHES,
-    "~/phase",
-    String,
-    "waiting, running, paused, finished, or `fault: ` with the reason",
-    depth=1,
-    latched=True,
-)
-DIAGNOSTICS = Endpoint(
-    PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the run, at 1 Hz"
-)
-CLOCK = Endpoint(
-    PUBLISHES, "/clock", Clock, "simulated time", depth=1, when="publish_clock is true"
-)
-ROBOT_DESCRIPTION = Endpoint(
-    PUBLISHES,
-    "robot_description",
-    String,
-    "the scene as URDF",
-    depth=1,
-    latched=True,
-    when="publish_description is true, the default",
-)
-COMMANDS = Endpoint(
-    SUBSCRIBES,
-    "~/commands",
-    Float64MultiArray,
-    "torques of gamma_1..3 [N m], held until the next",
-    MOST_WAITING,
-)
-COMMANDS_STAMPED = Endpoint(
-    SUBSCRIBES,
-    "~/commands_stamped",
-    JointState,
-    "the same by name, in effort [N m]; the stamp is that of the joint_states it answers",
-    MOST_WAITING,
-)
-EXTERNAL_MOMENT = Endpoint(
-    SUBSCRIBES,
-    "~/external_moment",
-    WrenchStamped,
-    "moment on the star, torque in {B} [N m]; the force is not used",
-    MOST_WAITING,
-    when="the scene has moment: {topic: true}",
-)
-SET_STATE = Endpoint(
-    SUBSCRIBES,
-    "~/set_state",
-    JointState,
-    "state to continue from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3; "
-    "refused while running, in fault, and where it is not admissible",
-)
-PAUSE = Endpoint(SERVES, "~/pause", SetBool, "pause the run, or resume it; idempotent")
-STEP = Endpoint(
-    SERVES, "~/step", Trigger, "advance a paused run by one sample; refused while running"
-)
-RESET = Endpoint(
-    SERVES, "~/reset", Trigger, "back to the initial state, also out of a fault; stamps continue"
-)
-
-SIMULATOR = (
-    JOINT_STATES,
-    ORIENTATION,
-    EULER_ZYZ,
-    APPLIED_TORQUES,
-    SCENE,
-    PHASE,
-    DIAGNOSTICS,
-    CLOCK,
-    ROBOT_DESCRIPTION,
-    COMMANDS,
-    COMMANDS_STAMPED,
-    EXTERNAL_MOMENT,
-    SET_STATE,
-    PAUSE,
-    STEP,
-    RESET,
-)
+def _read(table: str) -> dict[str, dict[str, Endpoint]]:
+    """Return the endpoints by node and by the last part of their names."""
+    nodes: dict[str, dict[str, Endpoint]] = {}
+    for part in table.replace("MOST_WAITING", str(MOST_WAITING)).split("\n[")[1:]:
+        node, _, rows = part.partition("]\n")
+        nodes[node] = {}
+        for row in rows.replace("\n    ", "\t").split("\n"):
+            if row:
+                head, *text = row.split("\t")
+                when = text.pop().removeprefix("if ") if text[-1].startswith("if ") else ""
+                use, name, kind, *more = head.split()
+                depth, latched = int(more[0]) if more else 10, "latched" in more
+                last = name.rpartition("/")[2]
+                doc = " ".join(text)
+                nodes[node][last] = Endpoint(use, name, kind, depth, latched, when, doc)
+    return nodes
 
 
-def _torques(doc: str) -> tuple[Endpoint, Endpoint]:
-    """Return the commands of a node whose parameter `stamped` selects one of them."""
-    plain, stamped = "{simulator}/commands", "{simulator}/commands_stamped"
-    same = "the same, by name and stamp"
-    return (
-        Endpoint(PUBLISHES, plain, Float64MultiArray, doc, when="stamped is false"),
-        Endpoint(PUBLISHES, stamped, JointState, same, when="stamped is true"),
-    )
+NODES = _read(_TABLE)
+SIMULATOR, PLAYER = NODES["simulator"], NODES["torque_player"]
+CONTROLLER, VIEWER = NODES["inverse_dynamics"], NODES["viewer"]
+SAMPLED = tuple(one.name for one in SIMULATOR.values() if one.use == PUBLISHES and not one.when)
+"""Topics that a simulator publishes in every run."""
 
 
-PLAYED = Endpoint(
-    SUBSCRIBES,
-    "joint_states",
-    JointState,
-    "samples that are answered, from the first on",
-    depth=1000,
-)
-PLAYER_PHASE = Endpoint(
-    SUBSCRIBES, "{simulator}/phase", String, "ends the player at a fault", 1, True
-)
-PLAYER = (
-    *_torques("the profile's torques [N m] for the hold that each joint_states begins"),
-    PLAYED,
-    PLAYER_PHASE,
-)
+def message_type(type_name: str) -> Any:
+    """Import a type of messages, services or actions."""
+    package, form, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{form}"), name)
 
-VIEWED = tuple(
-    Endpoint(SUBSCRIBES, *declared)
-    for declared in (
-        ("joint_states", JointState, "states that are shown", 64),
-        ("{simulator}/scene", String, "manipulator that is drawn", 1, True),
-        ("{simulator}/phase", String, "phase of the run", 1, True),
-        ("/diagnostics", DiagnosticArray, "diagnostics of the run"),
-    )
-)
-VIEWER_COMMANDS = Endpoint(
-    PUBLISHES,
-    "{simulator}/commands",
-    Float64MultiArray,
-    "torques of the page's sliders [N m], 20 times a second",
-    when="a slider was moved and no other node publishes commands",
-)
-CALLED = tuple(
-    Endpoint(CALLS, f"{{simulator}}/{name}", kind, doc)
-    for name, kind, doc in (
-        ("pause", SetBool, "the button Pause, or Resume"),
-        ("step", Trigger, "the button Step"),
-        ("reset", Trigger, "the button Reset"),
-    )
-)
-VIEWER = (*VIEWED, VIEWER_COMMANDS, *CALLED)
 
-REFERENCE = Endpoint(
-    PUBLISHES,
-    "~/reference",
-    JointState,
-    "desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m]; the stamp is that of "
-    "the joint_states it belongs to",
-    depth=1000,
-)
-TRACKING_ERROR = Endpoint(
-    PUBLISHES,
-    "~/tracking_error",
-    JointState,
-    "desired - measured [rad], [rad/s]; effort: feedback [N m]; stamp as of ~/reference",
-    depth=1000,
-)
-JOINT_TRAJECTORY = Endpoint(
-    SUBSCRIBES,
-    "~/joint_trajectory",
-    JointTrajectory,
-    "motion to follow, from now on and in place of the present one; refused as a whole where it "
-    "cannot be followed, and where motion is not topic",
-)
-FOLLOW_JOINT_TRAJECTORY = Endpoint(
-    EXECUTES,
-    "~/follow_joint_trajectory",
-    "control_msgs/action/FollowJointTrajectory",
-    "the same with tolerances, feedback and a result",
-    when="control_msgs is installed",
-)
+def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str]:
+    """Full names of the nodes that publish a topic, one for each (best-effort) publisher."""
+    return [
+        UNNAMED
+        if _UNKNOWN in info.node_name
+        else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+        for info in node.get_publishers_info_by_topic(topic)
+        if not best_effort or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    ]
 
-CONTROLLED = Endpoint(
-    SUBSCRIBES, "joint_states", JointState, "samples that are answered; the newest counts", 1
-)
-CONTROLLER_PHASE = Endpoint(
-    SUBSCRIBES,
-    "{simulator}/phase",
-    String,
-    "begins anew at a reset, ends at a fault and at the end of the run",
-    10,
-    True,
-)
-INVERSE_DYNAMICS = (
-    *_torques("torques [N m] that answer each joint_states"),
-    REFERENCE,
-    TRACKING_ERROR,
-    Endpoint(PUBLISHES, "/diagnostics", DiagnosticArray, "diagnostics of the control, at 1 Hz"),
-    CONTROLLED,
-    CONTROLLER_PHASE,
-    JOINT_TRAJECTORY,
-    FOLLOW_JOINT_TRAJECTORY,
-)
 
-RECORDER: tuple[Endpoint, ...] = ()
-"""The recorder subscribes to the topics of its parameter `topics`, and to nothing else."""
+def diagnostics(
+    node: Node, what: str, level: bytes, text: str, values: dict[str, object]
+) -> DiagnosticArray:
+    """Build a DiagnosticArray of one status of a node."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    name = f"{node.get_fully_qualified_name()}: {what}"
+    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=pairs)
+    message = DiagnosticArray(status=[status])
+    now = node.get_clock().now().nanoseconds
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, NANOSECONDS)
+    return message
+
+
+class ActionGoal:
+    """An accepted goal of an action that runs until `end`, which any thread may call.
+
+    Attributes:
+        handle: rclpy's handle of the goal.
+
+    """
+
+    def __init__(self, handle: Any) -> None:
+        self.handle = handle
+        self._result: Future[Any] = Future()
+        handle.execute(self._wait)
+
+    async def _wait(self, _: Any) -> Any:
+        return await self._result
+
+    def end(self, result: Any, *, success: bool) -> None:
+        """End the goal with a result: canceled where that was requested, else as `success` is."""
+        if self.handle.is_cancel_requested:
+            self.handle.canceled()
+        elif success:
+            self.handle.succeed()
+        else:
+            self.handle.abort()
+        self._result.set_result(result)

@@ -13,13 +13,10 @@ from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
+from sst_ros.nodes import topics
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.state import Vector3, is_idle, nanoseconds
-
-_DEPTH = 1000
-"""As of the other topics that are recorded: with ten, a recorder that is held up for a hundredth
-of a second loses commands."""
 
 
 class TorqueCommands:
@@ -32,15 +29,14 @@ class TorqueCommands:
 
     def __init__(self, node: Node, given: AnsweringParameters) -> None:
         self._given = given
+        topic = topics.PLAYER["commands_stamped" if given.stamped else "commands"]
         if given.stamped:
-            topic = f"{given.simulator}/commands_stamped"
             self._message: Any = JointState(name=list(ACTUATORS), effort=array("d", ZERO))
             self._torques = self._message.effort
         else:
-            topic = f"{given.simulator}/commands"
             self._message = Float64MultiArray(data=array("d", ZERO))
             self._torques = self._message.data
-        self.publisher = node.create_publisher(type(self._message), topic, _DEPTH)
+        self.publisher = topic.publisher(node, simulator=given.simulator)
         self.received()
 
     def subscribed(self) -> bool:

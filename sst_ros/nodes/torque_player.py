@@ -16,7 +16,7 @@ from std_msgs.msg import String
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.clocks import STEADY
+from sst_ros.nodes.process import every
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
@@ -36,11 +36,11 @@ class TorquePlayer:
         self._start_ns: int | None = None
         self._last_ns = 0
         self._warned = False
-        topics.PLAYER_PHASE.subscription(
+        topics.PLAYER["phase"].subscription(
             self.node, self._hear, simulator=self._parameters.simulator
         )
-        topics.PLAYED.subscription(self.node, self._answer)
-        self.node.create_timer(0.5, self._commands.watch, clock=STEADY)
+        topics.PLAYER["joint_states"].subscription(self.node, self._answer)
+        every(self.node, 0.5, self._commands.watch)
 
     def close(self) -> None:
         """Leave the actuators without torque if the profile was cut short."""

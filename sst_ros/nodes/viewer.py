@@ -19,8 +19,8 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.errors import InputError
-from sst_ros.nodes import graph, parameters, topics
-from sst_ros.nodes.clocks import STEADY
+from sst_ros.nodes import parameters, topics
+from sst_ros.nodes.process import every
 from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
@@ -35,7 +35,7 @@ _REPLY_S = 5.0
 _REPEAT_S = 0.05
 """Period of manual commands; the simulator drops commands older than half a second."""
 _LOOK_S = 0.5
-_QUEUE = topics.VIEWED[0].depth
+_QUEUE = topics.VIEWER["joint_states"].depth
 
 
 class Viewer:
@@ -53,16 +53,21 @@ class Viewer:
         self._controller, self._driving = "", False
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
-            one.name.rpartition("/")[2]: self.node.create_client(
-                one.kind, one.resolved(given.simulator), qos_profile=topics.SERVICE_QOS
+            name: self.node.create_client(
+                one.kind, one.resolve(given.simulator), qos_profile=topics.SERVICE_QOS
             )
-            for one in topics.CALLED
+            for name, one in topics.VIEWER.items()
+            if one.use == topics.CALLS
         }
-        takers = self._take_state, self._take_scene, self._take_phase, self._take_diagnostics
-        for topic, taker in zip(topics.VIEWED, takers, strict=True):
-            topic.subscription(self.node, taker, simulator=given.simulator)
-        self.node.create_timer(_REPEAT_S, self._repeat, clock=STEADY)
-        self.node.create_timer(_LOOK_S, self._look, clock=STEADY)
+        for name, take in (
+            ("joint_states", self._take_state),
+            ("scene", self._take_scene),
+            ("phase", self._take_phase),
+            ("diagnostics", self._take_diagnostics),
+        ):
+            topics.VIEWER[name].subscription(self.node, take, simulator=given.simulator)
+        every(self.node, _REPEAT_S, self._repeat)
+        every(self.node, _LOOK_S, self._look)
         self._page = Page(self, given.host, given.port)
         self._page.announce(opened=given.open)
 
@@ -141,9 +146,9 @@ class Viewer:
         own, node = self.node.get_fully_qualified_name(), self._parameters.simulator
         names = (
             name
-            for one in (topics.COMMANDS, topics.COMMANDS_STAMPED)
-            for name in graph.publishers(
-                self.node, self.node.resolve_topic_name(one.name.replace("~", node))
+            for topic in ("commands", "commands_stamped")
+            for name in topics.publishers(
+                self.node, self.node.resolve_topic_name(f"{node}/{topic}")
             )
         )
         self._controller = next((name for name in names if name != own), "")
@@ -160,7 +165,7 @@ class Viewer:
         if not self._driving:
             return
         if self._commands is None:
-            self._commands = topics.VIEWER_COMMANDS.publisher(
+            self._commands = topics.VIEWER["commands"].publisher(
                 self.node, simulator=self._parameters.simulator
             )
         self._commands.publish(Float64MultiArray(data=array("d", self._torque)))

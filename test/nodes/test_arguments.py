@@ -58,6 +58,7 @@ def test_every_parameter_is_a_plain_option(command, words, expected):
         (["--ros-args", "-p", "sceen:=friction"], "did you mean scene?"),
         (["--ros-args", "-p", "nonsense"], "must be NAME:=VALUE"),
         (["--ros-args", "--bogus"], "is no ROS argument"),
+        (["--ros-args", "-r"], "needs a value"),
         (["--ros-args", "--params-file", "/nowhere.yaml"], "must be a parameter file"),
         (["--ros-args", "--params-file", __file__], "must be a parameter file"),
     ],

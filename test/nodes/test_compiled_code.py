@@ -12,8 +12,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
 pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
 
 from sst_ros import load_scene
-from sst_ros.nodes import compiled_code
-from sst_ros.nodes.compiled_code import CodeCompiler
+from sst_ros.nodes import simulator
+from sst_ros.nodes.simulator import CodeCompiler
 from sst_ros.runtime.settings import SimulatorParameters
 
 FAKE = """#!{python}
@@ -49,7 +49,7 @@ def node(tmp_path, monkeypatch):
     program = tmp_path / "python"
     program.write_text(FAKE.format(python=sys.executable, folder=str(tmp_path)))
     program.chmod(0o755)
-    monkeypatch.setattr(compiled_code.sys, "executable", str(program))
+    monkeypatch.setattr(simulator.sys, "executable", str(program))
     return Node()
 
 

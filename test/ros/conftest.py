@@ -22,14 +22,14 @@ from ros.forked import ForkedNode  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
 from sst_ros.host import child_process  # noqa: E402
-from sst_ros.nodes import middleware  # noqa: E402
+from sst_ros.nodes.process import configure_middleware  # noqa: E402
 from sst_ros.state import IDLE_FRAME_ID  # noqa: E402
 
 # A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The observer is in this process: it asks the same of the middleware as the nodes do.
-middleware.configure()
+configure_middleware()
 
 
 @pytest.fixture

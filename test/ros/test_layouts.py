@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 
 from sst_ros.description.urdf import urdf
 from sst_ros.nodes import topics
-from sst_ros.nodes.messages import StateMessages, stamp
+from sst_ros.nodes.publications import StateMessages, stamp
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import load, names
 from sst_ros.simulation.simulation import Simulation
@@ -27,9 +27,9 @@ PUBLISHED = {
     endpoint.at(f"/{node}"): endpoint.kind
     for node, endpoints in (
         ("sst_simulator", topics.SIMULATOR),
-        ("sst_inverse_dynamics", topics.INVERSE_DYNAMICS),
+        ("sst_inverse_dynamics", topics.CONTROLLER),
     )
-    for endpoint in endpoints
+    for endpoint in endpoints.values()
     if endpoint.use == topics.PUBLISHES
 }
 """Types of the topics in the root namespace."""
@@ -70,7 +70,7 @@ def test_foxglove_plots_and_shows_what_is_published():
         topic, _, field = path.partition(".")
         assert field_type(PUBLISHED[topic], field) == "double", path
     (model,) = (one for one in panels["3D!manipulator"]["layers"].values() if "topic" in one)
-    assert model["topic"] == topics.ROBOT_DESCRIPTION.at("/sst_simulator")
+    assert model["topic"] == topics.SIMULATOR["robot_description"].at("/sst_simulator")
     assert PUBLISHED[model["jointStatesTopic"]] is JointState
     assert {*values(panels, "topicToRender"), *values(panels, "topicPath")} <= set(PUBLISHED)
     assert {*values(panels, "fixedFrame"), *values(panels, "frameId")} == {BASE_FRAME}
@@ -99,7 +99,7 @@ def test_rviz_shows_our_topic_and_frame():
     displays = {display["Class"].split("/")[1]: display for display in manager["Displays"]}
     assert set(displays) == {"Grid", "RobotModel", "TF"}
     description = displays["RobotModel"]["Description Topic"]
-    assert description["Value"] == topics.ROBOT_DESCRIPTION.name
+    assert description["Value"] == topics.SIMULATOR["robot_description"].name
     assert description["Durability Policy"] == "Transient Local"
     assert manager["Global Options"]["Fixed Frame"] == BASE_FRAME
     assert displays["Grid"]["Reference Frame"] == BASE_FRAME

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
-from sst_ros.nodes.messages import (
+from sst_ros.nodes.publications import (
     NotFinite,
     StateMessages,
     TorqueLog,
@@ -24,7 +24,7 @@ from sst_ros.nodes.messages import (
     finite,
     stamp,
 )
-from sst_ros.nodes.messages import (
+from sst_ros.nodes.publications import (
     zyz_angles as angles_of,
 )
 from sst_ros.scene.loads import JOINTS
@@ -127,7 +127,7 @@ def test_the_layout_is_that_of_the_middleware(state, frame_id):
     states = stamped(StateMessages(frame_id), 7, state)
     log = TorqueLog(2, 1_000_000, moments=True)
     log.append((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 2)
-    clock = clock_message().stamped(stamp(STAMP_NS))
+    clock = clock_message(STAMP_NS)
     kinds = (JointState, QuaternionStamped, Vector3Stamped, JointTrajectory, Clock)
     for data, kind in zip([*states, log.take(9), clock], kinds, strict=True):
         again = serialize_message(deserialize_message(data, kind))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sst_ros.nodes import middleware
+from sst_ros.nodes import process
 
 NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -27,8 +27,8 @@ import time
 import rclpy
 from rclpy.duration import Duration
 from std_msgs.msg import String
-from sst_ros.nodes import middleware
-middleware.configure()
+from sst_ros.nodes import process
+process.configure_middleware()
 rclpy.init()
 node = rclpy.create_node("speaker")
 publisher = node.create_publisher(String, "said", 1000)
@@ -106,14 +106,14 @@ def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
 def test_a_profile_of_the_user_is_left_alone(name, no_profile, monkeypatch):
     monkeypatch.setenv(name, "mine.xml")
     before = dict(os.environ)
-    middleware.configure()
+    process.configure_middleware()
     assert dict(os.environ) == before
 
 
 @pytest.mark.parametrize(("rclpy", "name"), [("7.1.5", NAMES[0]), ("9.1.2", NAMES[1])])
 def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch):
-    monkeypatch.setattr(middleware, "version", lambda package: {"rclpy": rclpy}[package])
-    middleware.configure()
+    monkeypatch.setattr(process, "version", lambda package: {"rclpy": rclpy}[package])
+    process.configure_middleware()
     (given,) = {each: os.environ.pop(each) for each in NAMES if each in os.environ}.items()
     assert given[0] == name
     assert Path(given[1]).is_file()

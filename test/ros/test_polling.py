@@ -36,7 +36,7 @@ def looks(monkeypatch):
 
 def publish(node, *torque):
     """Publish a command and wait until it has arrived."""
-    publisher = node.create_publisher(Float64MultiArray, topics.COMMANDS.name, 10)
+    publisher = node.create_publisher(Float64MultiArray, topics.SIMULATOR["commands"].name, 10)
     deadline = time.monotonic() + 30.0
     while not publisher.get_subscription_count():
         assert time.monotonic() < deadline
@@ -47,14 +47,14 @@ def publish(node, *torque):
 
 
 def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(node, looks):
-    reader = polling.Reader(node, topics.COMMANDS)
+    reader = polling.Reader(node, topics.SIMULATOR["commands"])
     for tick in range(100):
         assert not reader.arrived(tick * MS)
     assert len(looks) == 5
 
 
 def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks):
-    reader = polling.Reader(node, topics.COMMANDS)
+    reader = polling.Reader(node, topics.SIMULATOR["commands"])
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
     assert not reader.arrived(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
@@ -71,7 +71,7 @@ def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks)
 
 
 def test_without_a_time_every_command_is_taken_at_once(node):
-    reader = polling.Reader(node, topics.COMMANDS)
+    reader = polling.Reader(node, topics.SIMULATOR["commands"])
     assert not reader.arrived(time.monotonic_ns())
     publish(node, 1.0, 2.0, 3.0)
     assert len(reader.arrived(math.inf)) == 1
@@ -79,7 +79,7 @@ def test_without_a_time_every_command_is_taken_at_once(node):
 
 def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
     """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
-    reader = polling.Reader(node, topics.COMMANDS)
+    reader = polling.Reader(node, topics.SIMULATOR["commands"])
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     publish(node, 1.0, 2.0, 3.0)

@@ -158,7 +158,7 @@ def test_rosbag2_is_given_the_declared_qos():
     config = Path(__file__).parents[2] / "config"
     profiles = yaml.safe_load((config / "rosbag2_qos.yaml").read_text(encoding="utf-8"))
     assert set(profiles) == set((config / "topics.txt").read_text(encoding="utf-8").split())
-    declared = {one.name.rpartition("/")[2]: one for one in (*topics.PLAYER, *topics.SIMULATOR)}
+    declared = {**topics.PLAYER, **topics.SIMULATOR}
     for topic, profile in profiles.items():
         own = declared.get(topic.rpartition("/")[2])
         latched = own is not None and own.latched
