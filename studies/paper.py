@@ -11,12 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
 
+from benchmark.peers.pinocchio_peer import Model
+from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
-from sst_ros.extras import MissingDependency
+from sst_ros.extras import MissingDependency, require
 from sst_ros.host.output import require_free, writing
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import angle_between, rotation_matrix
+from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
 from sst_ros.plot.motion import path as path_of_e
@@ -27,7 +30,6 @@ from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from studies import parser, run
-from studies.pinocchio_motion import PinocchioMotion
 
 NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
 """Largest differences that are expected: of angles [rad], and of torques [N m]."""
@@ -109,12 +111,52 @@ def _solutions(
     ]
     differences = [_difference(scene, "nodes", motion, run.quaternion, run.gamma, NODES_LIMIT)]
     try:
-        quaternion, gamma = PinocchioMotion(scene).at(times)
+        quaternion, gamma = integrate_by_pinocchio(scene, times)
     except MissingDependency as error:
         return solutions, differences, [f"no independent engine: {error}"]
     solutions.append(Solution("Pinocchio", times, quaternion))
     differences.append(_difference(scene, "Pinocchio", motion, quaternion, gamma, ENGINE_LIMIT))
     return solutions, differences, []
+
+
+def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
+    """Integrate a scene by Pinocchio, whose equations share nothing with those of this package.
+
+    The seven links are a tree, base -> actuated -> intermediate link of each leg with the star on
+    leg 1; a point of the axis t_k on legs 2 and 3 is tied to the star. SciPy's DOP853 integrates
+    Pinocchio's accelerations in the angles of the seven joints of the tree.
+
+    Args:
+        scene: shipped scene that has bodies and sine torques only.
+        times: ascending times from 0 on [s], shape (n,).
+
+    Returns:
+        Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3).
+
+    Raises:
+        MissingDependency: Pinocchio is not installed.
+
+    """
+    pin, model = require("pinocchio"), Model(task := Task(scene.name))
+    size, rates = model.model.nv, task.dynamics.joints(*task.start)[9:]
+    start = np.zeros(2 * size)
+    for joint, place in model.place.items():
+        start[size + place] = rates[KINDS[joint[0]] + int(joint[1])]
+
+    def derivative(t: float, state: Array) -> Array:
+        force = np.zeros(size)
+        force[model.drives] = task.torque_at(t)
+        acceleration = pin.constraintDynamics(
+            model.model, model.data, state[:size], state[size:], force, model.ties, model.tied,
+            model.proximal,
+        )  # fmt: skip
+        return np.append(state[size:], acceleration)
+
+    span = (0.0, float(times[-1]))
+    run = solve_ivp(derivative, span, start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-12)
+    poses = [model.pose(state) for state in run.y.T]
+    rotations = np.array([pose.rotation for pose in poses])
+    return quaternion_of(rotations), np.array([pose.gamma for pose in poses])
 
 
 def _difference(

@@ -24,7 +24,7 @@ MU, ITERATIONS = 0.1, 5
 
 def series(task: Task, quick: bool) -> list[Series]:
     """RK4 and DOP853 in a Python loop."""
-    model = _Model(task)
+    model = Model(task)
     factor = 1.6 if quick else 1.2
     rows = (("RK4", RK4, 10, 1600), ("DOP853", DOP853, 5, 100))
     return [
@@ -36,7 +36,9 @@ def series(task: Task, quick: bool) -> list[Series]:
     ]  # fmt: skip
 
 
-class _Model:
+class Model:
+    """The tree with its ties; joint coordinates are differences to the start."""
+
     def __init__(self, task: Task) -> None:
         import pinocchio as pin
 

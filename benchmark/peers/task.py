@@ -55,7 +55,7 @@ class Moving(NamedTuple):
 
 
 class Task:
-    """Example 2 with its torques as continuous functions of time.
+    """A scene with its torques as continuous functions of time, Example 2 by default.
 
     Attributes:
         frames: rotations at the start by body: s, a0..a2, i0..i2.
@@ -64,8 +64,8 @@ class Task:
 
     """
 
-    def __init__(self) -> None:
-        self.scene = scenes.load("example2_heavy")
+    def __init__(self, scene: str = "example2_heavy") -> None:
+        self.scene = scenes.load(scene)
         assert self.scene.torque is not None
         self.torque = self.scene.torque
         self.dynamics = Dynamics.of(self.scene)
