@@ -23,8 +23,7 @@ from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.host.output import require_free
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
-from sst_ros.identification.parameters import INERTIA
-from sst_ros.identification.scene_numbers import value_of
+from sst_ros.identification.parameters import INERTIA, value_of
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, styled
 from sst_ros.recording.recording import read as read_bag

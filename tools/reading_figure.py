@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from sst_ros.identification.readings import readings
-from sst_ros.identification.scene_numbers import value_of
-from sst_ros.identification.sensitivities import Sensitivities
-from sst_ros.identification.simulation_fit import combination
+from sst_ros.identification.measured_motion import take_readings
+from sst_ros.identification.parameters import value_of
+from sst_ros.identification.simulation_fit import Sensitivities, describe_combination
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, GREY, INK, save_figure, styled
 from sst_ros.scene.scene import load
@@ -54,7 +53,7 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     t = np.linspace(0.0, scene.duration or 1.0, READINGS + 1)[1:]
     lengths = ERROR * (scene.star.radius if "x" in read else 1.0)
     data = {"t": t, "deviation": lengths} | {key: np.zeros(READINGS) for key in read}
-    found = readings(data, scene)
+    found = take_readings(data, scene)
     motion = Sensitivities(scene, names, found.torque)
     values = np.array([value_of(scene, key) for key in names], dtype=float)
     states, slopes = motion.run(values, t)
@@ -63,7 +62,7 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     matrix = np.einsum("ri,rip->rp", by_pose, poses) * values
     _, singular, rows = np.linalg.svd(matrix)
     relative = 1.0 / np.maximum(singular, 1e-9)
-    labels = (combination(row, tuple(words.values())) for row in rows)
+    labels = (describe_combination(row, tuple(words.values())) for row in rows)
     powers = [re.sub(r"(\S+)\^([+-][\d.]+)", r"$\1^{\2}$", label) for label in labels]
     return powers, relative
 

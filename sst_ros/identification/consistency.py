@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Physically consistent parameters: those of bodies that can exist.
+"""Weighted linear least squares, and the nearest parameters of bodies that can exist.
+
+The variance of the noise differs between actuators; it is estimated from the residuals of an
+unweighted fit, over the equations of the actuator less the unknowns that they determine (their
+leverage), and the equations are then divided by it (Gautier 1997; Swevers, Verdonck and
+De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71).
 
 A body has mass m, first moment h and inertia I about O if and only if its pseudo-inertia
 
@@ -21,15 +26,18 @@ least-squares problem, so that data without noise are fitted to rounding.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from sst_ros.identification.base_parameters import BaseParameters
-from sst_ros.identification.least_squares import LinearFit
 from sst_ros.identification.parameters import STANDARD, bodies_of
+from sst_ros.identification.regressor import BaseParameters
 from sst_ros.mechanism.geometry import Array
+
+EXACT = 1e-12
+"""Noise over RMS torque that is assumed at least: data of a simulation have no other."""
 
 INTERIOR = 1e-3
 """Share of its trace that J of a flat body is lifted by at the start, into the interior."""
@@ -43,6 +51,70 @@ CENTRED = 1e-2
 _NEWTON_STEPS = 100
 _CLOSE = 0.95
 """Share of the distance to the boundary that a step may cover."""
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """Estimates of b numbers.
+
+    Attributes:
+        estimate: shape (b,).
+        covariance: shape (b, b).
+        root: R of the weighted regressor, R^T R = covariance^-1, shape (b, b).
+        noise: standard deviation of the residuals of each actuator [N m], shape (3,).
+        residual: measured less predicted torques [N m] of the m equations, shape (m, 3).
+        condition: of the weighted regressor with columns of length one.
+
+    """
+
+    estimate: Array
+    covariance: Array
+    root: Array
+    noise: Array
+    residual: Array
+    condition: float
+
+    @property
+    def deviation(self) -> Array:
+        """Standard deviations, shape (b,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def fit_weighted(columns: Array, torque: Array, noise: Array | None = None) -> LinearFit:
+    """Fit torque = columns estimate.
+
+    Args:
+        columns: regressor of independent columns, shape (m, 3, b).
+        torque: measured less known torques [N m], shape (m, 3).
+        noise: standard deviations of the torques [N m], shape (3,); by default estimated.
+
+    """
+    floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
+    if noise is None:
+        noise = np.ones(3)
+        for _ in range(2):
+            estimate, _, leverage = _solve(columns, torque, noise)
+            free = np.maximum(len(torque) - leverage, 1.0)
+            squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
+            noise = np.maximum(np.sqrt(squares / free), floor)
+    estimate, root, _ = _solve(columns, torque, noise)
+    condition = float(np.linalg.cond(root / np.linalg.norm(root, axis=0)))
+    inverse = solve_triangular(root, np.eye(len(root)))
+    residual = torque - columns @ estimate
+    return LinearFit(estimate, inverse @ inverse.T, root, noise, residual, condition)
+
+
+def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """Estimate, R of the weighted regressor, and the unknowns that each actuator determines."""
+    matrix = (columns / noise[:, None]).reshape(-1, columns.shape[-1])
+    right = (torque / noise).ravel()
+    lengths = np.linalg.norm(matrix, axis=0)
+    q, r = np.linalg.qr(matrix / lengths)
+    estimate = solve_triangular(r, q.T @ right)
+    # One step of refinement: noise-free data are fitted to rounding.
+    estimate = estimate + solve_triangular(r, q.T @ (right - matrix / lengths @ estimate))
+    leverage = np.sum((q**2).reshape(-1, 3, len(r)), axis=(0, 2))
+    return estimate / lengths, r * lengths, leverage
 
 
 class Cone(NamedTuple):
@@ -62,7 +134,7 @@ class Cone(NamedTuple):
         return np.asarray(np.tensordot(values[self.places], self.basis, 1))
 
 
-def consistent_values(
+def find_consistent_values(
     names: Sequence[str], given: Array, base: BaseParameters, fit: LinearFit, reach: float
 ) -> tuple[Array, float]:
     """Values of all parameters that fit the base parameters, those of bodies that can exist.
@@ -82,7 +154,7 @@ def consistent_values(
     cones = list(_cones(tuple(names), reach))
     rows = np.vstack([fit.root @ base.transform, np.diag(1.0 / scales(names, given))])
     right = np.concatenate([fit.root @ fit.estimate, given / scales(names, given)])
-    values = _interior(cones, given)
+    values = _lift_into_interior(cones, given)
     for barrier in BARRIERS:
         for _ in range(_NEWTON_STEPS):
             step, size, decrement = _newton_step(cones, rows, right, values, barrier)
@@ -156,11 +228,8 @@ def _newton_step(
     q, r = np.linalg.qr(matrix / lengths)
     part = q.T @ np.concatenate(targets)
     step = np.asarray(solve_triangular(r, part) / lengths)
-    least = min(
-        (float(np.linalg.eigvalsh(np.tensordot(step[places], slopes, 1))[0])
-         for places, slopes in whitened),
-        default=0.0,
-    )  # fmt: skip
+    changes = (np.tensordot(step[places], slopes, 1) for places, slopes in whitened)
+    least = min((float(np.linalg.eigvalsh(change)[0]) for change in changes), default=0.0)
     return step, 1.0 if least > -_CLOSE else -_CLOSE / least, float(part @ part) / barrier
 
 
@@ -180,7 +249,7 @@ def _cones(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
             yield Cone([place], np.ones((1, 1, 1)))
 
 
-def _interior(cones: list[Cone], given: Array) -> Array:
+def _lift_into_interior(cones: list[Cone], given: Array) -> Array:
     """Values near those given at which every matrix is positive definite."""
     values = given.copy()
     for cone in cones:

@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exciting motions: Fourier series of the actuators that make parameters well determined.
 
-The coefficients of `FourierSeries` minimise
+The motion is a Fourier series that begins and ends at rest,
+
+    gamma_k(t) = c_k + sum over n of a_nk sin(n w t) + b_nk cos(n w t), w = 2 pi / duration
+
+(Swevers, Ganseman, Tukel, De Schutter and Van Brussel, IEEE Trans. Robotics Autom. 13 (1997)
+730-740). The coefficients are taken from the subspace in which gamma = c and gamma_dot =
+gamma_ddot = 0 at both ends. They minimise
 
     log condition number + mean log standard deviation
 
@@ -15,6 +21,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
@@ -23,14 +30,15 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, MotionRefused, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.base_parameters import BaseParameters, structural
-from sst_ros.identification.fourier_series import FourierSeries
-from sst_ros.identification.regressor import Regressor
+from sst_ros.identification.regressor import BaseParameters, Regressor, find_base_parameters
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.kinematics import rotate
 from sst_ros.scene.scene import Scene
+
+POINTS = 12
+"""Samples, and points of the scene, in a period of the highest harmonic."""
 
 SHARE = 0.9
 """Share of each range that the motion may use: the manipulator is not quite its model."""
@@ -73,7 +81,7 @@ class ExcitingMotion:
 
 def design(
     scene: Scene,
-    wanted: Iterable[str] | None = None,
+    requested: Iterable[str] | None = None,
     *,
     duration: float = 6.0,
     harmonics: int = 5,
@@ -84,7 +92,7 @@ def design(
 
     Args:
         scene: the manipulator, with values as good as they are known.
-        wanted: the parameters, see `identify`.
+        requested: the parameters, see `identify`.
         duration: of the motion [s].
         harmonics: of the series, 3 or more.
         iterations: of the optimisation.
@@ -103,19 +111,55 @@ def design(
     if problems:
         raise InputError("identify design", problems)
     series = FourierSeries(duration, harmonics, np.array(scene.initial.gamma))
-    cost = _Cost(scene, parameters.selected(scene, wanted), series)
+    cost = _Cost(scene, parameters.select_names(scene, requested), series)
     free = np.random.default_rng(seed).normal(size=series.size)
     free *= _FIRST / np.abs(series.at(free, series.times)[0] - series.centre).max()
     found = minimize(cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
     for _ in range(40):
-        designed = _scene(scene, series, found)
+        designed = _write_scene(scene, series, found)
         plan = examine(reference_motion(designed), designed)
         if not plan.problems and cost.violation(found) <= 0.0:
             return cost.result(designed, found)
         found = 0.95 * found
-    raise MotionRefused("identify design", plan.problems or [
-        Problem("initial.gamma", scene.initial.gamma, "leaves no room for a motion about it")
-    ])  # fmt: skip
+    room = Problem("initial.gamma", scene.initial.gamma, "leaves no room for a motion about it")
+    raise MotionRefused("identify design", plan.problems or [room])
+
+
+class FourierSeries:
+    """Angles of three actuators as functions of free numbers.
+
+    Args:
+        duration: of the motion [s].
+        harmonics: of the series.
+        centre: angles at both ends [rad], shape (3,).
+
+    Attributes:
+        size: number of the free numbers.
+        times: samples [s], POINTS in a period of the highest harmonic, shape (n,).
+
+    """
+
+    def __init__(self, duration: float, harmonics: int, centre: Array) -> None:
+        self.duration, self.centre = duration, centre
+        n = np.arange(1, harmonics + 1)
+        self._frequency = 2.0 * np.pi * n / duration
+        rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
+        rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
+        self._basis = null_space(rest)
+        self.size = 3 * self._basis.shape[1]
+        count = POINTS * harmonics
+        self.times = np.arange(1, count + 1) * duration / count
+
+    def at(self, free: Array, t: Array) -> tuple[Array, Array, Array]:
+        """Angles [rad] and two derivatives at the times t [s], each shape (len(t), 3)."""
+        sine, cosine = np.split(self._basis @ free.reshape(-1, 3), 2)
+        w = self._frequency
+        s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
+        return (
+            self.centre + s @ sine + c @ cosine,
+            (c * w) @ sine - (s * w) @ cosine,
+            -(s * w * w) @ sine - (c * w * w) @ cosine,
+        )
 
 
 class _Cost:
@@ -124,7 +168,7 @@ class _Cost:
     def __init__(self, scene: Scene, names: tuple[str, ...], series: FourierSeries) -> None:
         self._scene, self._series = scene, series
         self._regressor = Regressor(scene, names)
-        self._base = structural(self._regressor)
+        self._base = find_base_parameters(self._regressor)
         self._values = parameters.values(scene, names)
         self._geometry = Geometry.of(scene)
         self._rates = ActuatorSpaceMap(self._geometry).star_rates
@@ -209,7 +253,7 @@ class _Cost:
         return np.asarray(rotation)
 
 
-def _scene(scene: Scene, series: FourierSeries, free: Array) -> Scene:
+def _write_scene(scene: Scene, series: FourierSeries, free: Array) -> Scene:
     """Return the scene with the motion as waypoints, quintic between them."""
     names = ("gamma", "gamma_dot", "gamma_ddot")
     points = [

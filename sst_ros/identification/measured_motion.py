@@ -1,29 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured actuator angles and torques, as identification takes them.
+"""What was measured: angles and torques of the actuators, or numbers read off a figure.
 
 Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are. Rates and accelerations follow by one of two methods (`derivatives`).
+are. Identification by torques takes a `MeasuredMotion`, identification by simulation `Readings`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import with_jacobian
+from sst_ros.dynamics.model import joint_angle
+from sst_ros.dynamics.traced_dynamics import QUATERNION, compile_for_arrays
 from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque import TorqueTable
-from sst_ros.simulation.torque_profile import ConstantTorque
+from sst_ros.simulation.torque_profile import (
+    ConstantTorque,
+    PolynomialTorque,
+    SineProfile,
+    TorqueProfile,
+)
 from sst_ros.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording
+
 
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
 
@@ -31,6 +43,9 @@ FEWEST = 20
 """Samples below which nothing is identified: filters and splines have transients at both ends."""
 
 KEYS = ("t", "gamma", "gamma_dot", "torque", "held", "quaternion")
+
+OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y", "z")
+"""Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 
 
 @dataclass(frozen=True)
@@ -62,16 +77,11 @@ class MeasuredMotion:
         return len(self.torque) == len(self.t) - 1
 
 
-def measured_motion(
-    data: Measured, scene: Scene | None = None, delay: float = 0.0
-) -> MeasuredMotion:
+def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) -> MeasuredMotion:
     """Read a motion from a recording, a trajectory, or arrays.
 
     Args:
-        data: a recording or its path, a trajectory, or a mapping with t [s] (n,), gamma [rad]
-            (n, 3), torque [N m] (n, 3), and where they are known gamma_dot [rad/s] (n, 3),
-            quaternion (4,) at the first sample, and held: True where torque k acts from sample k
-            to the next (n or n - 1 rows).
+        data: see `identify`; held torques act from sample k to the next (n or n - 1 rows).
         scene: the manipulator, for the limit of its actuators.
         delay: time by which measured torques come late [s].
 
@@ -87,40 +97,46 @@ def measured_motion(
     if isinstance(data, Mapping):
         given = dict(data)
     elif isinstance(data, Trajectory):
-        given = _of_trajectory(data)
+        given = _take_trajectory(data)
     elif hasattr(data, "ticks"):
-        given = _of_recording(data)
+        given = _take_recording(data)
     else:
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
         raise InputError("identify", [Problem("data", data, allowed)])
-    t, gamma, torque, gamma_dot = _checked(given)
+    t, gamma, torque, gamma_dot = _check(given)
     quaternion = given.get("quaternion")
     held = bool(given.get("held", False))
     if held and len(torque) == len(t):
         torque = torque[:-1]
     if delay:
-        torque = _shifted(t, torque, held, delay)
-    limit = None if scene is None or scene.actuators is None else scene.actuators.torque_limit
-    worst = np.abs(torque).max(axis=1)
-    saturated = worst >= (np.inf if limit is None else limit * (1.0 - 1e-9))
+        torque = _shift(t, torque, held, delay)
+    actuators = None if scene is None else scene.actuators
+    limit = None if actuators is None else actuators.torque_limit
+    saturated = np.abs(torque).max(axis=1) >= (np.inf if limit is None else limit * (1.0 - 1e-9))
     start = None if quaternion is None else np.asarray(quaternion, dtype=float)
     return MeasuredMotion(t, gamma, gamma_dot, torque, start, saturated)
 
 
-def _of_trajectory(motion: Trajectory) -> dict[str, Any]:
+def _take_trajectory(motion: Trajectory) -> dict[str, Any]:
     """Take a simulated motion; torques without a law are held to their sample, see `Trajectory`."""
     given = {
-        "t": motion.t, "gamma": np.unwrap(motion.gamma, axis=0), "gamma_dot": motion.gamma_dot,
-        "torque": motion.torque, "quaternion": motion.quaternion[0] if len(motion) else None,
-    }  # fmt: skip
+        "t": motion.t,
+        "gamma": np.unwrap(motion.gamma, axis=0),
+        "gamma_dot": motion.gamma_dot,
+        "torque": motion.torque,
+        "quaternion": motion.quaternion[0] if len(motion) else None,
+    }
     if isinstance(motion.law, (TorqueTable, ConstantTorque)):
-        given |= {"torque": _means(motion.law.values, motion.law.breaks(), motion.t), "held": True}
+        given |= {
+            "torque": _average(motion.law.values, motion.law.breaks(), motion.t),
+            "held": True,
+        }
     elif motion.law is None:
         given |= {"torque": motion.torque[1:], "held": True}
     return given
 
 
-def _of_recording(recording: Recording) -> dict[str, Any]:
+def _take_recording(recording: Recording) -> dict[str, Any]:
     """Take a recorded run from the first sample that has an orientation and a torque after it."""
     ticks, times = recording.ticks, recording.seconds
     known = np.isfinite(recording.quaternion).all(axis=1)
@@ -131,16 +147,18 @@ def _of_recording(recording: Recording) -> dict[str, Any]:
         # The lag is between the tick's torque and the joint; the recorded effort is behind it.
         torque: dict[str, Any] = {"torque": recording.effort[inside]}
     else:
-        means = _means(table.values, table.breaks(), times[inside])
+        means = _average(table.values, table.breaks(), times[inside])
         torque = {"torque": means, "held": True}
     return {
-        "t": times[inside], "gamma": np.unwrap(recording.gamma[inside], axis=0),
+        "t": times[inside],
+        "gamma": np.unwrap(recording.gamma[inside], axis=0),
         "gamma_dot": recording.gamma_dot[inside],
-        "quaternion": recording.quaternion[inside][0] if inside.any() else None, **torque,
-    }  # fmt: skip
+        "quaternion": recording.quaternion[inside][0] if inside.any() else None,
+        **torque,
+    }
 
 
-def _means(values: Any, breaks: Array, t: Array) -> Array:
+def _average(values: Any, breaks: Array, t: Array) -> Array:
     """Means over the intervals of t of a torque that is constant between its breaks, (n - 1, 3)."""
     if len(t) < 2:
         return np.empty((0, 3))
@@ -155,7 +173,7 @@ def _means(values: Any, breaks: Array, t: Array) -> Array:
     return np.asarray(np.diff(total[at], axis=0) / np.diff(t)[:, None])
 
 
-def _shifted(t: Array, torque: Array, held: bool, delay: float) -> Array:
+def _shift(t: Array, torque: Array, held: bool, delay: float) -> Array:
     """Torques as they acted, `delay` earlier than they were measured; the last ones are held."""
     if held:
         total = np.vstack([np.zeros(3), np.cumsum(torque * np.diff(t)[:, None], axis=0)])
@@ -164,15 +182,15 @@ def _shifted(t: Array, torque: Array, held: bool, delay: float) -> Array:
     return np.stack([np.interp(t + delay, t, column) for column in torque.T], axis=1)
 
 
-def _checked(given: Mapping[str, Any]) -> tuple[Array, Array, Array, Array | None]:
+def _check(given: Mapping[str, Any]) -> tuple[Array, Array, Array, Array | None]:
     """Arrays of a mapping.
 
     Raises:
         InputError: lists every fault.
 
     """
-    problems = [Problem(key, given[key], f"must be one of {', '.join(KEYS)}")
-                for key in given if key not in KEYS]  # fmt: skip
+    allowed = f"must be one of {', '.join(KEYS)}"
+    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
     arrays: dict[str, Array] = {}
     for key in ("t", "gamma", "torque", "gamma_dot", "quaternion"):
         value = given.get(key)
@@ -189,22 +207,147 @@ def _checked(given: Mapping[str, Any]) -> tuple[Array, Array, Array, Array | Non
             bad = np.argwhere(~np.isfinite(arrays[key]))[0]
             problems.append(Problem(f"{key}{bad.tolist()}", "not finite", "must be finite numbers"))
     if not problems:
-        problems += _misfits(arrays, bool(given.get("held", False)))
+        problems += _find_misfits(arrays, bool(given.get("held", False)))
     if problems:
         raise InputError("identify", problems)
     return arrays["t"], arrays["gamma"], arrays["torque"], arrays.get("gamma_dot")
 
 
-def _misfits(arrays: Mapping[str, Array], held: bool) -> Iterator[Problem]:
+def _find_misfits(arrays: Mapping[str, Array], held: bool) -> Iterator[Problem]:
     t = arrays["t"]
     if t.ndim != 1 or np.any(np.diff(t) <= 0.0):
         yield Problem("t", t, "must be rising times [s], shape (n,)")
         return
     if len(t) < FEWEST:
         yield Problem("t", len(t), f"must be {FEWEST} samples or more")
-    for name, shapes in (
-        ("gamma", ((len(t), 3),)), ("gamma_dot", ((len(t), 3),)), ("quaternion", ((4,),)),
-        ("torque", ((len(t), 3), (len(t) - 1, 3)) if held else ((len(t), 3),)),
-    ):  # fmt: skip
-        if name in arrays and arrays[name].shape not in shapes:
-            yield Problem(name, arrays[name].shape, f"must have the shape {shapes[0]}")
+    samples = (len(t), 3)
+    shapes = {"gamma": samples, "gamma_dot": samples, "quaternion": (4,), "torque": samples}
+    for name, shape in shapes.items():
+        found = arrays[name].shape if name in arrays else shape
+        if found != shape and not (held and name == "torque" and found == (len(t) - 1, 3)):
+            yield Problem(name, found, f"must have the shape {shape}")
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Measured numbers.
+
+    Attributes:
+        t: times of the readings, ascending from 0 or later [s], shape (n,).
+        columns: numbers of what was read, in `OBSERVABLES`, shape (c,).
+        values: the readings [rad], [m], shape (n, c); nan where there is none.
+        deviation: their standard deviations, shape (n, c); None where they are unknown.
+        torque: torques of the motion.
+
+    """
+
+    t: Array
+    columns: tuple[int, ...]
+    values: Array
+    deviation: Array | None
+    torque: TorqueProfile
+
+    def residual(self, scene: Scene, states: Array) -> tuple[Array, Array]:
+        """Return computed less read numbers in standard deviations, and slopes by the quaternion.
+
+        Returns:
+            Residuals of the r readings, shape (r,), and slopes, shape (r, 4), in order of time;
+            those of a time follow each other.
+
+        """
+        found = compile_observables(scene)(*states[:, :4].T)
+        rows = np.stack([np.broadcast_to(row, len(self.t)) for row in found]).reshape(
+            5, -1, len(self.t)
+        )
+        off = rows[0, list(self.columns)].T - self.values
+        angle = np.array(self.columns) < 6
+        off[:, angle] = np.angle(np.exp(1j * off[:, angle]))
+        deviation = np.ones_like(off) if self.deviation is None else self.deviation
+        slopes = np.moveaxis(rows[1:, list(self.columns)], 0, -1).swapaxes(0, 1)
+        there = np.isfinite(self.values)
+        return (off / deviation)[there], (slopes / deviation[:, :, None])[there]
+
+    @property
+    def times_of_residuals(self) -> NDArray[np.intp]:
+        """Rows of `t` of the residuals, shape (r,)."""
+        return np.nonzero(np.isfinite(self.values))[0]
+
+
+def take_readings(data: Measured, scene: Scene) -> Readings:
+    """Take measured angles from a motion, or readings off a figure.
+
+    Args:
+        data: as for `read_motion`; or a mapping with t [s] and any of OBSERVABLES, shape (n,), nan
+            where nothing was read, and deviation, their standard deviation. The torques are then
+            those of the scene.
+        scene: the manipulator.
+
+    Raises:
+        InputError: the data are not sound, or the scene has no torques.
+
+    """
+    if isinstance(data, Mapping) and "torque" not in data:
+        return _take_figure(data, scene)
+    measured = read_motion(data, scene)
+    t = measured.t - measured.t[0]
+    torque: TorqueProfile
+    if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
+        begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
+        torque = TorqueTable(begins, data.ticks.torque)
+    elif measured.held:
+        torque = TorqueTable(t[:-1], measured.torque)
+    else:
+        from scipy.interpolate import CubicSpline
+
+        spline = CubicSpline(t, measured.torque)
+        torque = PolynomialTorque(spline.c, spline.x)
+    return Readings(t, (0, 1, 2), measured.gamma, None, torque)
+
+
+def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
+    problems = [
+        Problem(name, data[name], f"must be t, deviation or one of {', '.join(OBSERVABLES)}")
+        for name in data
+        if name not in (*OBSERVABLES, "t", "deviation")
+    ]
+    columns = tuple(i for i, name in enumerate(OBSERVABLES) if name in data)
+    t = np.atleast_1d(np.asarray(data.get("t", ()), dtype=float))
+    if not (len(t) and np.all(np.isfinite(t)) and t[0] >= 0.0 and np.all(np.diff(t) > 0.0)):
+        problems.append(Problem("t", t, "must be ascending times >= 0 [s]"))
+    if not columns:
+        problems.append(Problem("data", list(data), f"must have one of {', '.join(OBSERVABLES)}"))
+    rows = [np.atleast_1d(np.asarray(data[OBSERVABLES[i]], dtype=float)) for i in columns]
+    for i, row in zip(columns, rows, strict=True):
+        if row.shape != t.shape or np.any(np.isinf(row)):
+            problems.append(Problem(OBSERVABLES[i], row.shape, f"must have the shape {t.shape}"))
+    deviation = data.get("deviation")
+    if deviation is not None and not np.all(np.asarray(deviation) > 0.0):
+        problems.append(Problem("deviation", deviation, "must be > 0"))
+    if scene.torque is None:
+        problems.append(Problem("torque", None, "must be in the scene, or be given as samples"))
+    if problems:
+        raise InputError("identify", problems)
+    assert scene.torque is not None
+    values = np.stack(rows, axis=1)
+    spread = None if deviation is None else np.broadcast_to(deviation, values.shape)
+    return Readings(t, columns, values, spread, SineProfile(scene.torque))
+
+
+@lru_cache(maxsize=8)
+def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
+    """Return a function of the quaternion: nine `OBSERVABLES`, then their derivatives by it."""
+    model, radius = kernel.model_of(scene), scene.star.radius
+
+    def function(*q: Any) -> tuple[Any, ...]:
+        rows = rotation_rows((q[0], q[1], q[2], q[3]))
+        legs = [(kernel.leg_motion(leg, rows, ZERO), leg) for leg in model.legs]
+        first, second, third = rows
+        return (
+            *(joint_angle(at, 0, leg.across, leg.v) for at, leg in legs),
+            atan2(second[2], first[2]),
+            atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
+            atan2(third[1], -third[0]),
+            *(radius * row[2] for row in rows),
+        )
+
+    return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))

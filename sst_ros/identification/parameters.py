@@ -10,16 +10,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.identification.scene_numbers import JOINT_KINDS, at, opened, set_number
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.bodies import Link, Star
+from sst_ros.scene.bodies import Inertia, Link, Star
+from sst_ros.scene.loads import Actuators, Friction
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import Section
 from sst_ros.scene.yaml_document import from_values, replace_values, values_of
+
+JOINT_KINDS = ("gamma", "mu", "beta")
 
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" for part in INERTIA))
@@ -30,23 +35,23 @@ NEGLIGIBLE = 1e-12
 """Friction coefficient [N m, N m s/rad] below which a scene has no such friction."""
 
 
-def selected(scene: Scene, wanted: Iterable[str] | None) -> tuple[str, ...]:
-    """Names of parameters: all that the scene has, or those that begin as one of `wanted`.
+def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
+    """Names of parameters: all that the scene has, or those that begin as one of `requested`.
 
     Args:
         scene: the manipulator.
-        wanted: names, or the beginnings of names, as in ("star", "friction.gamma", "offset").
+        requested: names, or the beginnings of names, as in ("star", "friction.gamma", "offset").
 
     Raises:
         InputError: no parameter begins like that.
 
     """
-    if wanted is None:
+    if requested is None:
         return tuple(_own(scene))
     names: dict[str, None] = {}
     problems = []
-    known = list(_all(scene))
-    for begin in [wanted] if isinstance(wanted, str) else wanted:
+    known = _all(scene)
+    for begin in [requested] if isinstance(requested, str) else requested:
         found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
         if str(begin) in LINKS:  # the three alike
             found = [name for name in found if "[" not in name]
@@ -87,7 +92,7 @@ def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = Fa
         moments: bodies have mass 1, so that "centre" is mass times centre.
 
     """
-    result = opened(scene)
+    result = open_section(scene)
     if moments:
         for body in (result.star, *result.actuated_links, *result.intermediate_links):
             body.centre = [body.mass * part for part in body.centre]
@@ -129,15 +134,15 @@ def _drop_friction(document: dict[str, Any]) -> None:
     """Take away friction without a coefficient, and smoothing that acts on nothing."""
     friction = document.get("friction", {})
     for kind in list(friction):
-        law = friction[kind]
+        terms = friction[kind]
         for key in ("viscous", "coulomb", "static"):
-            if law.get(key, 0.0) < NEGLIGIBLE:
-                law.pop(key, None)
-        if not (law.get("coulomb") or law.get("static")):
-            law.pop("smoothing", None)
-        if not law.get("static"):
-            law.pop("stribeck", None)
-        if not law:
+            if terms.get(key, 0.0) < NEGLIGIBLE:
+                terms.pop(key, None)
+        if not (terms.get("coulomb") or terms.get("static")):
+            terms.pop("smoothing", None)
+        if not terms.get("static"):
+            terms.pop("stribeck", None)
+        if not terms:
             del friction[kind]
     if not friction:
         document.pop("friction", None)
@@ -154,32 +159,26 @@ def _own(scene: Scene) -> Iterator[str]:
             for k in range(3):
                 yield from _body(f"{kind}[{k}]", links[k], scene)
     for kind in JOINT_KINDS:
-        law = getattr(scene.friction, kind, None)
-        yield from (
-            f"friction.{kind}.{part}"
-            for part in ("viscous", "coulomb", "static")
-            if getattr(law, part, 0.0)
-        )
+        terms = getattr(scene.friction, kind, None)
+        present = (part for part in ("viscous", "coulomb", "static") if getattr(terms, part, 0.0))
+        yield from (f"friction.{kind}.{part}" for part in present)
     yield from (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
     if scene.actuators is not None and scene.actuators.rotor_inertia:
         yield "actuators.rotor_inertia"
 
 
-def _all(scene: Scene) -> Iterator[str]:
+def _all(scene: Scene) -> list[str]:
     """Names that may be asked for: also separate links, friction not yet known, offsets."""
-    own = list(_own(scene))
-    yield from own
+    names = list(_own(scene))
     for kind in LINKS:
         links = getattr(scene, kind)
         for k in range(3):
-            yield from (n for n in _body(f"{kind}[{k}]", links[k], scene) if n not in own)
-        yield from (n for n in _body(kind, links[0], scene) if n not in own)
+            names += _body(f"{kind}[{k}]", links[k], scene)
+        names += _body(kind, links[0], scene)
     for kind in JOINT_KINDS:
-        known = (f"friction.{kind}.{part}" for part in ("viscous", "coulomb"))
-        yield from (name for name in known if name not in own)
-    if "actuators.rotor_inertia" not in own:
-        yield "actuators.rotor_inertia"
-    yield from (f"offset[{k}]" for k in range(3))
+        names += (f"friction.{kind}.{part}" for part in ("viscous", "coulomb"))
+    names += ("actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3)))
+    return list(dict.fromkeys(names))
 
 
 def _body(name: str, body: Star | Link, scene: Scene) -> Iterator[str]:
@@ -197,3 +196,68 @@ def _value(scene: Scene, name: str) -> float:
         return float(value.mass * value.centre["xyz".index(words[-1])])
     value = at(scene, words)
     return 0.0 if value is None else float(value)
+
+
+def value_of(scene: Scene, name: str) -> float | None:
+    """Return a number of a scene by its key, the first of a list; None where there is none."""
+    try:
+        value = at(scene, re.findall(r"\w+", name))
+    except (AttributeError, IndexError, TypeError):
+        return None
+    return float(value) if isinstance(value, (int, float)) else None
+
+
+def at(value: Any, words: Sequence[str]) -> Any:
+    """Return what a key, split in words, names; of a list without index the first entry."""
+    for word in words:
+        if value is None:
+            return None
+        if isinstance(value, (tuple, list)):
+            if not word.isdigit():
+                value = getattr(value[0], word)
+                continue
+            value = value[int(word)]
+        else:
+            value = getattr(value, word)
+    return value[0] if isinstance(value, (tuple, list)) else value
+
+
+def open_section(value: Any) -> Any:
+    """Return a section as an object whose fields may be set to anything, tuples as lists."""
+    if isinstance(value, Section):
+        return SimpleNamespace(
+            **{f.name: open_section(getattr(value, f.name)) for f in fields(value)}
+        )
+    return [open_section(entry) for entry in value] if isinstance(value, tuple) else value
+
+
+def set_number(value: Any, words: Sequence[str], symbol: Any) -> None:
+    """Set a number of an `open_section`; a list without an index means all of its entries."""
+    first, *rest = words
+    if isinstance(value, list):
+        if not first.isdigit():
+            for entry in value:
+                set_number(entry, words, symbol)
+        elif rest:
+            set_number(value[int(first)], rest, symbol)
+        else:
+            value[int(first)] = symbol
+        return
+    known = vars(value)
+    if rest:
+        if known.get(first) is None:
+            known[first] = _make_absent(first)
+        set_number(known[first], rest, symbol)
+    else:
+        entries = known.get(first)
+        known[first] = [symbol] * len(entries) if isinstance(entries, list) else symbol
+
+
+def _make_absent(name: str) -> SimpleNamespace:
+    """Return an empty section for a term that the scene does not have."""
+    if name == "friction":
+        return SimpleNamespace(gamma=None, mu=None, beta=None)
+    if name == "inertia":
+        return SimpleNamespace(**dict.fromkeys((f.name for f in fields(Inertia)), 0.0))
+    section: type[Section] = Actuators if name == "actuators" else Friction
+    return SimpleNamespace(**{f.name: f.default for f in fields(section)})

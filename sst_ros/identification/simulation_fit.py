@@ -1,7 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification by simulation: the motion that fits measured angles, by any constant of a scene.
 
-Gauss-Newton steps of SciPy's `least_squares` with the sensitivities of the variational equations.
+Gauss-Newton steps of SciPy's `least_squares` with the sensitivities S = dy/dp of the motion
+y' = f(y, t, p), which obey the variational equation
+
+    S' = (df/dy) S + df/dp,  S(0) = dy(0)/dp
+
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
+derivatives are those of the traced equation of motion, exact to rounding, and are integrated with
+the motion, so that one error control holds for both. Where an elastic stop is met or left its
+torque is zero on both sides: f is continuous, and S as well. A jump (saltation) would follow from a
+jump of f alone (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems,
+Springer 2004, section 7.2).
+
 In sizes of the parameters, the singular values of the sensitivities over the measuring errors show
 which combinations are known and how well: a motion, and even more a single number read off a
 figure, may fix fewer combinations than there are parameters.
@@ -9,26 +20,46 @@ figure, may fix fewer combinations than there are parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import with_jacobian
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compile_program
 from sst_ros.errors import InputError, Problem
+from sst_ros.identification import parameters
+from sst_ros.identification.consistency import LinearFit, find_consistent_values, scales
 from sst_ros.identification.identification import Identification
-from sst_ros.identification.measured_motion import Measured
-from sst_ros.identification.possible_scene import possible_scene
-from sst_ros.identification.readings import Readings, readings
-from sst_ros.identification.scene_numbers import value_of
-from sst_ros.identification.sensitivities import Sensitivities
-from sst_ros.mechanism.geometry import Array
+from sst_ros.identification.measured_motion import Measured, Readings, take_readings
+from sst_ros.identification.parameters import STANDARD, value_of
+from sst_ros.identification.regressor import BaseParameters, mark_present
+from sst_ros.mechanism.generic_math import quaternion_rate
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.torque_profile import TorqueProfile
 
-OPEN = 1.0
+NOT_DETERMINED = 1.0
 """Relative standard deviation of a combination from which on it counts as not determined."""
 
-_SHOWN = 0.05
+TOLERANCE = 1e-12
+"""Relative and absolute, of a step; the latter over the size of a parameter for its column."""
+
+AT_STOPS = 0.1
+"""Of the tolerance where stops are elastic: derivatives jump there, and a step across loses its
+order."""
+
+GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
+RESTITUTION = "stroke.restitution"
 
 
 @dataclass(frozen=True)
@@ -50,39 +81,42 @@ class SimulationFit(Identification):
     def _notes(self) -> Iterator[str]:
         yield f"root of the mean square of the residuals {self.error:.3g}"
         for deviation, row in zip(self.relative, self.directions, strict=True):
-            text = combination(row, self.names)
-            if deviation < OPEN:
-                yield f"known to {deviation:.2g}: {text}"
-            else:
-                yield f"not determined: {text}"
+            known = f"known to {deviation:.2g}" if deviation < NOT_DETERMINED else "not determined"
+            yield f"{known}: {describe_combination(row, self.names)}"
 
 
-def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -> SimulationFit:
+def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None) -> SimulationFit:
     """Identify by simulation; arguments as for `identify`."""
-    names = (wanted,) if isinstance(wanted, str) else tuple(wanted or ())
+    names = (requested,) if isinstance(requested, str) else tuple(requested or ())
     if not names:
         allowed = "must be keys of numbers of the scene, with method simulation"
-        raise InputError("identify", [Problem("parameters", wanted, allowed)])
-    read = readings(data, scene)
+        raise InputError("identify", [Problem("parameters", requested, allowed)])
+    read = take_readings(data, scene)
     motion = Sensitivities(scene, names, read.torque)
     given = np.array([value_of(scene, name) for name in names], dtype=float)
     size = np.abs(given) + (given == 0.0)
 
-    known: dict[bytes, tuple[Array, Array]] = {}
+    last: dict[bytes, tuple[Array, Array]] = {}
 
-    def both(x: Array) -> tuple[Array, Array]:
+    def compare(x: Array) -> tuple[Array, Array]:
+        """Residuals and slopes at x times size; SciPy asks for them one after the other."""
         key = x.tobytes()
-        if key not in known:
-            known.clear()
-            known[key] = _residual(motion, read, x * size)
-        return known[key]
+        if key not in last:
+            last.clear()
+            last[key] = _compare(motion, read, x * size)
+        return last[key]
 
-    least = np.where([_positive(name) for name in names], 1e-3, -np.inf)
     found = least_squares(
-        lambda x: both(x)[0], given / size, lambda x: both(x)[1] * size, bounds=(least, np.inf),
-        xtol=1e-13, ftol=1e-13, gtol=None, max_nfev=100,
-    )  # fmt: skip
-    off, slopes = both(found.x)
+        lambda x: compare(x)[0],
+        given / size,
+        lambda x: compare(x)[1] * size,
+        bounds=(np.where([_is_positive(name) for name in names], 1e-3, -np.inf), np.inf),
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=None,
+        max_nfev=100,
+    )
+    off, slopes = compare(found.x)
     fitted = found.x * size
     scale = np.where(fitted == 0.0, 1.0, fitted)  # changes of logarithms
     error = float(np.sqrt(np.mean(off**2)))
@@ -95,9 +129,9 @@ def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -
     relative[: len(singular)][some] = 1.0 / singular[some]
     finite = np.minimum(relative, 1e9)
     spread = (rows.T * finite**2) @ rows * np.outer(scale, scale)
-    text = (combination(row, names) for row in rows[relative >= OPEN])
-    note = "identified by simulation"
-    adjusted, values, warnings = possible_scene(scene, names, fitted, note)
+    adjusted, values, warnings = make_possible_scene(
+        scene, names, fitted, "identified by simulation"
+    )
     return SimulationFit(
         scene=adjusted,
         given=scene,
@@ -107,7 +141,9 @@ def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -
         before=given,
         estimate=fitted,
         covariance=spread,
-        undetermined=tuple(text),
+        undetermined=tuple(
+            describe_combination(row, names) for row in rows[relative >= NOT_DETERMINED]
+        ),
         warnings=warnings,
         relative=relative,
         directions=rows,
@@ -115,19 +151,17 @@ def fit_simulation(data: Measured, scene: Scene, wanted: Iterable[str] | None) -
     )
 
 
-def combination(row: Array, names: tuple[str, ...]) -> str:
+def describe_combination(row: Array, names: tuple[str, ...]) -> str:
     """Write relative changes as a product of powers."""
-    largest = float(np.abs(row).max())
-    sign = np.sign(row[int(np.argmax(np.abs(row)))])
-    parts = [
-        f"{name}^{sign * value:+.2f}"
+    largest = float(row[int(np.argmax(np.abs(row)))])
+    return " ".join(
+        f"{name}^{np.sign(largest) * value:+.2f}"
         for name, value in zip(names, row, strict=True)
-        if abs(value) > _SHOWN * largest
-    ]
-    return " ".join(parts)
+        if abs(value) > 0.05 * abs(largest)
+    )
 
 
-def _residual(motion: Sensitivities, read: Readings, values: Array) -> tuple[Array, Array]:
+def _compare(motion: Sensitivities, read: Readings, values: Array) -> tuple[Array, Array]:
     """Residuals, shape (r,), and their derivatives by the parameters, shape (r, p)."""
     begin = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
     states, slopes = motion.run(values, begin)
@@ -137,8 +171,229 @@ def _residual(motion: Sensitivities, read: Readings, values: Array) -> tuple[Arr
     return off, np.einsum("ri,rip->rp", by_pose, poses)
 
 
-def _positive(name: str) -> bool:
+def _is_positive(name: str) -> bool:
     last = name.rpartition(".")[2]
     if name.startswith(("friction", "actuators", "stroke", "springs")):
         return last != "rest"
     return last in ("mass", "xx", "yy", "zz")
+
+
+TOLERANCE = 1e-12
+"""Relative and absolute, of a step; the latter over the size of a parameter for its column."""
+
+AT_STOPS = 0.1
+"""Of the tolerance where stops are elastic: derivatives jump there, and a step across loses its
+order."""
+
+GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
+RESTITUTION = "stroke.restitution"
+
+
+class Sensitivities:
+    """Motions of a scene and their derivatives by parameters.
+
+    Args:
+        scene: what moves.
+        names: numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]"
+            or "actuators.time_constant"; a list without index means all of its entries.
+        torque: torques over time.
+
+    Raises:
+        InputError: a key is not a number of the scene, or one of its geometry.
+
+    """
+
+    def __init__(self, scene: Scene, names: Sequence[str], torque: TorqueProfile) -> None:
+        self.scene, self.names = scene, tuple(names)
+        self._torque, self._geometry = torque, Geometry.of(scene)
+        problems = []
+        for name in self.names:
+            allowed = ""
+            if value_of(scene, name) is None:
+                allowed = "must be the key of a number that the scene has"
+            elif name.startswith(GEOMETRY):
+                allowed = "is geometry, which is taken as known"
+            if allowed:
+                problems.append(Problem("parameters", name, allowed))
+        if problems:
+            raise InputError("identify", problems)
+        self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]
+        lag = scene.actuators is not None and scene.actuators.time_constant is not None
+        self._state = (*QUATERNION, *RATE, *(LAG if lag else ()))
+
+    def run(self, values: Array, t: Array) -> tuple[Array, Array]:
+        """Integrate the motion and its sensitivities.
+
+        Args:
+            values: of the parameters, shape (p,).
+            t: times [s], ascending from 0 on, shape (n,).
+
+        Returns:
+            States (q, W and lagged torques), shape (n, m), and their derivatives, (n, m, p).
+
+        Raises:
+            InputError: the motion cannot be integrated with these values.
+
+        """
+        # Inertias between iterations of a fit need not be those of bodies that can exist.
+        outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
+        scene = self.scene.with_values({self.names[i]: float(values[i]) for i in outer})
+        inner = values[self._inner].copy()
+        chain = np.ones(len(values))
+        if RESTITUTION in self.names:
+            chain[self.names.index(RESTITUTION)] = differentiate_damping(scene)
+            inner[self._inner.index(self.names.index(RESTITUTION))] = damping_of(scene.stroke)
+        state, slopes = self._start(scene)
+        size, count = len(self._state), len(values)
+        scale = np.abs(values) + (values == 0.0)
+        y = np.concatenate([state, (slopes * scale).ravel()])
+        derivatives, torque = self._derivatives, self._torque
+        given = inner.tolist()
+
+        def rates(time: float, y: Array, acting: Callable[[float], Any]) -> Array:
+            found = derivatives(*y[:size].tolist(), *acting(time), *given)
+            derivative = np.array(found).reshape(-1, size)
+            into = np.zeros((size, count))
+            into[:, self._inner] = derivative[1 + size :].T
+            flow = derivative[1 : 1 + size].T @ y[size:].reshape(size, count)
+            return np.concatenate([derivative[0], (flow + into * (chain * scale)).ravel()])
+
+        tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
+        breaks = torque.breaks()
+        inside = breaks[(breaks > 0.0) & (breaks < t[-1])]
+        ends = np.unique(np.concatenate([inside, [t[-1]]]))
+        rows, begin = np.empty((len(t), len(y))), 0.0
+        rows[t <= 0.0] = y
+        for end in ends.tolist():
+            here = (t > begin) & (t <= end)
+            try:
+                run = solve_ivp(
+                    rates,
+                    (begin, end),
+                    y,
+                    "DOP853",
+                    np.union1d(t[here], end),
+                    rtol=tolerance,
+                    atol=tolerance,
+                    args=(torque.between(begin, end),),
+                )
+            except (ArithmeticError, ValueError):
+                run = None
+            if run is None or run.status != 0:
+                problem = Problem("parameters", values.tolist(), "leave no motion to the last time")
+                raise InputError("identify", [problem])
+            rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], end
+        sensitivity = rows[:, size:].reshape(len(t), size, count) / scale
+        return rows[:, :size], sensitivity
+
+    @cached_property
+    def _derivatives(self) -> Callable[..., tuple[float, ...]]:
+        """y', then its derivatives by each component of y and by each parameter."""
+        symbols = tuple(f"p{i}" for i in range(len(self._inner)))
+        program = with_jacobian(
+            self._derivative, (*self._state, *TORQUE, *symbols), (*self._state, *symbols)
+        )
+        return compile_program(program)
+
+    def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
+        size = len(self._state)
+        names = [self.names[i] for i in self._inner]
+        symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
+        damping = symbols.pop(RESTITUTION, None)
+        plant = parameters.with_symbols(self.scene, symbols)
+        if damping is not None:
+            plant.stroke.restitution, plant.stroke.damping = None, damping
+        model = kernel.model_of(plant, self._geometry)
+        return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
+
+    def _start(self, scene: Scene) -> tuple[Array, Array]:
+        """Return the initial state, and its derivatives by the parameters, shape (m, p)."""
+        state = np.zeros(len(self._state))
+        state[:7] = initial_state(scene, self._geometry)
+        slopes = np.zeros((len(state), len(self.names)))
+        quaternion, rate = state[:4], np.array(scene.initial.gamma_dot)
+        to_star = ActuatorSpaceMap(self._geometry).star_rates
+
+        def body_rate(q: Array, gamma_dot: Array) -> Array:
+            return np.array(to_star(*q, *gamma_dot, 0.0, 0.0, 0.0)[:3])
+
+        for column, name in enumerate(self.names):
+            if not name.startswith("initial"):
+                continue
+            index = re.search(r"\[(\d)\]", name)
+            unit = np.ones(3) if index is None else np.eye(3)[int(index[1])]
+            turn = body_rate(quaternion, unit)
+            if name.startswith("initial.gamma_dot"):
+                slopes[4:7, column] = turn
+                continue
+            along: Any = np.array(quaternion_rate(tuple(quaternion), tuple(turn)))
+            slopes[:4, column] = along
+            # Complex step: exact to rounding, as the map is rational.
+            slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30
+        return state, slopes
+
+
+def differentiate_damping(scene: Scene) -> float:
+    """Return the derivative of the damping of elastic stops by the restitution [s/rad].
+
+    From s = d (1 + e), L(s/2) = (1 - e) / (1 + e) with Langevin's function L, see
+    `damping_of`: ds/de = -4 / ((1 + e)^2 L'(s/2)), L'(x) = 1/x^2 - 1/sinh(x)^2.
+    """
+    e, v = scene.stroke.restitution, scene.stroke.impact_rate
+    assert e is not None and v is not None
+    d = damping_of(scene.stroke) * v
+    x = 0.5 * d * (1.0 + e)
+    if x < 0.05:  # the difference would cancel
+        slope = 1.0 / 3.0 - x * x / 15.0 + 2.0 * x**4 / 189.0 - x**6 / 675.0
+    else:
+        slope = 1.0 / x**2 - 1.0 / np.sinh(min(x, 300.0)) ** 2
+    return float((-4.0 / ((1.0 + e) ** 2 * slope) - d) / ((1.0 + e) * v))
+
+
+def make_possible_scene(
+    scene: Scene, names: Sequence[str], numbers: Array, note: str
+) -> tuple[Scene, Array, tuple[str, ...]]:
+    """Scene with other numbers by key; where its bodies cannot exist, that with the nearest ones.
+
+    Returns:
+        The scene, the values in it, and a warning where they are others.
+
+    Raises:
+        InputError: other numbers than those of inertias make no scene.
+
+    """
+    values = dict(zip(names, numbers.tolist(), strict=True))
+    sections = sorted({re.split(r"[.\[]", name)[0] for name in names})
+    notes = {f"provenance.{section}": note for section in sections}
+    try:
+        return scene.with_values({**values, **notes}), numbers, ()
+    except InputError:
+        inertias = {name: values.pop(name) for name in names if ".inertia." in name}
+        if not inertias:
+            raise
+    changed = scene.with_values(values)
+    found = _find_nearest_inertias(changed, list(inertias), np.array(list(inertias.values())))
+    adjusted = changed.with_values({**found, **notes})
+    warning = "no bodies have the inertias that fit best: the scene has the nearest"
+    return adjusted, np.array([value_of(adjusted, name) for name in names], dtype=float), (warning,)
+
+
+def _find_nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dict[str, float]:
+    """All entries of the inertias that some entries belong to, of bodies that can exist.
+
+    Args:
+        scene: the manipulator.
+        names: entries by key, as "star.inertia.zz".
+        numbers: their values [kg m^2], which are kept where that is possible.
+
+    """
+    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in names)
+    entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
+    given = parameters.values(scene, entries)
+    chosen = tuple(entries.index(name) for name in names)
+    base = BaseParameters(entries, chosen, np.eye(len(entries))[list(chosen)])
+    root = np.diag(1e6 / scales(entries, given)[list(chosen)])
+    covariance = np.asarray(np.linalg.inv(root) ** 2)
+    fit = LinearFit(numbers, covariance, root, np.ones(3), np.zeros((0, 3)), 1.0)
+    values, _ = find_consistent_values(entries, given, base, fit, 1.0)
+    return dict(zip(entries, values.tolist(), strict=True))

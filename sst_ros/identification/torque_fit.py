@@ -1,24 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification by torques: weighted least squares on the inverse dynamics."""
+"""Identification by torques: weighted least squares on the inverse dynamics.
+
+With measured rates the motion is a Hermite spline, exact to rounding where the data are. Without,
+or with a cut-off, angles pass a Butterworth filter of order 4 forwards and backwards (no phase) and
+a quintic spline, whose derivatives are the rates and accelerations.
+
+Torques that are held ask for the mean of the equation over each interval (weak form with a box as
+test function). Two Gauss points take it: there the second derivative of a cubic Hermite spline is
+of third order, and the errors of the pair cancel, so that the mean is of fourth order in the period
+although the acceleration jumps at each sample.
+
+Noise of variance s^2 in the angles is in the acceleration with a spectrum that rises as f^4. In the
+regressor it shrinks estimates by its share of the power of the acceleration (errors in variables),
+most those that the motion excites weakly. A lower cut-off of the angles would change the motion
+itself. So the regressor is made of angles filtered little, and then torques and columns alike are
+projected on the m sines of lowest frequency,
+
+    sqrt(2 / (n + 1)) sum over i of x_i sin(pi i k / (n + 1)), k = 1 to m.
+
+This is linear: what holds for samples holds for the components, without any distortion (parallel
+filtering and decimation: Gautier, Proc. IEEE ICRA 1997, 1922-1927). The sines are orthonormal:
+white noise of the torques stays white, of the same deviation. They vanish at both ends (modulating
+functions: Shinbrot, Trans. ASME 79 (1957) 547-552): integrated by parts, the acceleration leaves
+no noise of the rates there, as cosines, or sums of samples, would.
+
+Below the frequency f, the noise of the acceleration has the variance s^2 (2 pi f)^4 (2 f / 5 f_s),
+with f_s the rate of samples: a band three times the bandwidth of the motion has 400 times less
+of it than the filter of the angles leaves at ten times. In 1.2 s of the scene `reach` with encoders
+of 65,536 counts the bias is then 0.3 standard deviations at most, and without the projection 6.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dst
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
+from scipy.signal import butter, sosfiltfilt
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.errors import AssemblyError, InputError, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.base_parameters import BaseParameters, independent, structural
-from sst_ros.identification.consistency import consistent_values, scales
-from sst_ros.identification.derivatives import equations
+from sst_ros.identification.consistency import (
+    LinearFit,
+    find_consistent_values,
+    fit_weighted,
+    scales,
+)
 from sst_ros.identification.identification import Identification
-from sst_ros.identification.least_squares import LinearFit, weighted_fit
-from sst_ros.identification.measured_motion import Measured, measured_motion
-from sst_ros.identification.regressor import Regressor
-from sst_ros.identification.sine_components import components
+from sst_ros.identification.measured_motion import Measured, MeasuredMotion, read_motion
+from sst_ros.identification.regressor import (
+    BaseParameters,
+    Regressor,
+    find_base_parameters,
+    find_independent,
+)
+from sst_ros.mechanism import continuation, kinematics
+from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.kinematics import rotate
 from sst_ros.scene.scene import Scene
 
 STILL = 1e-6
@@ -26,6 +70,21 @@ STILL = 1e-6
 
 SIGNIFICANT = 25.0
 """chi^2 above which the nearest bodies that can exist do not explain the estimates (5 sigma)."""
+
+BAND = 3.0
+"""Highest frequency of the sines over the bandwidth of the motion: products of rates double the
+frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in 200 long recordings; the
+bias of short ones grows."""
+
+MARGIN = 10.0
+"""Default cut-off over the frequency below which the motion has all but 1e-4 of its power."""
+
+STEP = 0.03
+"""Length of gamma [rad] between poses that continuation follows; Newton's method takes the rest."""
+
+_NEWTON_STEPS = 8
+_EDGE = 8
+"""Samples at both ends at which an interpolating quintic spline has not its full order."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +126,8 @@ class TorqueFit(Identification):
             InputError: the data are not sound.
 
         """
-        measured = measured_motion(data, self.given)
-        states, rows, group, _ = equations(measured, Geometry.of(self.given), cutoff)
+        measured = read_motion(data, self.given)
+        states, rows, group, _ = pose_equations(measured, Geometry.of(self.given), cutoff)
         known, columns = self.regressor(*states)
         torque = known + self.base.of_columns(columns) @ self.estimate
         return torque.reshape(-1, group, 3).mean(axis=1), measured.torque[rows]
@@ -97,20 +156,20 @@ class TorqueFit(Identification):
 def fit_torques(
     data: Measured,
     scene: Scene,
-    wanted: Iterable[str] | None,
+    requested: Iterable[str] | None,
     cutoff: float | None,
     delay: float,
     noise: Iterable[float] | None,
 ) -> TorqueFit:
     """Identify by torques; arguments as for `identify`."""
-    names = parameters.selected(scene, wanted)
-    measured = measured_motion(data, scene, delay)
-    moved = float(np.ptp(measured.gamma, axis=0).max())
-    if moved < STILL and scene.gravity is None:
+    names = parameters.select_names(scene, requested)
+    measured = read_motion(data, scene, delay)
+    reached = float(np.ptp(measured.gamma, axis=0).max())
+    if reached < STILL and scene.gravity is None:
         allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
-        raise InputError("identify", [Problem("gamma", moved, allowed)])
+        raise InputError("identify", [Problem("gamma", reached, allowed)])
     regressor = Regressor(scene, names)
-    states, rows, group, band = equations(measured, Geometry.of(scene), cutoff)
+    states, rows, group, band = pose_equations(measured, Geometry.of(scene), cutoff)
     known, columns = regressor(*states)
     known = known.reshape(-1, group, 3).mean(axis=1)
     columns = columns.reshape(-1, group, 3, len(names)).mean(axis=1)
@@ -128,23 +187,25 @@ def fit_torques(
     samples = len(torque)
     if band is not None:
         period = float(np.median(np.diff(measured.t)))
-        torque, columns = (components(one, band, period, len(names)) for one in (torque, columns))
-    base = independent(columns, names)
+        torque, columns = (
+            project_on_sines(one, band, period, len(names)) for one in (torque, columns)
+        )
+    base = find_independent(columns, names)
     if not base.chosen:
         allowed = "must determine something: no torque depends on these parameters here"
         raise InputError("identify", [Problem("parameters", list(names), allowed)])
-    fit = weighted_fit(
-        base.of_columns(columns), torque, None if noise is None else _deviations(noise)
+    fit = fit_weighted(
+        base.of_columns(columns), torque, None if noise is None else _check_deviations(noise)
     )
     given = parameters.values(scene, names)
     reach = max(scene.base.radius, scene.star.radius)
-    values, excess = consistent_values(names, given, base, fit, reach)
-    all_of = structural(regressor)
-    lost = [i not in base.chosen for i in all_of.chosen]
+    values, excess = find_consistent_values(names, given, base, fit, reach)
+    whole = find_base_parameters(regressor)
     vague = fit.deviation > scales(names, given)[list(base.chosen)]
-    note = f"identified from {samples} samples"
     return TorqueFit(
-        scene=parameters.with_parameters(scene, names, values, note),
+        scene=parameters.with_parameters(
+            scene, names, values, f"identified from {samples} samples"
+        ),
         given=scene,
         names=names,
         values=values,
@@ -152,25 +213,180 @@ def fit_torques(
         before=np.asarray(base.transform @ given),
         estimate=fit.estimate,
         covariance=fit.covariance,
-        undetermined=_chosen(all_of.labels, lost),
+        undetermined=tuple(
+            label
+            for label, chosen in zip(whole.labels, whole.chosen, strict=True)
+            if chosen not in base.chosen
+        ),
         warnings=tuple(warnings),
         base=base,
         fit=fit,
         excess=excess,
-        vague=_chosen(base.labels, vague.tolist()),
+        vague=tuple(label for label, yes in zip(base.labels, vague, strict=True) if yes),
         samples=samples,
         band=band,
         regressor=regressor,
     )
 
 
-def _chosen(labels: tuple[str, ...], chosen: list[bool]) -> tuple[str, ...]:
-    return tuple(label for label, yes in zip(labels, chosen, strict=True) if yes)
-
-
-def _deviations(noise: Iterable[float]) -> Array:
+def _check_deviations(noise: Iterable[float]) -> Array:
     numbers = np.asarray(list(noise), dtype=float)
     if numbers.shape != (3,) or not np.all(np.isfinite(numbers) & (numbers > 0.0)):
         allowed = "must be three finite standard deviations > 0 [N m]"
         raise InputError("identify", [Problem("noise", noise, allowed)])
     return numbers
+
+
+class Equations(NamedTuple):
+    """Where the equation of motion is asked for.
+
+    Attributes:
+        states: g m quaternions (n, 4), W (n, 3) and W_dot (n, 3) in {E}; those of a row of torques
+            follow each other, and its equation is their mean.
+        rows: of the torques that they belong to, shape (m,).
+        group: g.
+        band: frequency up to which the equations are sound where angles were filtered [Hz].
+
+    """
+
+    states: tuple[Array, Array, Array]
+    rows: NDArray[np.intp]
+    group: int
+    band: float | None
+
+
+def pose_equations(
+    measured: MeasuredMotion, geometry: Geometry, cutoff: float | None = None
+) -> Equations:
+    """States and the rows of torques that belong to them.
+
+    Args:
+        measured: the motion.
+        geometry: base triangle and star.
+        cutoff: of the filter [Hz]; by default none where rates were measured, else MARGIN times
+            the bandwidth of the motion.
+
+    Raises:
+        InputError: no assembly of the manipulator has these angles, or samples are not evenly
+            spaced where they are filtered.
+
+    """
+    t = measured.t
+    path, unsettled = _interpolate(measured, cutoff)
+    if measured.held:
+        middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
+        times = np.stack([middle - half, middle + half], axis=1)
+    else:
+        times = t[:, None]
+    rows = np.arange(unsettled, len(times) - unsettled)
+    gamma, rate, acceleration = path(times[rows].ravel())
+    quaternion = follow_orientations(geometry, gamma, measured.quaternion, measured.gamma[0])
+    found = ActuatorSpaceMap(geometry).star_rates(*quaternion.T, *rate.T, *acceleration.T)
+    star = np.stack(found, axis=1)
+    band = None
+    if cutoff is not None or measured.gamma_dot is None:
+        band = min(
+            BAND * find_bandwidth(float(np.median(np.diff(t))), measured.gamma), cutoff or np.inf
+        )
+    states = quaternion, star[:, :3], star[:, 3:]
+    return Equations(states, rows, int(times.shape[1]), band)
+
+
+def follow_orientations(
+    geometry: Geometry, gamma: Array, quaternion: Array | None, first: Array
+) -> Array:
+    """Quaternions (n, 4) of the assembly mode at gamma (n, 3) that has `quaternion` at `first`.
+
+    Raises:
+        InputError: the angles are not those of this manipulator.
+
+    """
+    start = None if quaternion is None else rotation_matrix(quaternion)
+    points = np.vstack([first, gamma])
+    length = np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
+    known = known[known < len(gamma)]
+    try:
+        coarse = continuation.follow(geometry, np.vstack([first, gamma[known]]), start).rotation
+    except (AssemblyError, continuation.BranchEnds) as error:
+        allowed = f"must be angles of this manipulator ({error})"
+        raise InputError("identify", [Problem("gamma", first.tolist(), allowed)]) from None
+    nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
+    rotation, r = coarse[nearest], kinematics.carriage_directions(geometry, gamma)
+    for _ in range(_NEWTON_STEPS):
+        t = geometry.e @ np.swapaxes(rotation, -1, -2)
+        residual = np.sum(r * t, axis=-1)
+        step = np.linalg.solve(cross(t, r), -residual[..., None])[..., 0]
+        rotation = rotate(rotation, step)
+        if np.abs(step).max(initial=0.0) < 1e-9:  # quadratic: the next would be rounding
+            break
+    return np.asarray(quaternion_of(rotation))
+
+
+def _interpolate(
+    measured: MeasuredMotion, cutoff: float | None
+) -> tuple[Callable[[Array], tuple[Array, Array, Array]], int]:
+    """Gamma and two derivatives as a function of time, and the rows to leave out at both ends."""
+    t, gamma, rate = measured.t, measured.gamma, measured.gamma_dot
+    if cutoff is None and rate is not None:
+        if measured.held:
+            spline = CubicHermiteSpline(t, gamma, rate)
+            return (lambda at: (spline(at), spline(at, 1), spline(at, 2))), 0
+        rates = make_interp_spline(t, rate, k=5)
+        angles = make_interp_spline(t, gamma, k=5)
+        return (lambda at: (angles(at), rates(at), rates(at, 1))), min(_EDGE, len(t) // 4)
+    smooth, unsettled = filter_angles(t, gamma, cutoff)
+    spline = make_interp_spline(t, smooth, k=5)
+    return (lambda at: (spline(at), spline(at, 1), spline(at, 2))), unsettled
+
+
+def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, int]:
+    """Angles after a zero-phase filter, and the samples at both ends that it has not settled for.
+
+    Raises:
+        InputError: samples are not evenly spaced, or the cut-off is not below half their rate.
+
+    """
+    spacing = np.diff(t)
+    period = float(np.median(spacing))
+    if np.abs(spacing - period).max() > 1e-3 * period:
+        allowed = "must be evenly spaced (to 0.1 %) for angles to be filtered"
+        raise InputError("identify", [Problem("t", spacing, allowed)])
+    if cutoff is None:
+        cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
+    if not 0.0 < cutoff < 0.5 / period:
+        allowed = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
+        raise InputError("identify", [Problem("cutoff", cutoff, allowed)])
+    sections = butter(4, cutoff, fs=1.0 / period, output="sos")
+    settled = int(np.ceil(1.0 / (cutoff * period)))
+    if len(t) < 4 * settled + 10:
+        allowed = f"must last {(4 * settled + 10) * period:g} s or more at {cutoff:g} Hz"
+        raise InputError("identify", [Problem("t", float(t[-1] - t[0]), allowed)])
+    smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
+    return np.asarray(smooth), settled
+
+
+def find_bandwidth(period: float, gamma: Array) -> float:
+    """Frequency [Hz] below which the angles have all but 1e-4 of the power of their changes."""
+    spread = (gamma - gamma.mean(axis=0)) * np.hanning(len(gamma))[:, None]
+    power = np.sum(np.abs(np.fft.rfft(spread, axis=0)) ** 2, axis=1)
+    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+    frequencies = np.fft.rfftfreq(len(gamma), period)
+    return float(frequencies[max(int(np.searchsorted(share, 1.0 - 1e-4)), 1)])
+
+
+def project_on_sines(rows: Array, highest: float, period: float, least: int) -> Array:
+    """Project rows of evenly spaced samples on the sines of low frequency.
+
+    Args:
+        rows: shape (n, ...).
+        highest: frequency of the sines [Hz].
+        period: of the samples [s].
+        least: number of sines, however low their frequency.
+
+    Returns:
+        Their components, shape (m, ...).
+
+    """
+    count = max(int(np.ceil(2.0 * highest * period * len(rows))), least)
+    return np.asarray(dst(rows, type=1, norm="ortho", axis=0)[:count])

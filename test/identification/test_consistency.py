@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from sst_ros.identification.base_parameters import BaseParameters
-from sst_ros.identification.consistency import consistent_values, pseudo_inertia, scales
-from sst_ros.identification.least_squares import weighted_fit
+from sst_ros.identification.consistency import (
+    find_consistent_values,
+    fit_weighted,
+    pseudo_inertia,
+    scales,
+)
 from sst_ros.identification.parameters import STANDARD
+from sst_ros.identification.regressor import BaseParameters
 
 NAMES = tuple(f"star.{part}" for part in STANDARD)
 
@@ -31,7 +35,7 @@ def direct(names, noise=1e-3, rows=40, target=None, seed=0):
     columns = rng.normal(size=(rows, 3, len(names)))
     torque = columns @ target
     base = BaseParameters(tuple(names), tuple(range(len(names))), np.eye(len(names)))
-    return base, weighted_fit(columns, torque, np.full(3, noise))
+    return base, fit_weighted(columns, torque, np.full(3, noise))
 
 
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
@@ -52,7 +56,7 @@ def test_estimates_of_a_body_that_exists_are_not_changed(points):
     rng = np.random.default_rng(points)
     target, given = of_points(rng, points), of_points(rng)
     base, fit = direct(NAMES, 1e-9, target=target)
-    values, excess = consistent_values(NAMES, given, base, fit, 1.0)
+    values, excess = find_consistent_values(NAMES, given, base, fit, 1.0)
     assert np.abs(values - target).max() < 1e-9 * np.abs(target).max()
     assert excess < 1e-2
 
@@ -63,7 +67,7 @@ def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
     given = np.array([0.3, 0.3, 0.2, 0.0, 0.0, 0.0])
     target = np.array([0.1, 0.1, 0.4, 0.02, 0.0, 0.01])  # zz > xx + yy
     base, fit = direct(names, 1e-2, target=target)
-    values, excess = consistent_values(names, given, base, fit, 1.0)
+    values, excess = find_consistent_values(names, given, base, fit, 1.0)
     assert excess > 25.0
     size = scales(names, given)
 
@@ -93,7 +97,7 @@ def test_a_centre_stays_within_reach_and_friction_is_not_negative():
     target[1] = 0.5 * target[0]
     target[-1] = -0.1
     base, fit = direct(names, 1e-1, target=target)
-    values, _ = consistent_values(names, given, base, fit, 0.3)
+    values, _ = find_consistent_values(names, given, base, fit, 0.3)
     assert np.linalg.norm(values[1:4]) <= 0.3 * values[0]
     assert 0.0 < values[-1] < 1e-6
     assert np.linalg.eigvalsh(pseudo_inertia(values[:10]))[0] > 0.0

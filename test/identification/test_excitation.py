@@ -9,9 +9,8 @@ from sst_ros import load_scene, reference_motion
 from sst_ros.control.plan import examine
 from sst_ros.errors import InputError, MotionRefused
 from sst_ros.identification import parameters
-from sst_ros.identification.base_parameters import independent
 from sst_ros.identification.excitation import design
-from sst_ros.identification.regressor import Regressor
+from sst_ros.identification.regressor import Regressor, find_independent
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 
@@ -26,13 +25,13 @@ def condition(scene):
     """Of the regressor of the base parameters over the scene's motion, columns of length one."""
     motion = reference_motion(scene)
     references = [motion.at(t) for t in np.linspace(0.0, motion.duration, 200).tolist()]
-    regressor = Regressor(scene, parameters.selected(scene, None))
+    regressor = Regressor(scene, parameters.select_names(scene, None))
     _, columns = regressor(
         np.array([one.quaternion for one in references]),
         np.array([one.body_rate for one in references]),
         np.array([one.body_acceleration for one in references]),
     )
-    base = independent(columns, regressor.names)
+    base = find_independent(columns, regressor.names)
     matrix = base.of_columns(columns).reshape(-1, len(base.chosen))
     return np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)), base
 
@@ -75,7 +74,7 @@ def test_bad_arguments_are_refused():
     for options, message in (
         ({"duration": 0.0}, "duration = 0.0: must be a number >= 0.1"),
         ({"harmonics": 2}, "harmonics = 2: must be from 3 to 30"),
-        ({"wanted": ("nothing",)}, "begins no parameter"),
+        ({"requested": ("nothing",)}, "begins no parameter"),
     ):
         with pytest.raises(InputError, match=message):
             design(scene, **options)

@@ -10,8 +10,8 @@ from identification import manipulators
 from sst_ros import InverseDynamics, load_scene, reference_motion
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
-from sst_ros.identification.derivatives import bandwidth, filtered
 from sst_ros.identification.identify import identify
+from sst_ros.identification.torque_fit import filter_angles, find_bandwidth
 
 COUNT = 2.0 * np.pi / 65536
 NOISE = 0.01
@@ -132,11 +132,11 @@ def test_a_known_delay_of_the_torques_is_taken_out():
 def test_the_filter_has_no_phase_and_leaves_the_motion():
     t = np.arange(2000) * 1e-3
     gamma = np.stack([np.sin(2 * np.pi * f * t) for f in (1.0, 2.0, 3.0)], axis=1)
-    smooth, settled = filtered(t, gamma, 30.0)
+    smooth, settled = filter_angles(t, gamma, 30.0)
     inside = slice(settled, -settled)
     # |H|^2 = 1 / (1 + (f / cutoff)^8), forwards and backwards; the ends fade slowly.
     assert np.abs(smooth - gamma)[inside].max() < 1e-5
-    assert bandwidth(1e-3, gamma) == pytest.approx(3.0, abs=1.0)
+    assert find_bandwidth(1e-3, gamma) == pytest.approx(3.0, abs=1.0)
 
 
 def test_angles_to_be_filtered_must_be_evenly_spaced_and_long_enough():

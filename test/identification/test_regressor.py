@@ -8,8 +8,7 @@ from identification import manipulators
 from sst_ros import InverseDynamics
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
-from sst_ros.identification.base_parameters import independent, structural
-from sst_ros.identification.regressor import Regressor
+from sst_ros.identification.regressor import Regressor, find_base_parameters, find_independent
 from sst_ros.mechanism import kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
@@ -33,7 +32,7 @@ def states(scene, count, seed=0):
 @pytest.mark.parametrize("name", SCENES)
 def test_torques_are_the_known_part_plus_regressor_times_parameters(name):
     scene = getattr(manipulators, name)()
-    names = parameters.selected(scene, None)
+    names = parameters.select_names(scene, None)
     _, rotation, rate, acceleration = states(scene, 30)
     quaternion = quaternion_of(rotation)
     known, columns = Regressor(scene, names)(quaternion, rate, acceleration)
@@ -46,7 +45,7 @@ def test_torques_are_the_known_part_plus_regressor_times_parameters(name):
 def test_friction_that_the_scene_does_not_have_offsets_and_rotors_are_columns():
     scene = manipulators.thin_arcs()
     wanted = ("friction.gamma", "actuators.rotor_inertia", "offset")
-    names = parameters.selected(scene, wanted)
+    names = parameters.select_names(scene, wanted)
     assert names == (
         "friction.gamma.viscous", "friction.gamma.coulomb", "actuators.rotor_inertia",
         "offset[0]", "offset[1]", "offset[2]",
@@ -65,8 +64,8 @@ def test_friction_that_the_scene_does_not_have_offsets_and_rotors_are_columns():
 def test_base_parameters_are_those_of_the_kernel():
     """Star 6; a leg has A0, A2 and three products of inertia (`kernel`), here alike."""
     scene = manipulators.thin_arcs()
-    regressor = Regressor(scene, parameters.selected(scene, None))
-    base = structural(regressor)
+    regressor = Regressor(scene, parameters.select_names(scene, None))
+    base = find_base_parameters(regressor)
     assert len(base.chosen) == 11
     axial = "actuated_links.inertia.zz + intermediate_links.inertia.zz"
     shape = (
@@ -74,30 +73,30 @@ def test_base_parameters_are_those_of_the_kernel():
         " + intermediate_links.inertia.zz"
     )
     assert {axial, shape} <= set(base.labels)
-    separate = parameters.selected(
+    separate = parameters.select_names(
         scene, ("star", *(f"{k}[{i}]" for k in parameters.LINKS for i in range(3)))
     )
-    assert len(structural(Regressor(scene, separate)).chosen) == 6 + 3 * 5
+    assert len(find_base_parameters(Regressor(scene, separate)).chosen) == 6 + 3 * 5
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_the_columns_of_the_base_parameters_give_all_torques(name):
     scene = getattr(manipulators, name)()
-    regressor = Regressor(scene, parameters.selected(scene, None))
-    base = structural(regressor)
+    regressor = Regressor(scene, parameters.select_names(scene, None))
+    base = find_base_parameters(regressor)
     _, rotation, rate, acceleration = states(scene, 40, seed=3)
     _, columns = regressor(quaternion_of(rotation), rate, acceleration)
     rebuilt = base.of_columns(columns) @ base.transform
     assert np.abs(rebuilt - columns).max() < 1e-9 * np.abs(columns).max()
-    assert independent(columns, regressor.names).chosen == base.chosen
+    assert find_independent(columns, regressor.names).chosen == base.chosen
 
 
 def test_unknown_names_are_refused_with_the_nearest():
     scene = manipulators.thin_arcs()
     with pytest.raises(InputError, match=r"parameters = 'sta': begins no parameter"):
-        parameters.selected(scene, ("sta",))
+        parameters.select_names(scene, ("sta",))
     with pytest.raises(InputError, match="not both"):
-        parameters.selected(scene, ("actuated_links", "actuated_links[0]"))
+        parameters.select_names(scene, ("actuated_links", "actuated_links[0]"))
 
 
 def test_pinocchio_has_the_same_regressor():
@@ -106,7 +105,7 @@ def test_pinocchio_has_the_same_regressor():
     scene = manipulators.general()
     geometry = Geometry.of(scene)
     separate = [f"{kind}[{k}]" for kind in parameters.LINKS for k in range(3)]
-    names = parameters.selected(scene, ("star", *separate))
+    names = parameters.select_names(scene, ("star", *separate))
     gamma, rotation, rate, acceleration = states(scene, 10)
     _, columns = Regressor(scene, names)(quaternion_of(rotation), rate, acceleration)
     for row in range(len(gamma)):

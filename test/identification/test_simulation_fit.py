@@ -17,8 +17,8 @@ from sst_ros.dynamics.model import damping_of, joint_angle
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
-from sst_ros.identification.scene_numbers import value_of
-from sst_ros.identification.sensitivities import Sensitivities, damping_slope
+from sst_ros.identification.parameters import value_of
+from sst_ros.identification.simulation_fit import Sensitivities, differentiate_damping
 from sst_ros.mechanism.generic_math import ZERO, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.simulation.torque import SineProfile
@@ -203,7 +203,7 @@ def test_the_slope_of_the_damping_by_the_restitution():
             damping_of(scene.with_values({"stroke.restitution": e + h}).stroke)
             for h in (1e-6, -1e-6)
         )
-        assert damping_slope(scene) == pytest.approx((high - low) / 2e-6, rel=1e-7)
+        assert differentiate_damping(scene) == pytest.approx((high - low) / 2e-6, rel=1e-7)
 
 
 @pytest.mark.slow
