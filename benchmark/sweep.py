@@ -30,10 +30,8 @@ import numpy as np
 from benchmark import machine
 from sst_ros import load_scene, simulate, sweep
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.sweeps.chunk_task import ChunkTask, run_chunk, versions
-from sst_ros.sweeps.local_engine import run_local
-from sst_ros.sweeps.parts import read_sweep
-from sst_ros.sweeps.prepared import prepared
+from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_chunk, run_local
+from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
@@ -91,7 +89,7 @@ def _study(rows: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         began, processor = time.perf_counter(), time.process_time()
         study = study_of(rows)
-        ready = prepared(study)
+        ready = prepare(study)
         prepared_s = time.perf_counter() - began
         _chunks(study, ready.steps, folder)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
@@ -113,7 +111,7 @@ def _study(rows: int) -> dict[str, float]:
 def _arrays(study: SweepStudy, steps: int) -> tuple[Any, list[Any]]:
     """Sample and check all rows; return their batch, states, inputs and codes."""
     values = study.sampler.rows(0, study.rows)
-    ready = prepared(study, steps)
+    ready = prepare(study, steps)
     scenarios, _, _ = ready.scenarios(values)
     batch = ready.batch.with_parameters(scenarios)
     y, code = batch.start(study.scene.initial.gamma, (0.0, 0.0, 0.0))
@@ -147,7 +145,7 @@ def _ratios(steps: int) -> dict[str, float]:
 
 def _chunks(study: SweepStudy, steps: int, folder: str) -> None:
     """Compute and write all chunks of a study, on all cores."""
-    task = ChunkTask(study, steps, folder, versions())
+    task = ChunkTask(study, steps, folder, list_versions())
     run_local(task, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
 
 
@@ -201,10 +199,10 @@ def _cluster(steps: int) -> dict[str, float]:
 
     found: dict[str, float] = {}
     study = study_of(CHUNKS * CHUNK)
-    ready = prepared(study, steps)
+    ready = prepare(study, steps)
     times: dict[str, list[float]] = {"1": [], "2": [], "C": []}
     with tempfile.TemporaryDirectory() as folder:
-        task = ChunkTask(study, steps, folder, versions())
+        task = ChunkTask(study, steps, folder, list_versions())
         began = time.perf_counter()
         run_chunk(task, 0)
         found["seconds of a chunk"] = time.perf_counter() - began

@@ -16,11 +16,11 @@ from sst_ros.identification.identify import identify
 from sst_ros.recording.recorded_motion import samples
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
+from sst_ros.sweeps.chunk_task import read_sweep
 from sst_ros.sweeps.cluster_engine import connect
-from sst_ros.sweeps.parts import read_sweep
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
-from sst_ros.sweeps.sweep_summary import summary
+from sst_ros.sweeps.sweep_summary import summarize
 
 PLOT, DESIGN = "plot", "design"
 """Words in place of a study and of a bag."""
@@ -63,14 +63,16 @@ def run_sweep(options: argparse.Namespace) -> None:
     finally:
         if client is not None:
             client.close(timeout=5)
-    print(summary(found))
+    print(summarize(found))
     print(f"Results in {out}; `sst-ros sweep plot {out}` draws them.")
 
 
 def _draw_sweep(options: argparse.Namespace) -> None:
     if options.folder is None or options.scheduler or options.workers or options.resume:
         options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
-    draw = function("sweeps.sweep_pictures:draw")  # Matplotlib, which a sweep does not need
+    draw = function(
+        "sweeps.sweep_pictures:draw_pictures"
+    )  # Matplotlib, which a sweep does not need
     for path in draw(read_sweep(options.folder), options.out or options.folder):
         print(path)
 

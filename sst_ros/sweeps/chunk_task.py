@@ -1,25 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The task that a thread or a worker does: one chunk, computed and written."""
+"""The task that a thread or a worker does: one chunk, computed and written; all of them on threads.
+
+Results are Parquet files, one a chunk, each complete or absent: a file is written to a temporary
+name, flushed to the disk, and renamed. Its metadata holds the study, its digest, the version and
+the units, so that a file explains itself and `--resume` knows which chunks are there.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 import platform
+import tempfile
+import threading
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.sweeps import parts
-from sst_ros.sweeps.prepared import prepared
+from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.extras import require
+from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
+METADATA = b"sst_ros"
+
+_TEMPORARY = ".part-"
+
 DONE, REFUSED, UNWRITABLE = "done", "refused", "unwritable"
+
+
+class SweepFailed(SstError):
+    """Chunks of a study could not be computed or written; the others are complete."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +50,7 @@ class ChunkTask:
         study: what runs.
         steps: number of steps of a run.
         folder: where files are written; None to return tables.
-        versions: those of the process that started the study, see `versions`.
+        versions: those of the process that started the study, see `list_versions`.
 
     """
 
@@ -66,7 +86,7 @@ class ChunkOutcome:
     worker: str = ""
 
 
-def versions() -> tuple[tuple[str, str], ...]:
+def list_versions() -> tuple[tuple[str, str], ...]:
     """Versions on which the bits of results depend."""
     import numba
     import scipy
@@ -82,7 +102,7 @@ def versions() -> tuple[tuple[str, str], ...]:
 
 def difference(expected: tuple[tuple[str, str], ...]) -> str:
     """How this process differs from the versions expected; empty where it does not."""
-    here = dict(versions())
+    here = dict(list_versions())
     texts = [
         f"{name} {here.get(name, 'missing')} in place of {version}"
         for name, version in expected
@@ -99,7 +119,7 @@ def run_chunk(task: ChunkTask, index: int, worker: str = "") -> ChunkOutcome:
     if folder is not None and not folder.is_dir():
         allowed = f"{folder} is not there: workers need the folder of --out on a shared disk"
         return ChunkOutcome(index, UNWRITABLE, allowed, worker=worker)
-    ready = prepared(task.study, task.steps)
+    ready = prepare(task.study, task.steps)
     table, trajectory = ready.chunk(index)
     counts = Counter(
         {row["values"]: row["counts"] for row in table["reason"].value_counts().to_pylist()}
@@ -112,8 +132,146 @@ def run_chunk(task: ChunkTask, index: int, worker: str = "") -> ChunkOutcome:
         return ChunkOutcome(**vars(outcome) | {"table": table, "trajectory": trajectory})
     try:
         if trajectory is not None:
-            parts.write(trajectory, folder, parts.part(index, "trajectory"), ready.about)
-        parts.write(table, folder, parts.part(index), ready.about)
+            write(trajectory, folder, part(index, "trajectory"), ready.about)
+        write(table, folder, part(index), ready.about)
     except OSError as error:
         return ChunkOutcome(index, UNWRITABLE, f"{folder}: {error}", worker=worker)
     return outcome
+
+
+def run_local(
+    task: ChunkTask, chunks: Sequence[int], done: Callable[[ChunkOutcome], None], workers: int
+) -> None:
+    """Compute chunks on threads; the compiled code releases the interpreter's lock.
+
+    Args:
+        task: what all chunks have in common.
+        chunks: indices of the chunks.
+        done: is called with each outcome, one at a time.
+        workers: number of threads; 1 for Dask's synchronous scheduler.
+
+    Raises:
+        SweepFailed: a file cannot be written.
+
+    """
+    dask = require("dask")
+    lock, failed = threading.Lock(), threading.Event()
+
+    def run(index: int) -> None:
+        if failed.is_set():
+            return
+        try:
+            outcome = run_chunk(task, index)
+        except BaseException:
+            failed.set()
+            raise
+        if outcome.status != DONE:
+            failed.set()
+            raise SweepFailed(f"chunk {index}: {outcome.detail}")
+        with lock:
+            done(outcome)
+
+    # By its name Dask would look for a client first, and import all of distributed.
+    get = require("dask.threaded").get if workers > 1 else require("dask.local").get_sync
+    tasks = [dask.delayed(run, pure=False)(index) for index in chunks]
+    dask.compute(*tasks, scheduler=get, num_workers=workers)
+
+
+def part(index: int, kind: str = "part") -> str:
+    """Name of the file of a chunk."""
+    return f"{kind}-{index:07d}.parquet"
+
+
+def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) -> None:
+    """Write a table as a file that is there whole or not at all.
+
+    Raises:
+        OSError: it cannot be written; nothing of it is left.
+
+    """
+    parquet = require("pyarrow.parquet")
+    names = set(table.column_names)
+    units = {name: unit for name, unit in about["units"].items() if name in names}
+    about = dict(about) | {"units": units}
+    table = table.replace_schema_metadata({METADATA: json.dumps(about).encode()})
+    handle, temporary = tempfile.mkstemp(prefix=_TEMPORARY, dir=folder)
+    try:
+        # Random mantissas do not compress, and their least and greatest help no reader.
+        parquet.write_table(
+            table, temporary, compression="none", use_dictionary=["reason"], write_statistics=False
+        )
+        os.fsync(handle)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(folder / name)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(handle)
+
+
+def read_about(path: Path) -> dict[str, Any] | None:
+    """Metadata of a file, with its number of rows; None if it is no complete file of a study."""
+    parquet = require("pyarrow.parquet")
+    try:
+        with parquet.ParquetFile(path) as file:
+            found: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
+            return found | {"rows": file.metadata.num_rows}
+    except (OSError, ValueError, KeyError, TypeError, require("pyarrow").ArrowException):
+        return None
+
+
+def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
+    """Return the chunks whose files are there.
+
+    Raises:
+        InputError: a file is that of another study or version.
+
+    """
+    expected = {"digest": study.digest, "steps": steps, "version": VERSION}
+    found = set()
+    for path in sorted(folder.glob("part-*.parquet")):
+        about = read_about(path)
+        if about is None:
+            continue
+        if any(about[key] != value for key, value in expected.items()):
+            allowed = "is of another study or version: choose another --out"
+            raise InputError("sweep", [Problem("--resume", str(path), allowed)])
+        index = int(path.stem.removeprefix("part-"))
+        rows = min(study.chunk, study.rows - index * study.chunk)
+        trajectory = folder / part(index, "trajectory")
+        kept = study.trajectory is not None and index * study.chunk < study.trajectory["rows"]
+        if about["rows"] == rows and (not kept or read_about(trajectory) is not None):
+            found.add(index)
+    return found
+
+
+def clear_temporary(folder: Path) -> None:
+    """Remove what killed processes have left."""
+    for path in folder.glob(f"{_TEMPORARY}*"):
+        path.unlink(missing_ok=True)
+
+
+def read_sweep(folder: Path, kind: str = "part") -> pd.DataFrame:
+    """Read the results in a folder as one table, units and study in its `attrs`.
+
+    Raises:
+        InputError: there are none.
+
+    """
+    paths = sorted(folder.glob(f"{kind}-*.parquet"))
+    about = [one for one in map(read_about, paths) if one is not None]
+    if not about:
+        allowed = f"must be a folder with files {kind}-*.parquet of `sst-ros sweep`"
+        raise InputError("sweep", [Problem("DIR", str(folder), allowed)])
+    dataset = require("pyarrow.parquet").read_table([str(path) for path in paths])
+    return to_frame(dataset, about[0])
+
+
+def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
+    """Return a table as pandas, with its metadata as `attrs`."""
+    frame: pd.DataFrame = table.replace_schema_metadata(None).to_pandas()
+    if "t" in frame and "status" in frame:
+        frame = frame.set_index("scenario")
+    frame.attrs = {key: value for key, value in about.items() if key != "rows"}
+    return frame

@@ -18,8 +18,7 @@ from typing import Any
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
 from sst_ros.host.cache_folder import cache_folder, store
-from sst_ros.sweeps.chunk_task import DONE, ChunkOutcome, ChunkTask, run_chunk
-from sst_ros.sweeps.local_engine import SweepFailed
+from sst_ros.sweeps.chunk_task import DONE, ChunkOutcome, ChunkTask, SweepFailed, run_chunk
 
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker that takes chunks, and for a scheduler that does not answer [s]."""
@@ -157,9 +156,14 @@ class _Run:
         """Send a chunk: to any worker, or where some are refused to one of the others."""
         chosen = workers if self._refused else None
         future = self._client.submit(
-            _task_on_worker, self._task, index, pure=False, workers=chosen,
-            allow_other_workers=False, key=f"chunk-{index}-{time.monotonic_ns()}",
-        )  # fmt: skip
+            _task_on_worker,
+            self._task,
+            index,
+            pure=False,
+            workers=chosen,
+            allow_other_workers=False,
+            key=f"chunk-{index}-{time.monotonic_ns()}",
+        )
         self._running[future] = index, chosen
 
     def _stranded(self, workers: set[str]) -> list[int]:

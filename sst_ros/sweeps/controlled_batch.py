@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -21,10 +22,38 @@ from sst_ros.integration.batch_run import integrated
 from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Array
-from sst_ros.sweeps import counter_noise
-from sst_ros.sweeps.controlled import ControlledRun
-from sst_ros.sweeps.reference_samples import REFERENCES, grouped, reference_table
-from sst_ros.sweeps.traced_controller import GAINS, TracedController
+from sst_ros.sweeps.sweep_study import ControlledRun
+from sst_ros.sweeps.traced_controller import (
+    GAINS,
+    REFERENCES,
+    TracedController,
+    divide,
+    tabulate_references,
+)
+
+NOISE = (
+    """\
+def mixed(x):
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+""",
+    """\
+def gaussian(seed, row, counter):
+    step = np.uint64(0x9E3779B97F4A7C15)
+    stream = mixed(mixed(np.uint64(seed) + step) + np.uint64(row) * step)
+    first = mixed(stream + np.uint64(2 * counter + 1) * step)
+    second = mixed(stream + np.uint64(2 * counter + 2) * step)
+    u = (np.float64(first >> np.uint64(11)) + 0.5) * 1.1102230246251565e-16
+    v = (np.float64(second >> np.uint64(11)) + 0.5) * 1.1102230246251565e-16
+    return sqrt(-2.0 * np.log(u)) * cos(6.283185307179586 * v)
+""",
+)
+"""Normal noise from a counter: number c of row i depends on the seed, i and c alone.
+
+The bits are those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for each number;
+a pair of them becomes a normal number by the method of Box and Muller (1958)."""
+
 
 _NOISE = 6
 _NEVER = 2**62
@@ -60,8 +89,11 @@ class ControlledBatch:
             raise InputError("sweep", [Problem("duration", length, allowed)])
         controller = Controller(loop.model, loop.motion, loop.settings, period)
         self._inertia = np.array(controller.inertia)
-        limits = np.isfinite(self._own_limit()) or "control.torque_limit" in varied
-        plant = batch.scene.actuators is not None and batch.scene.actuators.torque_limit is not None
+        own = bool(loop.settings.torque_limit) or "control.torque_limit" in varied
+        limited = own or any(
+            plant.actuators is not None and plant.actuators.torque_limit
+            for plant in (loop.model, batch.scene)
+        )
         self._noisy = bool(
             loop.channel.angle_noise
             or loop.channel.rate_noise
@@ -70,12 +102,16 @@ class ControlledBatch:
         integral = loop.settings.integral_rate > 0.0 or "control.integral_rate" in varied
         observes = loop.settings.mode in ("gravity_pd", "computed_torque")
         sizes = {
-            "integral": 3 * integral, "queue": 3 * loop.channel.delay,
-            "before": 3 * (loop.channel.counts > 0), "observed": 4 * observes,
-            "squares": 3, "largest": 3, "limited": 1,
-        }  # fmt: skip
+            "integral": 3 * integral,
+            "queue": 3 * loop.channel.delay,
+            "before": 3 * (loop.channel.counts > 0),
+            "observed": 4 * observes,
+            "squares": 3,
+            "largest": 3,
+            "limited": 1,
+        }
         memory = tuple((name, int(size)) for name, size in sizes.items())
-        self._controller = TracedController(loop, bool(limits or plant), memory)
+        self._controller = TracedController(loop, limited, memory)
 
     @cached_property
     def module(self) -> ModuleType:
@@ -84,7 +120,7 @@ class ControlledBatch:
         text = batch_source(
             model.program, model.limit_distances, DOP853, len(model.ode.state), self._feedback
         )
-        texts = [counter_noise.SOURCE, counter_noise.GAUSSIAN, text]
+        texts = [*NOISE, text]
         return codegen.load(texts, {"NODES": DOP853.c}, numba=True, nogil=True)
 
     def run(
@@ -129,15 +165,20 @@ class ControlledBatch:
 
         numbers = rows.astype(np.int64)
         result = integrated(
-            batch.model, batch.columns, batch.start(gamma, rate),
-            batch.drives((0.0, 0.0, 0.0), count), advance,
-            step=step, count=steps, keep_every=kept,
-        )  # fmt: skip
+            batch.model,
+            batch.columns,
+            batch.start(gamma, rate),
+            batch.drives((0.0, 0.0, 0.0), count),
+            advance,
+            step=step,
+            count=steps,
+            keep_every=kept,
+        )
         return result, self._tracking(result, memory, result.t)
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
-        found = grouped(self._controller.memory, list(memory))
+        found = divide(self._controller.memory, list(memory))
         final = self._references[-1, 1:4] - result.gamma
         complete = (result.code == 0)[:, None]
         squares = np.stack(found["squares"], axis=1) + np.where(complete, final**2, 0.0)
@@ -151,36 +192,42 @@ class ControlledBatch:
 
     @cached_property
     def _references(self) -> Array:
-        return reference_table(self._loop, self.samples)
+        return tabulate_references(self._loop, self.samples)
 
     @cached_property
     def _feedback(self) -> SampledFeedback:
         model, controller = self._batch.model, self._controller
         drive, state = model.ode.drive[3:], model.ode.state
         noise = _NOISE if self._noisy else 0
-        groups = [REFERENCES, ((s, 1) for s in state), controller.memory, (("noise", noise),),
-                  ((s, 1) for s in (*drive, *model.names)), GAINS]  # fmt: skip
-        names = [f"{i}_{name}_{k}" for i, group in enumerate(groups) for name, n in group
-                 for k in range(n)]  # fmt: skip
-        sizes = [
-            sum(n for _, n in REFERENCES), len(state), sum(n for _, n in controller.memory), noise,
-            len(drive) + len(model.names), sum(n for _, n in GAINS),
-        ]  # fmt: skip
+        groups: dict[str, Sequence[tuple[str, int]]] = {
+            "references": REFERENCES,
+            "state": [(name, 1) for name in state],
+            "memory": controller.memory,
+            "noise": [("noise", noise)],
+            "parameters": [(name, 1) for name in (*drive, *model.names)],
+            "gains": GAINS,
+        }
+        sizes = {name: sum(n for _, n in parts) for name, parts in groups.items()}
+        names = [
+            f"{i}_{name}_{k}"
+            for i, parts in enumerate(groups.values())
+            for name, n in parts
+            for k in range(n)
+        ]
 
         def command(*inputs: Expression) -> tuple[Any, ...]:
-            parts, at = [], 0
-            for size in sizes:
-                parts.append(inputs[at : at + size])
-                at += size
-            references, y, memory, normals, parameters, gains = parts
-            plant = model.constants(parameters[len(drive) :]).model
+            given = divide(list(sizes.items()), inputs)
             return controller(
-                plant, y, grouped(REFERENCES, references), grouped(controller.memory, memory),
-                grouped(GAINS, gains), normals,
-            )  # fmt: skip
+                model.constants(given["parameters"][len(drive) :]).model,
+                given["state"],
+                divide(REFERENCES, given["references"]),
+                divide(controller.memory, given["memory"]),
+                divide(GAINS, given["gains"]),
+                given["noise"],
+            )
 
         program: Program = trace(command, names)
-        return SampledFeedback(program, sizes[0], sizes[2], noise, sizes[5])
+        return SampledFeedback(program, sizes["references"], sizes["memory"], noise, sizes["gains"])
 
     def _memory(self, gamma: Array, rate: Array, count: int) -> Array:
         """Return the memory before the first sample, a column a scenario."""
@@ -220,15 +267,16 @@ class ControlledBatch:
         if actuators is not None and actuators.torque_limit:
             limit = np.minimum(limit, actuators.torque_limit)
         rows = [
-            kp, kd, np.broadcast_to(inertia, (3, count)), value("integral_rate"), limit,
-            batch.columns.torque_limit, value("angle_noise"), value("rate_noise"),
-        ]  # fmt: skip
-        return np.concatenate(
-            [np.broadcast_to(np.atleast_2d(row), (len(np.atleast_2d(row)), count)) for row in rows]
-        )
-
-    def _own_limit(self) -> float:
-        limits = [self._loop.settings.torque_limit or math.inf]
-        if self._loop.model.actuators is not None:
-            limits.append(self._loop.model.actuators.torque_limit or math.inf)
-        return min(limits)
+            np.atleast_2d(row)
+            for row in (
+                kp,
+                kd,
+                inertia,
+                value("integral_rate"),
+                limit,
+                batch.columns.torque_limit,
+                value("angle_noise"),
+                value("rate_noise"),
+            )
+        ]
+        return np.concatenate([np.broadcast_to(row, (len(row), count)) for row in rows])

@@ -48,12 +48,15 @@ def run_jobs(
     call = dask.delayed(function, pure=False, traverse=False)
     tasks = [call(dask.delayed(job, traverse=False)) for job in jobs]
     with _bar(parts) if progress else nullcontext():
-        return list(
-            dask.compute(
-                *tasks, scheduler="processes", num_workers=workers, chunksize=1,
-                initializer=_end_with_the_parent, optimize_graph=False,
-            )
-        )  # fmt: skip
+        results = dask.compute(
+            *tasks,
+            scheduler="processes",
+            num_workers=workers,
+            chunksize=1,
+            initializer=_end_with_the_parent,
+            optimize_graph=False,
+        )
+        return list(results)
 
 
 def _bar(parts: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,21 +15,14 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import BatchResult
+from sst_ros.integration.batch_result import BatchResult, BatchStates
 from sst_ros.integration.parametric_model import OUTPUTS
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array
+from sst_ros.state import DIMENSIONS, QUANTITIES
 from sst_ros.sweeps.controlled_batch import ControlledBatch
-from sst_ros.sweeps.range_ends import parameters_of, range_ends
-from sst_ros.sweeps.step_choice import chosen_steps, pilot_rows
-from sst_ros.sweeps.sweep_columns import (
-    Columns,
-    components,
-    extremes_of,
-    units_of,
-    with_faults,
-)
 from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.sweeps.variations import Sampler, Variation
 from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
@@ -37,7 +31,16 @@ if TYPE_CHECKING:
 PARTS = 64
 """Extremes are those of the states at the ends of at most so many equal parts of a run."""
 
+PILOT = 256
+"""Rows by which the number of steps is chosen; drawn apart, so that no number of rows matters."""
+
+MOST_STEPS = 1_000_000
+
 _STATE_KEYS = ("initial.gamma", "initial.gamma_dot")
+
+_JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+
+Columns = dict[str, NDArray[Any]]
 
 
 class PreparedSweep:
@@ -56,7 +59,7 @@ class PreparedSweep:
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:
         self.study = study
         scene = study.model_scene
-        numbers, _ = _split(range_ends(self.study))
+        numbers, _ = _split(find_range_ends(self.study))
         ends = Scenarios(scene, numbers)
         faults = ends.faults(most=1)
         if faults:
@@ -75,10 +78,10 @@ class PreparedSweep:
         self.module = (self.controlled or self.batch).module
         self.steps, self.pilot_error = steps or study.steps or 0, math.nan
         if not self.steps:
-            values = pilot_rows(study)
+            values = draw_pilot_rows(study)
             scenarios, starts, _ = self.scenarios(values)
             rows = np.arange(len(next(iter(values.values()))))
-            self.steps, self.pilot_error = chosen_steps(
+            self.steps, self.pilot_error = choose_steps(
                 lambda number: self.run(scenarios, starts, rows, number)[0],
                 1 if self.controlled is None else self.controlled.samples,
                 study.tolerance,
@@ -91,7 +94,7 @@ class PreparedSweep:
         count = min(self.study.chunk, self.study.rows - first)
         values = self.study.sampler.rows(first, count)
         rows = np.arange(first, first + count)
-        columns, wanted = self._results(values, rows)
+        columns, trajectory = self._results(values, rows)
         arrays: dict[str, Any] = {"scenario": rows}
         for one in self.study.variations:
             for k, name in enumerate(one.columns):
@@ -101,11 +104,11 @@ class PreparedSweep:
         arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
             reason.astype(np.int32), pyarrow.array(texts.tolist(), pyarrow.string())
         )
-        return pyarrow.table(arrays), None if wanted is None else pyarrow.table(wanted)
+        return pyarrow.table(arrays), None if trajectory is None else pyarrow.table(trajectory)
 
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        numbers, _ = _split(parameters_of(self.study, values))
+        numbers, _ = _split(list_parameters(self.study, values))
         Scenarios(self.study.model_scene, numbers).check()
 
     @cached_property
@@ -139,7 +142,7 @@ class PreparedSweep:
         columns |= more
         texts, reason = result.reasons
         if faults:
-            texts, reason = with_faults(columns, texts, reason, faults)
+            texts, reason = mark_faults(columns, texts, reason, faults)
         columns |= {"reason_texts": texts, "reason": reason}
         return columns, self._trajectory(values, rows)
 
@@ -147,12 +150,12 @@ class PreparedSweep:
         self, values: dict[str, Array]
     ) -> tuple[Scenarios, dict[str, Array], dict[int, InputError]]:
         """Scenarios of rows, their starts and gains, and the rows that make no scene."""
-        numbers, starts = _split(parameters_of(self.study, values))
+        numbers, starts = _split(list_parameters(self.study, values))
         scenarios = Scenarios(self.study.model_scene, numbers)
         count = len(next(iter(values.values())))
         faults = scenarios.faults(most=count)
         if faults:
-            known = {key: array[:1] for key, array in range_ends(self.study).items()}
+            known = {key: array[:1] for key, array in find_range_ends(self.study).items()}
             numbers = {key: array.copy() for key, array in numbers.items()}
             for key, array in numbers.items():
                 array[list(faults)] = known[key]
@@ -187,13 +190,13 @@ class PreparedSweep:
 
     def _trajectory(self, values: dict[str, Array], rows: NDArray[np.int64]) -> Columns | None:
         """States of the first rows at equal intervals, in long form."""
-        wanted = self.study.trajectory
-        if wanted is None or rows[0] >= wanted["rows"]:
+        asked = self.study.trajectory
+        if asked is None or rows[0] >= asked["rows"]:
             return None
-        count = min(len(rows), wanted["rows"] - int(rows[0]))
+        count = min(len(rows), asked["rows"] - int(rows[0]))
         some = {key: array[:count] for key, array in values.items()}
         scenarios, starts, _ = self.scenarios(some)
-        every = max(1, self.steps // wanted["samples"])
+        every = max(1, self.steps // asked["samples"])
         result, _ = self.run(scenarios, starts, rows[:count], self.steps, every)
         assert result.kept is not None
         samples = len(result.kept.t)
@@ -211,10 +214,11 @@ class PreparedSweep:
 
 
 _PREPARED: dict[tuple[str, int | None], PreparedSweep] = {}
+
 _LOCK = threading.Lock()
 
 
-def prepared(study: SweepStudy, steps: int | None = None) -> PreparedSweep:
+def prepare(study: SweepStudy, steps: int | None = None) -> PreparedSweep:
     """Return the prepared study; prepared once in a process."""
     with _LOCK:
         key = study.digest, steps
@@ -232,3 +236,142 @@ def _split(parameters: dict[str, Array]) -> tuple[dict[str, Array], dict[str, Ar
         if key in _STATE_KEYS or key.startswith("control.")
     }
     return {key: parameters[key] for key in parameters.keys() - outside.keys()}, outside
+
+
+def find_range_ends(study: SweepStudy) -> dict[str, Array]:
+    """Return rows at the middle and at the ends of all ranges, by key of the scene."""
+    rows = []
+    tabulated = [one for one in study.variations if one.kind == "table"]
+    middle = {one.key: _middle(one) for one in study.variations if one.kind != "table"}
+    picks = {0}
+    for values in (study.table or {}).values():
+        picks |= {int(np.argmin(values)), int(np.argmax(values))}
+    for pick in sorted(picks) if tabulated else []:
+        row = study.sampler.rows(pick, 1)
+        rows.append(middle | {one.key: row[one.key][0] for one in tabulated})
+    rows = rows or [middle]
+    for one in study.variations:
+        rows += [rows[0] | {one.key: end} for end in _ends(one)]
+    stacked = {one.key: np.stack([row[one.key] for row in rows]) for one in study.variations}
+    return list_parameters(study, stacked)
+
+
+def list_parameters(study: SweepStudy, values: Mapping[str, Array]) -> dict[str, Array]:
+    """Return arrays by key of the scene for the values of what varies."""
+    found: dict[str, Array] = {}
+    for one in study.variations:
+        found |= one.parameters(values[one.key])
+    return found
+
+
+def _middle(one: Variation) -> Array:
+    return np.asarray(one.numbers.mean(axis=0) if one.kind == "uniform" else one.numbers[0])
+
+
+def _ends(one: Variation) -> list[Array]:
+    """Values that differ in every component that can differ."""
+    if one.kind == "normal":
+        return [one.values(np.full((1, len(one.columns)), q))[0] for q in (0.4, 0.6)]
+    return list(one.numbers)
+
+
+def draw_pilot_rows(study: SweepStudy) -> dict[str, Array]:
+    """Return the values of what varies in the pilot rows."""
+    if study.table is None:
+        return Sampler(study.variations, {}, PILOT, study.seed, "random").rows(0, PILOT)
+    chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
+    parts = [study.sampler.rows(int(row), 1) for row in chosen]
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def choose_steps(
+    run: Callable[[int], BatchResult], unit: int, tolerance: float
+) -> tuple[int, float]:
+    """Least number of steps, about, whose error is within the tolerance; and that error [rad].
+
+    The error of c steps is the difference from 2c steps; it falls with the eighth power of c.
+    It is nan where no run reaches the end.
+
+    Args:
+        run: runs the pilot rows by a number of steps.
+        unit: the number is a multiple of it.
+        tolerance: of the orientation at the end [rad].
+
+    Raises:
+        InputError: no number of steps reaches the tolerance.
+
+    """
+    count = max(unit, 16)
+    for _ in range(12):
+        coarse, fine = run(count), run(2 * count)
+        both = (coarse.status == 0) & (fine.status == 0)
+        error = largest_angle(coarse.quaternion[both], fine.quaternion[both])
+        if not both.any():
+            return count, math.nan
+        if error <= tolerance:
+            return count, error
+        factor = (error / (0.7 * tolerance)) ** (1.0 / 8.0) if math.isfinite(error) else 4.0
+        count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
+        if count > MOST_STEPS:
+            break
+    allowed = f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
+    raise InputError("sweep", [Problem("tolerance", tolerance, allowed)])
+
+
+def units_of(variations: Sequence[Variation]) -> dict[str, str]:
+    """Return the unit of each column that has one."""
+    found = {"t": "s", "fault_time": "s", "energy": "J", "local_error": "1"}
+    for name, (unit, dimension) in QUANTITIES.items():
+        for part in DIMENSIONS[dimension]:
+            for suffix in ("", "_min", "_max"):
+                found[f"{name}{suffix}_{part}"] = unit
+    for part in DIMENSIONS["leg"]:
+        found |= {f"error_rms_{part}": "rad", f"error_max_{part}": "rad"}
+    for one in variations:
+        unit = "1" if one.factor else one.targets[0].spec.unit
+        found |= dict.fromkeys(one.columns, unit)
+    return found
+
+
+def components(name: str, array: Array) -> Columns:
+    """Return a column for each component of a quantity, shape (n, components)."""
+    _, dimension = QUANTITIES[name]
+    return {
+        f"{name}_{part}": np.ascontiguousarray(array[:, i])
+        for i, part in enumerate(DIMENSIONS[dimension])
+    }
+
+
+def extremes_of(kept: BatchStates) -> Columns:
+    """Least and largest angles and rates of joints at the ends of steps."""
+    found: Columns = {}
+    with np.errstate(all="ignore"):
+        for name in _JOINTS:
+            array = getattr(kept, name)
+            for suffix, reduced in (("min", array.min(axis=0)), ("max", array.max(axis=0))):
+                for k in range(3):
+                    found[f"{name}_{suffix}_{k + 1}"] = reduced[:, k]
+    return found
+
+
+def mark_faults(
+    columns: Columns, texts: NDArray[Any], reason: NDArray[Any], faults: dict[int, InputError]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Mark rows that make no scene: status -1, no numbers, and the first problem as the reason."""
+    rows, reason = list(faults), reason.copy()
+    for name, array in columns.items():
+        columns[name] = array.copy()
+        columns[name][rows] = -1 if name == "status" else np.nan
+    columns["fault_time"][rows] = 0.0
+    found = [f"no scene: {error.problems[0].key.partition(': ')[2]}" for error in faults.values()]
+    distinct = sorted(set(found))
+    reason[rows] = [len(texts) + distinct.index(text) for text in found]
+    return np.array([*texts, *distinct], dtype=object), reason
+
+
+def largest_angle(one: Array, other: Array) -> float:
+    """Largest angle between orientations [rad]."""
+    if not len(one):
+        return 0.0
+    apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
+    return float(2.0 * apart.max())

@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+import time
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +16,24 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.host.output import require_free, writing
 from sst_ros.scene.scene import scene_of
-from sst_ros.sweeps import parts
-from sst_ros.sweeps.chunk_task import ChunkOutcome, ChunkTask, versions
-from sst_ros.sweeps.local_engine import run_local
-from sst_ros.sweeps.prepared import PreparedSweep, prepared
-from sst_ros.sweeps.sweep_progress import SweepProgress
+from sst_ros.sweeps.chunk_task import (
+    ChunkOutcome,
+    ChunkTask,
+    clear_temporary,
+    find_complete,
+    list_versions,
+    read_sweep,
+    run_local,
+    to_frame,
+)
+from sst_ros.sweeps.prepared import PreparedSweep, prepare
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 if TYPE_CHECKING:
     import pandas as pd
+
+_EVERY = 0.2
+"""Least time between two lines on a terminal [s]."""
 
 
 def sweep(
@@ -71,10 +83,15 @@ def sweep(
     """
     tabular = hasattr(vary, "columns")
     table = {str(name): vary[name].to_numpy(dtype=float) for name in vary} if tabular else None
-    values = dict(options) | {
-        "torque": torque, "duration": duration, "n": n, "seed": seed, "scene": scene_of(scene),
-        "vary": {} if tabular else dict(vary),
-    }  # fmt: skip
+    values = dict(
+        options,
+        torque=torque,
+        duration=duration,
+        n=n,
+        seed=seed,
+        scene=scene_of(scene),
+        vary={} if tabular else dict(vary),
+    )
     if table is not None:
         values["table"] = table
     return run_study(
@@ -106,18 +123,20 @@ def run_study(
         raise InputError("sweep", [Problem("resume", True, "needs out")])
     if out is not None and not resume:
         require_free(out, "sweep")
-    ready = prepared(study, _recorded_steps(out) if resume else None)
-    _check_table(study, ready)
+    ready = prepare(study, _read_steps(out) if resume else None)
+    if study.table is not None:  # refuse rows that make no scene, before anything runs
+        ready.check(study.sampler.rows(0, study.rows))
     done: set[int] = set()
     if out is not None:
         out = out.resolve()
         with writing(out, "sweep"):
-            parts.clear_temporary(out)
-            done = parts.complete(out, study, ready.steps)
+            clear_temporary(out)
+            done = find_complete(out, study, ready.steps)
             (out / "study.json").write_text(
                 json.dumps(ready.about, indent=1) + "\n", encoding="utf-8"
             )
-    bar = SweepProgress(study.rows, _rows(study, done), shown=progress)
+    before = sum(min(study.chunk, study.rows - index * study.chunk) for index in done)
+    bar = SweepProgress(study.rows, before, shown=progress)
     tables: dict[int, ChunkOutcome] = {}
 
     def take(outcome: ChunkOutcome) -> None:
@@ -125,7 +144,7 @@ def run_study(
         if out is None:
             tables[outcome.index] = outcome
 
-    task = ChunkTask(study, ready.steps, None if out is None else str(out), versions())
+    task = ChunkTask(study, ready.steps, None if out is None else str(out), list_versions())
     missing = [index for index in range(study.chunks) if index not in done]
     if client is None:
         run_local(task, missing, take, workers or len(os.sched_getaffinity(0)))
@@ -134,12 +153,15 @@ def run_study(
 
         send_code(client, ready.module)
         run_on_cluster(client, task, missing, take, bar.note)
-    if out is not None:
-        return _read(out, study)
-    return _joined(ready, tables)
+    if out is None:
+        return _join(ready, tables)
+    frame = read_sweep(out)
+    if study.trajectory is not None:
+        frame.attrs["trajectory"] = read_sweep(out, "trajectory")
+    return frame
 
 
-def _recorded_steps(out: Path | None) -> int | None:
+def _read_steps(out: Path | None) -> int | None:
     """Return the number of steps of the study in a folder, chosen when it was started."""
     try:
         steps = json.loads((Path(out or ".") / "study.json").read_text(encoding="utf-8"))["steps"]
@@ -148,28 +170,54 @@ def _recorded_steps(out: Path | None) -> int | None:
         return None
 
 
-def _check_table(study: SweepStudy, ready: PreparedSweep) -> None:
-    """Refuse a table with rows that make no scene, before anything runs."""
-    if study.table is not None:
-        ready.check(study.sampler.rows(0, study.rows))
-
-
-def _rows(study: SweepStudy, chunks: set[int]) -> int:
-    return sum(min(study.chunk, study.rows - index * study.chunk) for index in chunks)
-
-
-def _read(out: Path, study: SweepStudy) -> pd.DataFrame:
-    frame = parts.read_sweep(out)
-    if study.trajectory is not None:
-        frame.attrs["trajectory"] = parts.read_sweep(out, "trajectory")
-    return frame
-
-
-def _joined(ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]) -> pd.DataFrame:
+def _join(ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]) -> pd.DataFrame:
     pyarrow = require("pyarrow")
     ordered = [outcomes[index] for index in sorted(outcomes)]
-    frame = parts.framed(pyarrow.concat_tables([one.table for one in ordered]), ready.about)
+    frame = to_frame(pyarrow.concat_tables([one.table for one in ordered]), ready.about)
     known = [one.trajectory for one in ordered if one.trajectory is not None]
     if known:
-        frame.attrs["trajectory"] = parts.framed(pyarrow.concat_tables(known), ready.about)
+        frame.attrs["trajectory"] = to_frame(pyarrow.concat_tables(known), ready.about)
     return frame
+
+
+class SweepProgress:
+    """A line that is drawn over itself on a terminal; silent elsewhere.
+
+    Args:
+        total: rows of the study.
+        done: rows that are there already.
+        shown: draw at all.
+
+    """
+
+    def __init__(self, total: int, done: int, *, shown: bool) -> None:
+        self._total, self._before, self._done = total, done, done
+        self._began, self._drawn = time.monotonic(), 0.0
+        self._shown = shown and sys.stderr.isatty()
+        self.reasons: Counter[str] = Counter()
+
+    def add(self, outcome: ChunkOutcome) -> None:
+        """Count a chunk that is done."""
+        self._done += outcome.rows
+        self.reasons.update(dict(outcome.reasons))
+        now = time.monotonic()
+        if self._shown and (now - self._drawn > _EVERY or self._done == self._total):
+            self._drawn = now
+            end = "\n" if self._done == self._total else ""
+            print(f"\r{self.line()[:110]:110}", end=end, file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        """Print a message above the line."""
+        if self._shown:
+            print(f"\r{' ' * 110}\r", end="", file=sys.stderr)
+        print(f"sweep: {text}", file=sys.stderr, flush=True)
+
+    def line(self) -> str:
+        """Return the line."""
+        seconds = max(time.monotonic() - self._began, 1e-9)
+        rate = (self._done - self._before) / seconds
+        left = (self._total - self._done) / rate if rate else float("inf")
+        bar = "#" * (20 * self._done // self._total)
+        ended = ", ".join(f"{count} {text}" for text, count in self.reasons.most_common(3))
+        early = f"; early: {ended}" if ended else ""
+        return f"[{bar:20}] {self._done}/{self._total} runs, {rate:.0f}/s, {left:.0f} s left{early}"

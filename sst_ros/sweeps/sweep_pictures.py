@@ -16,21 +16,62 @@ from sst_ros.extras import require
 from sst_ros.host.output import writing
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
-from sst_ros.sweeps.sweep_summary import early_end_correlations, output_columns
+from sst_ros.sweeps.sweep_summary import correlate_early_ends, list_outputs
 
 if TYPE_CHECKING:
     import pandas as pd
 
+COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
 
-COLUMNS = 4
 MOST_POINTS = 2000
 """Of all runs in a scatter plot; the worst are drawn over them."""
 
 Series = Mapping[str, Array]
 
 
+def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
+    """Draw the table of a study into a folder; return the paths.
+
+    The worst runs are those that ended first; where none ended early, those with the largest
+    tracking error, or with the outputs farthest from their medians.
+    """
+    outputs = list_outputs(table)
+    ended = table["status"].to_numpy() != 0
+    complete = {name: table[name].to_numpy()[~ended] for name in outputs}
+    figures = {"distributions": draw_distributions(complete, table.attrs["units"])}
+    correlations = correlate_early_ends(table)
+    counts = {str(reason): int(count) for reason, count in table["reason"].value_counts().items()}
+    if ended.any():
+        figures["early_ends"] = draw_early_ends(dict(correlations), counts)
+    score, title = _score(table, outputs)
+    inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
+    ranks = require("pandas").Series(score, index=table.index).rank()
+    strength = table[inputs].rank().corrwith(ranks).abs()
+    shown = list(strength.sort_values(ascending=False).index[:MOST_INPUTS])
+    if shown:
+        columns = {name: table[name].to_numpy() for name in shown}
+        figures["worst"] = draw_scatter(columns, np.argsort(score)[-MOST_RUNS:], title)
+    with writing(out, "sweep plot"):
+        for name, figure in figures.items():
+            save_figure(figure, out / f"{name}.png")
+    return [out / f"{name}.png" for name in figures]
+
+
+def _score(table: pd.DataFrame, outputs: list[str]) -> tuple[Array, str]:
+    """How bad each run is, and what that means."""
+    if (table["status"] != 0).any():
+        ends = table["fault_time"].fillna(table["t"]).to_numpy()
+        return -ends, f"The {MOST_RUNS} runs that ended first"
+    errors = [name for name in outputs if name.startswith("error_max")]
+    if errors:
+        return table[errors].max(axis=1).to_numpy(), f"The {MOST_RUNS} largest tracking errors"
+    numbers = table[outputs]
+    apart = (numbers - numbers.median()).abs() / numbers.std().replace(0.0, 1.0)
+    return apart.max(axis=1).to_numpy(), f"The {MOST_RUNS} runs farthest from the median"
+
+
 @styled
-def distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
+def draw_distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
     """Histograms of the outputs of the runs that reached the end."""
     rows = max(1, math.ceil(len(outputs) / COLUMNS))
     figure = Figure(figsize=(3.0 * COLUMNS, 2.2 * rows))
@@ -44,7 +85,7 @@ def distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
 
 
 @styled
-def early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> Figure:
+def draw_early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> Figure:
     """Rank correlation of each input with an early end, and how runs ended."""
     figure = Figure(figsize=(11.0, 1.2 + 0.3 * max(len(correlations), len(counts), 4)))
     left, right = figure.subplots(1, 2)
@@ -61,7 +102,7 @@ def early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> 
 
 
 @styled
-def worst_runs(inputs: Series, worst: NDArray[np.intp], title: str) -> Figure:
+def draw_scatter(inputs: Series, worst: NDArray[np.intp], title: str) -> Figure:
     """Scatter matrix of inputs: a sample of all runs, and the worst over it.
 
     Args:
@@ -89,48 +130,3 @@ def worst_runs(inputs: Series, worst: NDArray[np.intp], title: str) -> Figure:
             axes.tick_params(labelsize=6)
     figure.suptitle(title)
     return figure
-
-
-MOST_INPUTS, WORST = 6, 200
-
-
-def draw(table: pd.DataFrame, out: Path) -> list[Path]:
-    """Draw the table of a study into a folder; return the paths.
-
-    The worst runs are those that ended first; where none ended early, those with the largest
-    tracking error, or with the outputs farthest from their medians.
-    """
-    outputs = output_columns(table)
-    ended = table["status"].to_numpy() != 0
-    complete = {name: table[name].to_numpy()[~ended] for name in outputs}
-    figures = {"distributions": distributions(complete, table.attrs["units"])}
-    correlations = early_end_correlations(table)
-    counts = {str(reason): int(count) for reason, count in table["reason"].value_counts().items()}
-    if ended.any():
-        figures["early_ends"] = early_ends(dict(correlations), counts)
-    score, title = _badness(table, outputs)
-    worst = np.argsort(score)[-min(WORST, len(score)) :]
-    inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
-    ranks = require("pandas").Series(score, index=table.index).rank()
-    strength = table[inputs].rank().corrwith(ranks).abs()
-    shown = list(strength.sort_values(ascending=False).index[:MOST_INPUTS])
-    if shown:
-        columns = {name: table[name].to_numpy() for name in shown}
-        figures["worst"] = worst_runs(columns, worst, title)
-    with writing(out, "sweep plot"):
-        for name, figure in figures.items():
-            save_figure(figure, out / f"{name}.png")
-    return [out / f"{name}.png" for name in figures]
-
-
-def _badness(table: pd.DataFrame, outputs: list[str]) -> tuple[Array, str]:
-    """How bad each run is, and what that means."""
-    if (table["status"] != 0).any():
-        ends = table["fault_time"].fillna(table["t"]).to_numpy()
-        return -ends, f"The {WORST} runs that ended first"
-    errors = [name for name in outputs if name.startswith("error_max")]
-    if errors:
-        return table[errors].max(axis=1).to_numpy(), f"The {WORST} largest tracking errors"
-    numbers = table[outputs]
-    apart = (numbers - numbers.median()).abs() / numbers.std().replace(0.0, 1.0)
-    return apart.max(axis=1).to_numpy(), f"The {WORST} runs farthest from the median"

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,18 +16,38 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sst_ros.control.controller import ControllerSettings
+from sst_ros.control.reference import ReferenceMotion
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.scene import Scene, SineTorque, scene_of
+from sst_ros.scene.schema import Section, integer, number, specs
 from sst_ros.scene.yaml_document import plain, values_of
-from sst_ros.sweeps import study_checks
-from sst_ros.sweeps.controlled import ControlledRun, control_of
-from sst_ros.sweeps.sampling import LARGEST_HYPERCUBE, Sampler
-from sst_ros.sweeps.sweep_table import digest_of, keys_of, read_table, tabulated
-from sst_ros.sweeps.variations import Target, Variation, scales_tensor, targets_of, variation
+from sst_ros.state import QUANTITIES
+from sst_ros.sweeps.variations import (
+    LARGEST_HYPERCUBE,
+    SAMPLINGS,
+    Sampler,
+    Target,
+    Variation,
+    digest_of,
+    keys_of,
+    read_table,
+    read_variation,
+    scales_tensor,
+    tabulate,
+    targets_of,
+)
 
 DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
+
 CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
+
+OUTPUTS = (*QUANTITIES, "energy", "extremes")
+"""What `outputs` may name: quantities of the final state, and extremes of joints."""
+
+MOST_ROWS, MOST = 2**53, 10_000_000
 
 
 @dataclass(frozen=True)
@@ -72,7 +92,7 @@ class SweepStudy:
     chunk: int = CHUNK
 
     def __post_init__(self) -> None:
-        found = list(study_checks.problems(vars(self)))
+        found = list(find_problems(vars(self)))
         if found:
             raise InputError("sweep", found)
         object.__setattr__(self, "outputs", tuple(self.outputs))
@@ -133,7 +153,7 @@ class SweepStudy:
     @cached_property
     def controlled(self) -> ControlledRun | None:
         """The control loop; None without one."""
-        return None if self.control is None else control_of(self.scene, self.control)
+        return None if self.control is None else read_control(self.scene, self.control)
 
     @cached_property
     def length(self) -> float:
@@ -153,7 +173,7 @@ class SweepStudy:
         found, problems = [], []
         for key, given in self.vary.items():
             try:
-                found.append(variation(key, given, self._targets(key)))
+                found.append(read_variation(key, given, self._targets(key)))
             except (ValueError, TypeError, OverflowError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
         columns = [name for one in found for name in one.columns]
@@ -163,7 +183,7 @@ class SweepStudy:
                 if key in self.vary or set(names) & set(columns):
                     raise ValueError("is given in vary, too")
                 factor = scales_tensor(key, targets)
-                found.append(tabulated(key, names, targets, factor))
+                found.append(tabulate(key, names, targets, factor))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
         if not found:
@@ -234,3 +254,107 @@ class SweepStudy:
         if key.partition(".")[0] == "torque" and self.control is not None:
             raise ValueError("has no effect: the controller gives the torques")
         return targets_of(self.model_scene, key)
+
+
+def find_problems(given: Mapping[str, Any]) -> Iterator[Problem]:
+    """Yield what is wrong with the values of a study by key."""
+    ranges = {"n": (1, MOST_ROWS), "seed": (0, 2**64 - 1), "steps": (1, MOST), "chunk": (1, MOST)}
+    for name, (least, most) in ranges.items():
+        value = given[name]
+        if value is None and name in ("n", "steps"):
+            continue
+        if type(value) is not int or not least <= value <= most:
+            yield Problem(name, value, f"must be a whole number from {least} to {most}")
+    for name in ("duration", "tolerance"):
+        value = given[name]
+        real = isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0
+        if value is not None and not real:
+            yield Problem(name, value, "must be a finite number > 0")
+    if given["sampling"] not in SAMPLINGS:
+        yield Problem("sampling", given["sampling"], f"must be one of {', '.join(SAMPLINGS)}")
+    for name in given["outputs"]:
+        if name not in OUTPUTS:
+            yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
+    if given["torque"] is not None and given["control"] is not None:
+        yield Problem("torque", "given", "has no effect: the controller gives the torques")
+    torque, kept = given["torque"], given["trajectory"]
+    constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
+    if constant and (np.shape(torque) != (3,) or not np.all(np.isfinite(torque))):
+        yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
+    good = isinstance(kept, Mapping) and kept.keys() == {"rows", "samples"}
+    if kept is not None and not (
+        good and all(type(x) is int and 1 <= x <= 100_000 for x in kept.values())
+    ):
+        allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
+        yield Problem("trajectory", kept, allowed)
+
+
+@dataclass(frozen=True)
+class ControlChannel(Section):
+    """What lies between plant and controller; zeros change nothing."""
+
+    period: float = number("control period", "s", default=1e-3, least=1e-6, most=1.0)
+    delay: int = integer("delay of commands", "periods", default=0, least=0, most=100)
+    counts: int = integer(
+        "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
+    )
+    angle_noise: float = number(
+        "standard deviation of noise on gamma", "rad", default=0.0, least=0.0, most=1.0
+    )
+    rate_noise: float = number(
+        "standard deviation of noise on gamma_dot", "rad/s", default=0.0, least=0.0, most=1e3
+    )
+
+
+@dataclass(frozen=True)
+class ControlledRun:
+    """A control loop.
+
+    Attributes:
+        model: the controller's model of the plant, which does not vary.
+        motion: reference motion, that of the scene.
+        settings: scheme and gains.
+        channel: period, delay, encoders, noise.
+
+    """
+
+    model: Scene
+    motion: ReferenceMotion
+    settings: ControllerSettings
+    channel: ControlChannel
+
+    def targets(self, key: str) -> list[Target]:
+        """Return what a key control.* names."""
+        name = key.removeprefix("control.")
+        for given in (self.settings, self.channel):
+            spec = specs(type(given)).get(name)
+            if spec is not None and spec.kind == "number" and name != "period":
+                return [Target(key, np.array(getattr(given, name), dtype=float), spec)]
+        known = [*_numbers(ControllerSettings), *_numbers(ControlChannel)]
+        raise ValueError(f"must be one of {', '.join(f'control.{name}' for name in known)}")
+
+
+def read_control(scene: Scene, given: Mapping[str, Any]) -> ControlledRun:
+    """Read the settings of a control loop: those of a controller and of its channel.
+
+    Raises:
+        InputError: a key is unknown or its value not allowed, or the scene has no motion.
+
+    """
+    controller, channel = specs(ControllerSettings), specs(ControlChannel)
+    known = (*controller, *channel)
+    allowed = f"unknown key; allowed are {', '.join(known)}"
+    unknown = [Problem(f"control.{key}", given[key], allowed) for key in given if key not in known]
+    if unknown:
+        raise InputError("sweep", unknown)
+    motion = reference_motion(scene)
+    return ControlledRun(
+        scene,
+        motion,
+        ControllerSettings(**{key: value for key, value in given.items() if key in controller}),
+        ControlChannel(**{key: value for key, value in given.items() if key in channel}),
+    )
+
+
+def _numbers(cls: type[Section]) -> list[str]:
+    return [name for name, spec in specs(cls).items() if spec.kind == "number" and name != "period"]

@@ -8,21 +8,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
+
 SHOWN = 8
 NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
 
 
-def summary(table: pd.DataFrame) -> str:
+def summarize(table: pd.DataFrame) -> str:
     """Return a text of the table of a study."""
     counts = table["reason"].value_counts()
     steps, length = table.attrs["steps"], table.attrs["duration"]
     lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
     lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
-    causes = early_end_correlations(table)
+    causes = correlate_early_ends(table)
     if len(causes):
         lines.append("Rank correlation of inputs with an early end:")
         lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(SHOWN).items()]
-    outputs = table.loc[table["status"] == 0, output_columns(table)]
+    outputs = table.loc[table["status"] == 0, list_outputs(table)]
     if len(outputs):
         shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
         shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
@@ -30,13 +31,13 @@ def summary(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def output_columns(table: pd.DataFrame) -> list[str]:
+def list_outputs(table: pd.DataFrame) -> list[str]:
     """Names of the outputs of a study."""
     known = (*table.attrs["inputs"], *NOT_OUTPUTS)
     return [name for name in table.columns if name not in known]
 
 
-def early_end_correlations(table: pd.DataFrame) -> pd.Series:
+def correlate_early_ends(table: pd.DataFrame) -> pd.Series:
     """Spearman's rank correlation of each input with an early end, largest first.
 
     Empty where all runs ended alike, or no input differs.

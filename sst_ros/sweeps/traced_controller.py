@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import REST
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression
@@ -31,9 +32,8 @@ from sst_ros.mechanism.generic_math import (
     sin,
     sqrt,
 )
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.sweeps.controlled import ControlledRun
-from sst_ros.sweeps.reference_samples import Group
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.sweeps.sweep_study import ControlledRun
 
 NEWTON_STEPS = 5
 """Of the observer at a sample. They square the error; from one sample to the next it is small."""
@@ -41,10 +41,48 @@ NEWTON_STEPS = 5
 _ROUND = 1.5 * 2.0**52
 """Added and subtracted, it rounds to whole numbers, halves to even."""
 
+REFERENCES = (
+    ("first", 1), ("gamma", 3), ("gamma_dot", 3), ("gamma_ddot", 3), ("feedforward", 3),
+    ("held_feedforward", 3), ("quaternion", 4), ("body_rate", 3), ("body_acceleration", 3),
+)  # fmt: skip
+
+"""Names and sizes of what a sample is given."""
+
 GAINS = (
     ("kp", 3), ("kd", 3), ("inertia", 3), ("integral_rate", 1), ("limit", 1), ("plant_limit", 1),
     ("angle_noise", 1), ("rate_noise", 1),
 )  # fmt: skip
+
+Group = dict[str, Any]
+"""Tuples of numbers by name."""
+
+
+def tabulate_references(loop: ControlledRun, samples: int) -> Array:
+    """Return the references of samples 0 to `samples`, shape (samples + 1, n)."""
+    inverse, period = InverseDynamics(loop.model), loop.channel.period
+    feeding = loop.settings.mode not in ("pd", "gravity_pd")
+    middle = loop.settings.feedforward_at == "middle"
+    rows = []
+    for k in range(samples + 1):
+        time = k * round(period * 1e9) / 1e9
+        at = loop.motion.at(time)
+        torque = inverse.reference_torque(at) if feeding else REST
+        held = torque
+        if feeding and middle:
+            held = inverse.reference_torque(loop.motion.at(time + 0.5 * period))
+        joints = (*at.gamma, *at.gamma_dot, *at.gamma_ddot)
+        star = (*at.quaternion, *at.body_rate, *at.body_acceleration)
+        rows.append((float(k == 0), *joints, *torque, *held, *star))
+    return np.array(rows)
+
+
+def divide(names: Sequence[tuple[str, int]], numbers: Sequence[Any]) -> Group:
+    """Divide numbers into groups of the sizes given."""
+    found, at = {}, 0
+    for name, size in names:
+        found[name] = tuple(numbers[at : at + size])
+        at += size
+    return found
 
 
 class _Sample(NamedTuple):
@@ -75,9 +113,14 @@ class TracedController(NamedTuple):
     memory: tuple[tuple[str, int], ...]
 
     def __call__(
-        self, model: kernel.Model, state: Sequence[Any], given: Group, memory: Group, gains: Group,
+        self,
+        model: kernel.Model,
+        state: Sequence[Any],
+        given: Group,
+        memory: Group,
+        gains: Group,
         noise: Sequence[Any],
-    ) -> tuple[Any, ...]:  # fmt: skip
+    ) -> tuple[Any, ...]:
         """Return three torques and the new memory.
 
         Args:
@@ -91,12 +134,12 @@ class TracedController(NamedTuple):
         """
         joints = kernel.joints(model, tuple(state))
         true = _tuple(joints.gamma)
-        gamma, gamma_dot, before = self._measured(
+        gamma, gamma_dot, before = self._measure(
             true, _tuple(joints.gamma_dot), memory, gains, noise
         )
         error = axpy(1.0, given["gamma"], -1.0, gamma)
         rates = axpy(1.0, given["gamma_dot"], -1.0, gamma_dot)
-        observed = self._observed(gamma, memory)
+        observed = self._observe(gamma, memory)
         command, limited, integral = self._command(
             _Sample(given, gamma, gamma_dot, error, rates, observed, memory, gains)
         )
@@ -110,7 +153,7 @@ class TracedController(NamedTuple):
         else:
             torque = command
         if self.limited:
-            torque = _tuple(_clamped(tau, gains["plant_limit"][0]) for tau in torque)
+            torque = _tuple(_clamp(tau, gains["plant_limit"][0]) for tau in torque)
         off = axpy(1.0, given["gamma"], -1.0, true)
         new: Group = {
             "integral": integral,
@@ -125,7 +168,7 @@ class TracedController(NamedTuple):
         }
         return (*torque, *(number for name, _ in self.memory for number in new[name]))
 
-    def _measured(
+    def _measure(
         self, gamma: Any, gamma_dot: Any, memory: Group, gains: Group, noise: Sequence[Any]
     ) -> tuple[Any, Any, Any]:
         """Angles and rates that the controller receives, and counted angles to remember."""
@@ -141,7 +184,7 @@ class TracedController(NamedTuple):
             gamma_dot = _tuple(x + n * rate for x, n in zip(gamma_dot, noise[3:], strict=True))
         return gamma, gamma_dot, before
 
-    def _observed(self, gamma: Any, memory: Group) -> tuple[Any, ...]:
+    def _observe(self, gamma: Any, memory: Group) -> tuple[Any, ...]:
         """Quaternion at the measured angles in the last assembly mode; none if not needed."""
         if not memory["observed"]:
             return ()
@@ -168,7 +211,7 @@ class TracedController(NamedTuple):
         elif mode != "pd":
             feedforward = at.given["feedforward"]
         if mode == "computed_torque":
-            total, summed = self._computed(model, at)
+            total, summed = self._compute_torque(model, at)
             feedback = axpy(1.0, total, -1.0, feedforward)
         elif mode != "feedforward":
             acceleration, summed = _feedback(at.error, at.rates, at)
@@ -178,22 +221,22 @@ class TracedController(NamedTuple):
         total = add(feedforward, feedback)
         torque, limited, free = total, 0.0, 1.0
         if self.limited:
-            torque = _tuple(_clamped(tau, at.gains["limit"][0]) for tau in total)
+            torque = _tuple(_clamp(tau, at.gains["limit"][0]) for tau in total)
             cut = axpy(1.0, total, -1.0, torque)
-            free = 1.0 - _above(dot(cut, at.error))
-            limited = _above(dot(cut, cut))
+            free = 1.0 - _is_above(dot(cut, at.error))
+            limited = _is_above(dot(cut, cut))
         rate = free * self.loop.channel.period
         integral = at.memory.get("integral", ())
         if integral:
             integral = tuple(s + rate * x for s, x in zip(integral, summed, strict=True))
         return torque, limited, integral
 
-    def _computed(self, model: kernel.Model, at: _Sample) -> tuple[Any, Any]:
+    def _compute_torque(self, model: kernel.Model, at: _Sample) -> tuple[Any, Any]:
         """Torque of computed_torque, and the error to integrate."""
         acceleration, summed = _feedback(at.error, at.rates, at)
-        wanted = add(at.given["gamma_ddot"], acceleration)
+        asked = add(at.given["gamma_ddot"], acceleration)
         space = ActuatorSpaceMap(Geometry.of(self.loop.model))
-        now = space.star_accelerations(*at.observed, *at.gamma_dot, *wanted)
+        now = space.star_accelerations(*at.observed, *at.gamma_dot, *asked)
         body_rate, body_acceleration = _tuple(now[:3]), _tuple(now[3:])
         if self.loop.settings.space == "so3":
             x, y, z, w = at.observed
@@ -224,14 +267,14 @@ def _feedback(error: Any, rates: Any, at: _Sample) -> tuple[Any, Any]:
 
 def _rotation_vector(q: tuple[Any, ...]) -> Any:
     """Axis times angle of a rotation of less than half a turn; as `rotation_vector`."""
-    sign = 2.0 * _above(q[3]) - 1.0
+    sign = 2.0 * _is_above(q[3]) - 1.0
     x, y, z, w = (sign * part for part in q)
     sine = sqrt(x * x + y * y + z * z + 1e-300)
     factor = 2.0 * atan2(sine, w) / sine
     return factor * x, factor * y, factor * z
 
 
-def _clamped(value: Any, limit: Any) -> Any:
+def _clamp(value: Any, limit: Any) -> Any:
     return value - positive(value - limit) + positive(-limit - value)
 
 
@@ -239,10 +282,10 @@ def _size(value: Any) -> Any:
     return positive(value) + positive(-value)
 
 
-def _above(value: Any) -> Any:
+def _is_above(value: Any) -> Any:
     """1 where a number is positive, else 0."""
     return value.apply("step") if isinstance(value, Expression) else float(value > 0.0)
 
 
 def _tuple(values: Iterable[Any]) -> Any:
-    return tuple(values)
+    return tuple(values)  # of any type: mypy knows no length of it

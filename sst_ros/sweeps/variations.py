@@ -1,27 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What varies in a study: keys of the scene, and the distribution or the values of each.
+"""What varies in a study: keys of the scene, the distribution or the values of each, and the rows.
 
 A distribution is ("uniform", low, high), ("normal", mean, standard deviation[, low, high]), or a
 list of values, which spans a grid with those of other keys; in a YAML file {uniform: [low, high]},
 {normal: [...]}, {grid: [...]}, {linspace: [low, high, count]}. With `relative: true` the numbers
 are factors of the value in the scene. Components of a vector are independent. An inertia as a
 whole ("star.inertia") has one factor, so its principal moments keep their ratios.
+
+Row i depends on the seed and on i alone, whatever is drawn before or beside it. Random numbers come
+from the counter-based generator Philox (Salmon et al., SC 2011), whose counter is the number of the
+row; Sobol points from their index; a Latin hypercube from all n rows at once.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
 from sst_ros.integration.scenarios import NO_NUMBER, addressed
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Section, Spec, specs
 
 KINDS = ("uniform", "normal", "grid", "linspace")
+
+SAMPLINGS = ("random", "sobol", "latin_hypercube")
+
+LARGEST_HYPERCUBE = 10_000_000
+"""Rows of a Latin hypercube: each process holds all of them, 80 bytes for ten columns."""
+
+_TINY = 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -75,7 +92,7 @@ class Variation:
         return found
 
 
-def variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
+def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
     """Read one entry of `vary`.
 
     Args:
@@ -116,7 +133,7 @@ def variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
     if kind == "normal" and not np.all(values[1] > 0.0):
         raise ValueError("the standard deviation must be > 0")
     _refuse_ends(kind, values, targets, factor)
-    columns = tuple(f"{key}{index}" for index in _indices(shape))
+    columns = tuple(f"{key}{index}" for index in _list_indices(shape))
     return Variation(key, kind, values, columns, tuple(targets), factor)
 
 
@@ -202,5 +219,133 @@ def _refuse_ends(kind: str, values: Array, targets: Sequence[Target], factor: bo
             )
 
 
-def _indices(shape: tuple[int, ...]) -> list[str]:
+def _list_indices(shape: tuple[int, ...]) -> list[str]:
     return ["".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
+
+
+def keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Columns of a table by key: a trailing index is that of a component."""
+    found: dict[str, list[str]] = {}
+    for name in table:
+        found.setdefault(re.sub(r"(\[\d+\])+$", "", name), []).append(name)
+    return found
+
+
+def tabulate(key: str, names: list[str], targets: list[Target], factor: bool) -> Variation:
+    """Return the variation of a key whose values are columns of a table.
+
+    Raises:
+        ValueError: columns of its components are missing.
+
+    """
+    shape = () if factor else targets[0].nominal.shape
+    expected = [key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
+    if names != expected:
+        raise ValueError(f"needs the columns {', '.join(expected)}")
+    return Variation(key, "table", np.empty((0, 1)), tuple(names), tuple(targets), factor)
+
+
+def read_table(path: Path) -> dict[str, Array]:
+    """Read the columns of a CSV or Parquet file.
+
+    Raises:
+        InputError: it is not readable, or holds more than numbers.
+
+    """
+    pandas = require("pandas")
+    try:
+        frame = pandas.read_parquet(path) if path.suffix == ".parquet" else pandas.read_csv(path)
+        return {str(name): frame[name].to_numpy(dtype=float) for name in frame}
+    except (OSError, ValueError) as error:
+        allowed = f"must be a readable .csv or .parquet file of numbers ({error})"
+        raise InputError("sweep", [Problem("table", str(path), allowed)]) from None
+
+
+def digest_of(values: Array) -> str:
+    """Return a digest of the bits of a column."""
+    return hashlib.sha256(np.ascontiguousarray(values, dtype=float).tobytes()).hexdigest()[:24]
+
+
+class Sampler:
+    """Values of all varied numbers by row.
+
+    Args:
+        variations: what varies.
+        table: columns given row by row, in place of distributions.
+        n: number of rows.
+        seed: of the random numbers.
+        sampling: one of SAMPLINGS, for what has a distribution.
+
+    """
+
+    def __init__(
+        self,
+        variations: Sequence[Variation],
+        table: dict[str, Array],
+        n: int,
+        seed: int,
+        sampling: str,
+    ) -> None:
+        self._variations, self._table = variations, table
+        self._n, self._seed, self._sampling = n, seed, sampling
+        self._drawn = [one for one in variations if one.kind in ("uniform", "normal")]
+        self._width = sum(len(one.columns) for one in self._drawn)
+
+    def rows(self, first: int, count: int) -> dict[str, Array]:
+        """Values of rows `first` to `first + count`, shape (count, components), by key."""
+        quantiles = self._quantiles(first, count)
+        found, at, index = {}, 0, np.arange(first, first + count)
+        grids = [one for one in self._variations if one.kind == "grid"]
+        for one in reversed(grids):  # the last key varies fastest
+            found[one.key] = one.numbers[index % len(one.numbers)]
+            index = index // len(one.numbers)
+        for one in self._drawn:
+            found[one.key] = one.values(quantiles[:, at : at + len(one.columns)])
+            at += len(one.columns)
+        for one in self._variations:
+            if one.kind == "table":
+                columns = [self._table[name][first : first + count] for name in one.columns]
+                found[one.key] = np.stack(columns, axis=1)
+        return {one.key: found[one.key] for one in self._variations}
+
+    def _quantiles(self, first: int, count: int) -> Array:
+        """Numbers in (0, 1), shape (count, width)."""
+        if not self._width:
+            return np.empty((count, 0))
+        if self._sampling == "random":
+            return philox(self._seed, first, count, self._width)
+        if self._sampling == "latin_hypercube":
+            points = self._hypercube[first : first + count]
+        else:
+            from scipy.stats import qmc
+
+            engine = qmc.Sobol(self._width, seed=np.random.default_rng(self._seed))
+            if first:
+                engine.fast_forward(first)
+            points = _draw_points(engine, count)
+        return np.clip(points, _TINY, 1.0 - _TINY)
+
+    @cached_property
+    def _hypercube(self) -> Array:
+        from scipy.stats import qmc
+
+        engine = qmc.LatinHypercube(self._width, seed=np.random.default_rng(self._seed))
+        return np.asarray(engine.random(self._n))
+
+
+def philox(seed: int, first: int, count: int, width: int) -> Array:
+    """Uniform numbers in (0, 1) of rows `first` on, shape (count, width)."""
+    blocks = -(-width // 4)  # a value of the counter gives four numbers
+    generator = np.random.Philox(key=seed)
+    generator.advance(first * blocks)
+    raw = generator.random_raw(count * 4 * blocks).reshape(count, 4 * blocks)[:, :width]
+    return np.asarray(((raw >> np.uint64(11)) + 0.5) * _TINY)
+
+
+def _draw_points(engine: object, count: int) -> Array:
+    """Sobol points without the warning that a count is no power of two: rows come in chunks."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return np.asarray(engine.random(count))  # type: ignore[attr-defined]

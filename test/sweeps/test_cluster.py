@@ -15,8 +15,8 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.sweeps import cluster_engine
+from sst_ros.sweeps.chunk_task import SweepFailed
 from sst_ros.sweeps.cluster_engine import connect
-from sst_ros.sweeps.local_engine import SweepFailed
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from test.sweeps.tables import same

@@ -11,7 +11,7 @@ from sst_ros import load_scene, sweep
 from sst_ros.control.controller import MODES, Controller, ControllerSettings, Measurement
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.sweeps.counter_noise import gaussian
+from sst_ros.sweeps.controlled_batch import NOISE
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
@@ -35,6 +35,15 @@ CASES = [
      "feedforward_at": "middle", "torque_limit": 6.0, "integral_rate": 4.0},
 ]  # fmt: skip
 CHANNEL = ("delay", "counts", "angle_noise", "rate_noise")
+
+
+def gaussian(seed, rows, counter):
+    """Standard normal numbers `counter` of rows, as the kernel computes them."""
+    names = {"np": np, "sqrt": np.sqrt, "cos": np.cos}
+    text = NOISE[1].replace("np.float64(", "np.asarray(").replace("np.uint64(row)", "row")
+    exec(NOISE[0] + text, names)
+    with np.errstate(over="ignore"):
+        return np.asarray(names["gaussian"](seed, np.asarray(rows).astype(np.uint64), counter))
 
 
 def name_of(case):

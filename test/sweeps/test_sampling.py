@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 from sst_ros import InputError, load_scene
-from sst_ros.sweeps.sampling import SAMPLINGS, philox
 from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.sweeps.variations import SAMPLINGS, philox
 
 SCENE = load_scene("example2_heavy")
 KEY = "star.inertia.zz"

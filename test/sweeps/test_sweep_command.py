@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import spearmanr
 
 from sst_ros.cli.main import run
-from sst_ros.sweeps.parts import read_sweep
-from sst_ros.sweeps.sweep_summary import early_end_correlations
+from sst_ros.sweeps.chunk_task import read_sweep
+from sst_ros.sweeps.sweep_summary import correlate_early_ends
 
 for module in ("numba", "dask", "pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
@@ -41,7 +41,7 @@ def test_its_summary_names_reasons_and_causes(folder, capsys):
 
 def test_correlations_are_spearmans(folder):
     table = read_sweep(folder / "out")
-    found = early_end_correlations(table)
+    found = correlate_early_ends(table)
     for name in table.attrs["inputs"]:
         assert found[name] == pytest.approx(spearmanr(table[name], table["status"] != 0).statistic)
     assert list(found.abs()) == sorted(found.abs(), reverse=True)
