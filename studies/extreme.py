@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.methods import draw_regions
 from sst_ros.report.results import markdown, provenance, records, table, write
-from sst_ros.report.stability import regions
+from sst_ros.report.step_advice import regions
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies.extreme_cases import LOOSE, catalogue

@@ -26,8 +26,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.methods import MARKERS
 from sst_ros.plot.style import free_figure, note, styled
 from sst_ros.report.results import table
-from sst_ros.report.stability import FAR, stability_function
-from sst_ros.report.step_advice import eigenvalues, step_advice
+from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.sweeps.job_list import run_jobs
@@ -217,7 +216,7 @@ def scene_points() -> dict[str, NDArray[np.complex128]]:
     found = {}
     for name in scenes.names():
         step = step_advice(scenes.load(name)).step
-        if step is not None:
+        if math.isfinite(step):
             found[name] = step * eigenvalues(scenes.load(name))
     return found
 

@@ -199,7 +199,8 @@ COMMANDS: dict[str, Subcommand | str] = {
     "report accuracy": Subcommand(
         "work-precision diagrams: error against cost of every method and step",
         "cli.reports:report_accuracy",
-        scene("--scene", "names, or paths of .yaml files; default: all", nargs="+", metavar="S"),
+        scene("scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"),
+        scene("--scene", "the same", nargs="+", default=[], metavar="S"),
         flag("--all", "all shipped scenes, the default"),
         *out("folder of the results", "accuracy_out"),
         flag("--mpmath", "reference in 30 digits, slow"),

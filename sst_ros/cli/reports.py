@@ -32,8 +32,8 @@ def report_accuracy(options: argparse.Namespace) -> None:
     """Measure the error and the run time of every method."""
     out = free_out(options, "accuracy_out")
     kind = MPMATH if options.mpmath else EXTENDED
-    scenes = names() if options.all else options.scene or names()
-    accuracy.report(scenes, out, kind=kind)
+    scenes = [] if options.all else [*options.scenes, *options.scene]
+    accuracy.report(scenes or names(), out, kind=kind)
 
 
 def draw_pictures(options: argparse.Namespace) -> int:

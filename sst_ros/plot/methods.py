@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 MARKERS = {
     "rk4": (BLUE, "o"), "dopri5": (VERMILION, "s"), "dop853": (GREEN, "^"), "rodas4": (PURPLE, "D"),
+    "gauss": (ORANGE, "v"),
 }  # fmt: skip
 """Colour and marker of each method; steps are solid and full, tolerances dashed and hollow."""
 
@@ -45,8 +46,7 @@ def draw_work_precision(
     *,
     floors: tuple[float, float],
     seconds: float,
-    target: float,
-    best: tuple[float, float] | None,
+    best: Mapping[float, tuple[float, float]],
     title: str,
     footnote: str,
 ) -> Figure:
@@ -57,8 +57,8 @@ def draw_work_precision(
             largest_gamma_dot_rad_per_s, failure.
         floors: smallest errors of both that are drawn [rad], [rad/s].
         seconds: time span of the run [s].
-        target: error of the orientation that is marked [rad].
-        best: wall time [ms] and error [rad] of the fastest setting for the target.
+        best: wall time [ms] and error [rad] of the fastest setting for errors of the orientation
+            [rad], which are marked.
         title: two lines.
         footnote: small print.
 
@@ -72,12 +72,12 @@ def draw_work_precision(
         _panel(axes, rows, quantity, floor)
         axes.set_ylabel(label)
         axes.set_xlabel(f"wall time for {seconds:g} s of motion [ms]")
-    if best is not None:
+    for target, place in best.items():
         panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
-        panels[0].plot(*best, "o", markersize=14, markerfacecolor="none", markeredgecolor=INK,
+        panels[0].plot(*place, "o", markersize=14, markerfacecolor="none", markeredgecolor=INK,
                        markeredgewidth=1.4, zorder=5)  # fmt: skip
-    figure.legend(handles=_legend(rows, target if best else None), loc="center",
-                  bbox_to_anchor=(0.5, 0.095), ncol=8, fontsize=8.5, frameon=False)  # fmt: skip
+    figure.legend(handles=_legend(rows, best), loc="center",
+                  bbox_to_anchor=(0.5, 0.095), ncol=9, fontsize=8, frameon=False)  # fmt: skip
     figure.suptitle(title, fontsize=12)
     note(figure, footnote, 185)
     return figure
@@ -160,7 +160,7 @@ def _failures(axes: Axes, failed: DataFrame, high: float, top: float) -> None:
         axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
 
 
-def _legend(rows: DataFrame, target: float | None) -> list[Line2D]:
+def _legend(rows: DataFrame, targets: Collection[float]) -> list[Line2D]:
     handles = [
         Line2D([], [], color=colour, marker=marker, label=name, linewidth=1.5)
         for name, (colour, marker) in MARKERS.items() if name in set(rows.method)
@@ -170,10 +170,10 @@ def _legend(rows: DataFrame, target: float | None) -> list[Line2D]:
                           label="tolerance (hollow)"))  # fmt: skip
     if (rows.failure != "").any():
         handles.append(Line2D([], [], color=INK, marker="x", linestyle="none", label="failed"))
-    if target is not None:
+    if targets:
+        name = f"fastest for {', '.join(f'{target:.0e}' for target in targets)} rad"
         handles.append(Line2D([], [], color=INK, marker="o", linestyle=":", markersize=11,
-                              markerfacecolor="none", label=f"fastest for {target:g} rad")
-                       )  # fmt: skip
+                              markerfacecolor="none", label=name))  # fmt: skip
     return handles
 
 

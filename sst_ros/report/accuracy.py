@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame, Series
 
-TARGET, TARGETS = 1e-9, (1e-6, 1e-9, 1e-12)
-"""Orientation errors for which the fastest setting is named [rad]; TARGET is marked in figures."""
+TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
+"""Orientation errors for which the fastest setting is named [rad]; TARGET is in titles."""
 
 AT_REST = "It rests: it has no torques of its own, a controller drives it along its motion."
 
@@ -40,16 +40,16 @@ Every method solves the scene under its own torques, as continuous functions of 
 compared with a reference solution at twenty or more instants: DOP853 with fixed steps in extended
 precision. The reference's own error is twice the difference of two step sizes; an error is plotted
 only if it is 100 times larger than that. Times are of the integration alone, the shortest of
-several runs, without compilation. Fixed steps use no error estimate. Tolerances include the coarse
-solution that `Simulation` integrates for its estimate of the global error, three steps for each,
-and one loop in Python around them. Elastic stops have kinks: fixed steps step over them, and
-tolerances are given to `Simulation`, which locates each; it is the reference there too. Errors are
-the largest over the run.
+several runs, without compilation. Fixed steps use no error estimate; those of Gauss collocation are
+of a motion that was prepared. Tolerances include the coarse solution that `Simulation` integrates
+for its estimate of the global error, three steps for each, and one loop in Python around them; for
+Gauss collocation the search for its steps. Elastic stops have kinks: fixed steps step over them,
+collocation does not take them, and tolerances are given to `Simulation`, which locates each; it is
+the reference there too. Errors are the largest over the run.
 
 A setting is named as the fastest for a target only if every finer setting of the same method that
-was tried, and at least one, reaches the target too. The advice is that of
-`python -m sst_ros scene show`; where it was measured, the error of a `Simulation` that follows it
-stands behind it.
+was tried, and at least one, reaches the target too. The advice is what `simulate` takes with the
+method "auto", as in `sst-ros scene show`; behind it stands the error that a run with it had.
 """
 
 TERMS_INTRODUCTION = """\
@@ -105,7 +105,7 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
             "reference": study.reference.how,
             "reference_own_error": asdict(study.reference.own),
             "formulation_difference_relative": study.formulation,
-            "advice": asdict(study.advice),
+            "advice": study.advice._asdict(),
             "advice_measured_error_rad": study.measured and study.measured[0],
             "fastest": fastest(study),
             "warnings": list(study.warnings),
@@ -146,7 +146,7 @@ def setting(row: Series[Any]) -> str:
     """Return method and setting in words."""
     if row.kind == TOLERANCE:
         return f"{row.method}, tolerance {row.setting:.0e}"
-    return f"{row.method}, {1e3 * row.setting:g} ms steps"
+    return f"{row.method}, {1e3 * row.setting:.4g} ms steps"
 
 
 def _time(wall_s: float) -> str:
@@ -207,13 +207,16 @@ def facts(study: WorkPrecision) -> Iterator[str]:
 
 def figure(study: WorkPrecision) -> Figure:
     """Draw the study."""
-    best = study.best(TARGET)
+    best = {target: study.best(target) for target in TARGETS if target >= study.floor}
     return draw_work_precision(
         study.rows,
         floors=(study.floor, ABOVE_REFERENCE * study.reference.own.gamma_dot),
         seconds=study.seconds,
-        target=TARGET,
-        best=None if best is None else (1e3 * best.wall_min_s, max(best[ERROR], study.floor)),
+        best={
+            target: (1e3 * row.wall_min_s, max(row[ERROR], study.floor))
+            for target, row in best.items()
+            if row is not None
+        },
         title=f"{study.scene}: error against wall time\n{fastest(study)}",
         footnote=f"Reference: {study.reference.how}. {provenance(compiled=study.compiled)}",
     )

@@ -1,110 +1,139 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which method and step suit a scene, from the spectrum of its linearised dynamics at the start.
+"""Which method and step suit a scene: what `auto` takes, and the steps in which others are stable.
 
-This is the advice of `scene show` and of the accuracy page, which measures its error.
+The advice of `scene show` and of the accuracy and stability reports is the run of `simulate` with
+the method "auto" itself: they cannot disagree with it.
+
+Applied to y' = lambda y with steps h, a method multiplies y by its stability function R(z),
+z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and
+IV.3). The eigenvalues lambda are those of the linearised dynamics.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import SstError
-from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.integration.compiled_method import Method
+from sst_ros.integration.methods import DORMAND_PRINCE, METHODS, Rosenbrock
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulate import GAUSS, simulate
 
-LONGEST_STEP = 1e-2
-"""Longest control period that is recommended [s]."""
+LONGEST_S, WHOLE_RUN_S = 10.0, 1.0
+"""The advice is for a run of the scene's duration, but not of more than LONGEST_S [s]; of
+WHOLE_RUN_S where the scene names no duration."""
 
-STABLE = 3.3
-"""Dormand-Prince 5(4) is stable for h abs(lambda) up to about this on the negative real axis."""
+TOLERANCE = 1e-9
+"""Error of the orientation that the advice is for [rad]: the default of `simulate`."""
 
-ACCURATE = 0.3
-"""h abs(lambda) at which its local error is far below 1e-6."""
+FAR = -1e12
+"""Where the stability function of an L-stable method has vanished."""
 
-TOLERANCE = 1e-10
-"""Local tolerance that goes with the advice; `Simulation` divides the period where it must."""
-
-PERIODS, PERIOD_NS = 20, 5_000_000
-"""Number and length [ns] of the control periods over which `auto` is run to see what it chooses."""
+GROWTH = 1e-6
+"""abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i."""
 
 
-@dataclass(frozen=True)
-class StepAdvice:
+class StepAdvice(NamedTuple):
     """A recommendation.
 
     Attributes:
-        text: one sentence.
-        method: name of the method.
-        step: longest control period [s]; None where the scene cannot start.
-        stiff: `auto` changes to the implicit method.
-        tolerance: local tolerance.
+        text: a sentence or two.
+        method: what `auto` takes, as `Trajectory.method` has it; empty where the scene cannot
+            start.
+        step: mean length of its steps [s]; nan where there is none.
 
     """
 
     text: str
-    method: str = "auto"
-    step: float | None = None
-    stiff: bool = False
-    tolerance: float = TOLERANCE
+    method: str = ""
+    step: float = math.nan
 
 
 def step_advice(scene: Scene) -> StepAdvice:
-    """Recommend a method and a step for a scene."""
+    """Recommend a method and a step for a scene: those that `auto` takes."""
+    seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
     try:
-        simulation = Simulation(scene, step_budget=WHOLE_MOTION_BUDGET)
+        motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
+        rates = eigenvalues(scene)
     except SstError as error:
         return StepAdvice(f"none, the scene cannot start: {error}")
-    fastest = float(np.abs(eigenvalues(scene)).max())
-    name = DORMAND_PRINCE.name
-    if fastest == 0.0:
-        text = f"{name} with steps of {LONGEST_STEP:g} s; nothing moves fast at the start"
-        return StepAdvice(text, name, LONGEST_STEP)
-    limit, rate = STABLE / fastest, f"the fastest rate at the start is {fastest:.3g} 1/s"
-    if _stiff(simulation, scene):
-        text = (
-            f"auto, which changes to {RODAS4.name}: the scene is stiff; {rate}, and {name} would "
-            f"be unstable in steps above {limit:.2g} s"
-        )
-        return StepAdvice(text, "auto", LONGEST_STEP, stiff=True)
-    step = _rounded(min(LONGEST_STEP, ACCURATE / fastest))
-    text = (
-        f"{name} with steps of {step:g} s or less; {rate}, and steps above {limit:.2g} s would be "
-        "unstable"
-    )
-    return StepAdvice(text, name, step)
+    text = f"for an error of {TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
+    if not motion.method.startswith(GAUSS):  # which gives its steps itself
+        text += f"; its steps have {motion.step:.2g} s on average"
+    limit, fastest = largest_stable_step(DORMAND_PRINCE, rates), float(np.abs(rates).max())
+    text += f". The fastest rate at the start is {fastest:.3g} 1/s"
+    if math.isfinite(limit):
+        text += f": steps of {DORMAND_PRINCE.name} above {limit:.2g} s would be unstable"
+    return StepAdvice(text, motion.method, motion.step)
 
 
-def eigenvalues(scene: Scene) -> NDArray[np.complex128]:
-    """Eigenvalues of the linearised dynamics at the start [1/s]."""
+def eigenvalues(
+    scene: Scene, state: Sequence[float] | None = None, t: float = 0.0
+) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised dynamics without torques [1/s], shape (7,) or (10,).
+
+    Args:
+        scene: a scene.
+        state: quaternion, body rate [rad/s] and lagged torques, if any; by default the start.
+        t: time [s].
+
+    """
     dynamics = Dynamics.of(scene)
-    start = initial_state(scene, Geometry.of(scene))
-    lagged = (0.0,) * (len(dynamics.state) - 7)
+    y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
+    lagged = (0.0,) * (len(dynamics.state) - len(y))
     drive = (0.0,) * len(dynamics.drive)
-    return np.asarray(ODE(dynamics).eigenvalues(0.0, (*start, *lagged), drive), dtype=complex)
+    return np.asarray(ODE(dynamics).eigenvalues(t, (*y, *lagged), drive), dtype=complex)
 
 
-def _stiff(simulation: Simulation, scene: Scene) -> bool:
-    """Return whether `auto` changes to the implicit method in a short run."""
-    profile = scene.torque.at if scene.torque else lambda _: (0.0, 0.0, 0.0)
-    try:
-        for period in range(PERIODS):
-            simulation.step(profile(period * PERIOD_NS / NANOSECONDS), PERIOD_NS)
-            if simulation.method == RODAS4.name:
-                return True
-    except SstError:
-        pass  # the run ends before that
-    return False
+def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
+    """Return the longest step [s] below which all are stable; inf where every one is.
+
+    Args:
+        method: of integration.
+        eigenvalues: of the linearised dynamics [1/s], shape (n,); growing ones are left out.
+
+    """
+    values = np.asarray(eigenvalues, dtype=complex)
+    fastest = float(np.abs(values).max(initial=0.0))
+    values = values[(values.real <= 1e-9 * fastest) & (np.abs(values) > 1e-6 * fastest)]
+    if not len(values):
+        return math.inf
+    steps = np.geomspace(1e-2, 1e3, 5001) / np.abs(values).max()
+    stable = np.abs(stability_function(method, np.outer(steps, values))).max(axis=1) < 1 + GROWTH
+    return math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])
 
 
-def _rounded(step: float) -> float:
-    """Round down to 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(step) + 1e-12)
-    return power * max(digit for digit in (1.0, 2.0, 5.0) if digit * power <= step * (1 + 1e-9))
+def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Evaluate R(z) of a method from its coefficients, for any shape of z."""
+    stages: list[Any] = []
+    one = np.ones_like(z)
+    if isinstance(method, Rosenbrock):
+        for a, c in zip(method.a, method.c, strict=True):
+            at = one + _weighted(a, stages)
+            stages.append((z * at + _weighted(c, stages)) / (4.0 - z))
+        return np.asarray(at + stages[-1])
+    for row in method.a:
+        stages.append(one + z * _weighted(row, stages))
+    return np.asarray(one + z * _weighted(method.b, stages))
+
+
+def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:
+    return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)
+
+
+def regions(
+    x: tuple[float, float] = (-8.0, 2.0), y: tuple[float, float] = (-6.0, 6.0), points: int = 401
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return a grid of z, shapes (points,), and abs(R) of every method on it."""
+    real, imaginary = np.linspace(*x, points), np.linspace(*y, points)
+    z = real[None, :] + 1j * imaginary[:, None]
+    found = {name: np.abs(stability_function(method, z)) for name, method in METHODS.items()}
+    return real, imaginary, found

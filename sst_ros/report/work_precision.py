@@ -9,6 +9,7 @@ under torques that are functions of time.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import time
@@ -23,6 +24,7 @@ from sst_ros.host.output import slices
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, StepperCheckpoint
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod, Method
+from sst_ros.integration.gauss_motion import GaussMotion, NotSmooth
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report import states
@@ -35,6 +37,8 @@ from sst_ros.report.reference_solution import (
 from sst_ros.report.results import table
 from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulate import GAUSS, simulate
+from sst_ros.simulation.simulation import NANOSECONDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -94,8 +98,8 @@ class WorkPrecision:
         reference: the reference solution.
         rows: the solver grid, columns as in COLUMNS; settings of a method from coarse to fine.
         advice: what `step_advice` recommends, as `scene show` prints it.
-        measured: error [rad] and wall time [s] of `Simulation` with that advice; None where the
-            scene's torques allow no such run.
+        measured: error [rad] and wall time [s] of `simulate` with that advice; None where a limit
+            stops it before.
         formulation: largest difference of W_dot from the paper's equations along the reference,
             relative to the largest W_dot; None where it cannot be compared.
         warnings: contradictions.
@@ -182,27 +186,24 @@ def work_precision(
     torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
     along = zip(truth.states.astype(float), torques, strict=True)
     difference, _ = states.compare_with_paper(scene, along)
-    advice = step_advice(scene)
     return WorkPrecision(
-        scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS), advice,
-        _measured(problem, truth, advice), difference,
+        scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS),
+        step_advice(scene),
+        _measured(problem, truth), difference,
         tuple(_warnings(problem, truth, rows, ends, difference)),
     )  # fmt: skip
 
 
-def _measured(
-    problem: InitialValueProblem, truth: ReferenceSolution, advice: StepAdvice
-) -> tuple[float, float] | None:
-    """Run `Simulation` as advised; implicit methods take no torques that are functions of time."""
-    if advice.step is None or (advice.stiff and callable(problem.torque)):
-        return None
+def _measured(problem: InitialValueProblem, truth: ReferenceSolution) -> tuple[float, float] | None:
+    """Error and wall time of `simulate` with the method "auto"; None where it stops before."""
+    times = problem.interval_ns * np.arange(problem.count + 1) / NANOSECONDS
     began = time.perf_counter()
-    try:
-        periods = math.ceil(problem.interval / advice.step * (1.0 - 1e-9))
-        states = problem.simulated(advice.method, advice.tolerance, periods)
-    except SstError:
+    motion = simulate(problem.scene, duration=problem.seconds, t_eval=times)
+    wall = time.perf_counter() - began
+    if not motion.success:
         return None
-    return problem.errors(states, truth.states)[1].orientation, time.perf_counter() - began
+    states = np.hstack([motion.quaternion, motion.body_rate])
+    return problem.errors(states, truth.states)[1].orientation, wall
 
 
 def _warnings(
@@ -268,6 +269,8 @@ def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[S
             found.append(_adaptive(problem, method, compiled))
         elif not isinstance(method, Rosenbrock):  # which takes no torques that are functions
             found.append(_simulated(problem, method))
+    if not problem.kinked:
+        found += [_collocated(problem, compiled, kind) for kind in (FIXED, TOLERANCE)]
     return found
 
 
@@ -313,6 +316,39 @@ def _adaptive(
             return states, stepper.budget.spent - before
 
         yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
+
+
+def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iterator[SolverSetting]:
+    """Yield settings of Gauss collocation, with the steps that each tolerance chooses.
+
+    A run of fixed steps is one of a motion that has been prepared. One for a tolerance searches
+    for its steps, which solves the motion several times.
+    """
+    torque = problem.scene.torque or (0.0, 0.0, 0.0)
+    start = problem.start[:-1]
+    times = problem.interval_ns * np.arange(problem.count + 1) / NANOSECONDS
+    longest = math.inf
+    for tolerance in (1e-2, 1e-3, *_TOLERANCES):
+
+        def prepare(tolerance: float = tolerance) -> GaussMotion:
+            return GaussMotion(
+                problem.scene, torque, start, problem.seconds, tolerance, compiled=compiled
+            )
+
+        def solve(prepare: Callable[[], GaussMotion] = prepare) -> tuple[Array, int]:
+            motion = prepare()
+            states = np.full((len(times), len(problem.start)), np.nan)
+            states[:, :-1] = motion.at(times)
+            return states, motion.evaluations
+
+        if kind == TOLERANCE:
+            yield SolverSetting(GAUSS, kind, tolerance, solve, prepare)
+            continue
+        with contextlib.suppress(NotSmooth):
+            motion = prepare()
+            if motion.h < longest:
+                longest = motion.h
+                yield SolverSetting(GAUSS, kind, motion.h, solve, motion.run)
 
 
 def _simulated(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:

@@ -41,6 +41,7 @@ class SampledMotion:
         error_estimate: float = float("nan"),
         energy_residual: float | Callable[[], float] = float("nan"),
         evaluations: int = 0,
+        step: float = float("nan"),
         law: Law | None = None,
         dense: Callable[[Array], Array] | None = None,
     ) -> None:
@@ -59,6 +60,7 @@ class SampledMotion:
         self.method = method
         self.error_estimate = error_estimate
         self.evaluations = evaluations
+        self.step = step
         self.law = law
         self.dense = dense
         self._residual = energy_residual

@@ -69,6 +69,7 @@ class CollocatedMotion:
             f"{motion.iterations} iterations{chosen}",
             "error_estimate": motion.error,
             "evaluations": motion.evaluations,
+            "step": motion.h,
             "law": law,
             "_residual": partial(motion.energy_residual, self._end),
             "dense": motion.at,

@@ -176,6 +176,7 @@ class SteppedMotion:
             error_estimate=simulation.error_estimate,
             energy_residual=simulation.energy_residual,
             evaluations=simulation.evaluations,
+            step=simulation.time_ns / NANOSECONDS / max(simulation.accepted_steps, 1),
             law=law,
         )
 

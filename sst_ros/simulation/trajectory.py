@@ -24,8 +24,8 @@ __all__ = ["JOINTS", "Array", "Law", "Trajectory"]
 JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 
 _OF_THE_RUN = (
-    "scene", "status", "message", "method", "error_estimate", "_residual", "evaluations", "law",
-    "dense",
+    "scene", "status", "message", "method", "error_estimate", "_residual", "evaluations", "step",
+    "law", "dense",
 )  # fmt: skip
 _FEW = 300
 """Samples below which a picture asks for more."""
@@ -50,6 +50,7 @@ class Trajectory(SampledMotion):
         energy_residual: energy at the end, less that at the start, less the work done [J]; a
             number, or a function that computes it when it is asked for.
         evaluations: how often the derivative was evaluated.
+        step: mean length of the steps of the integrator [s], nan if unknown.
         law: torques that act between the samples, for `at`; by default each is held over the
             interval that ends at its sample.
         dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.

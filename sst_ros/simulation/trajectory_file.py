@@ -40,7 +40,9 @@ UNITS = {
 }
 """Unit of each column of a table."""
 
-_FIGURES = ("status", "message", "method", "error_estimate", "energy_residual", "evaluations")
+_FIGURES = (
+    "status", "message", "method", "error_estimate", "energy_residual", "evaluations", "step",
+)  # fmt: skip
 
 
 def frame(trajectory: SampledMotion) -> pd.DataFrame:
@@ -118,7 +120,7 @@ def load(cls: type[T], path: Path) -> T:
         *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
         joints=np.hstack([arrays[name] for name in joints]),
         law=profile_from(metadata["torque"]),
-        **{name: metadata[name] for name in _FIGURES},
+        **{name: metadata[name] for name in _FIGURES if name in metadata},
     )
 
 

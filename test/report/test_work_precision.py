@@ -43,6 +43,7 @@ from sst_ros.report.work_precision import (
 )
 from sst_ros.scene import scene
 from sst_ros.scene.bodies import Inertia
+from sst_ros.simulation.simulate import METHODS
 
 SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
@@ -95,6 +96,7 @@ def test_methods_show_their_order(short):
 def test_every_row_is_whole(short):
     rows = short.rows
     assert set(rows.kind) == {FIXED, TOLERANCE} and not _rows(short, "rk4", TOLERANCE)
+    assert set(rows.method) == set(METHODS) - {"auto"}
     assert (rows.failure == "").all()
     assert (rows.wall_min_s > 0.0).all() and (rows.wall_min_s <= rows.wall_median_s).all()
     assert (rows.final_orientation_rad <= rows[ERROR]).all()
@@ -123,7 +125,7 @@ def test_what_it_writes_can_be_read(short, tmp_path):
 @pytest.mark.slow
 def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
     found = summary_of([short])
-    assert found.target.tolist() == [1e-6, 1e-9, 1e-12]
+    assert found.target.tolist() == [1e-3, 1e-6, 1e-9, 1e-12]
     save_figure(draw_summary(found, "made today"), tmp_path / "summary.png")
     terms = cost_table(SHORT, compiled=False)
     assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51]

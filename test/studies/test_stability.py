@@ -12,7 +12,7 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.plot.methods import draw_regions
 from sst_ros.plot.style import save_figure
 from sst_ros.report.results import table
-from sst_ros.report.stability import regions, stability_function
+from sst_ros.report.step_advice import regions, stability_function
 from studies import stability_limits
 from studies.extreme import lines, page
 from studies.extreme_cases import catalogue
