@@ -31,7 +31,8 @@ GAMMA = "gamma: [0.7853981633974483, 0.7853981633974483, 0.7853981633974483]"
 LINK = "  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}"
 # What is changed, into what, and what the message must say after "origin: ".
 REFUSED = {
-    "unknown key": ("duration: 1 ", "durration: 1 ", r"durration = '1': unknown key; .*duration"),
+    "unknown key": ("duration: 1 ", "durration: 1 ", r"durration = '1': unk.* mean 'duration'"),
+    "removed key": ("duration: 1 ", "markers: {}\nduration: 1 ", r"markers = .*: unknown key"),
     "unknown inner key": ("radius: 0.4 ", "radus: 0.4 ", r"star\.radus = '0\.4': unknown key"),
     "duplicate key": ("duration: 1 ", "name: x\nduration: 1 ", r"name = 'x': is given twice.* 2"),
     "missing key": (ALPHA, "", r"star\.alpha_deg = None: is missing; must be 3 finite numbers > 0"),

@@ -153,7 +153,7 @@ def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
 
 
 def _allowed(spec: Spec) -> str:
-    return spec.allowed().removeprefix("must be ")
+    return spec.describe().removeprefix("must be ")
 
 
 def _endpoint_rows(listed: Iterable[Endpoint]) -> Iterator[tuple[str, ...]]:

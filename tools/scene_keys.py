@@ -59,7 +59,7 @@ def _table(cls: type[Section], paths: list[str]) -> str:
     lines += ["| key | meaning | must be | default |", "| --- | --- | --- | --- |"]
     for field in dataclasses.fields(cls):
         spec: Spec = field.metadata["spec"]
-        allowed = spec.allowed().removeprefix("must be ")
+        allowed = spec.describe().removeprefix("must be ")
         lines.append(f"| `{field.name}` | {spec.doc} | {allowed} | {_default(field.default)} |")
     return "\n".join([*lines, ""])
 

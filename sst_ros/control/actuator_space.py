@@ -113,10 +113,10 @@ class ActuatorSpaceMap:
         best, least, q = near, math.inf, near
         for _ in range(_STEPS):
             *moved, first, second, third = self._newton(*q, *carriages)
-            worst = max(abs(first), abs(second), abs(third))
-            if worst < least:
-                best, least = q, worst
-            if not worst > ROUNDING:
+            largest = max(abs(first), abs(second), abs(third))
+            if largest < least:
+                best, least = q, largest
+            if not largest > ROUNDING:
                 break
             q = (moved[0], moved[1], moved[2], moved[3])
         return best
@@ -257,11 +257,11 @@ class OrientationObserver:
     def _measures(self, quaternion: Quaternion, gamma: Vector3) -> tuple[float, float]:
         """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
         rows = rotation_rows(quaternion)
-        normals, worst = [], 0.0
+        normals, largest = [], 0.0
         for angle, (v, across, e) in zip(gamma, self._legs, strict=True):
             r = axpy(math.cos(angle), v, math.sin(angle), across)
             t = dot(rows[0], e), dot(rows[1], e), dot(rows[2], e)
             normals.append(cross(t, r))
-            worst = max(worst, abs(dot(r, t)))
+            largest = max(largest, abs(dot(r, t)))
         determinant = dot(normals[0], cross(normals[1], normals[2]))
-        return 2.0 / 3.0 * abs(determinant), worst
+        return 2.0 / 3.0 * abs(determinant), largest

@@ -58,9 +58,11 @@ def maximum(
         bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
         width = float(bounds[1] - bounds[0])
         found = minimize_scalar(
-            lambda time: -function(time), bounds=bounds, method="bounded",
+            lambda time: -function(time),
+            bounds=bounds,
+            method="bounded",
             options={"xatol": 1e-8 * width},
-        )  # fmt: skip
+        )
         if -found.fun > best.value + _ROUNDING * abs(best.value):
             best = Peak(float(-found.fun), float(found.x))
     return best
@@ -194,9 +196,15 @@ def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     demands = [_demand(motion, torque, leg, times, desired, torques) for leg in range(3)]
     problems = [*_beyond(distances), *_too_much(demands, scene.actuators)]
     return MotionPlan(
-        motion, scene, times, desired, torques, (demands[0], demands[1], demands[2]), distances,
+        motion,
+        scene,
+        times,
+        desired,
+        torques,
+        (demands[0], demands[1], demands[2]),
+        distances,
         tuple(problems),
-    )  # fmt: skip
+    )
 
 
 def sample_times(motion: ReferenceMotion) -> Array:

@@ -12,7 +12,7 @@ from sst_ros.state import Quaternion, Vector3
 REST: Vector3 = (0.0, 0.0, 0.0)
 
 PIECES = 8
-"""Pieces of a minimum-jerk law, and of a quarter of a turn."""
+"""Pieces of a minimum-jerk motion, and of a quarter of a turn."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 """Time scaling: the factors by which a motion can be run faster or slower.
 
 At `factor` times the speed rates grow by the factor and accelerations by its square. Torques of
-inertia follow the square too, but weight and springs stay, and friction follows its own law: the
+inertia follow the square too, but weight and springs stay, and friction has its own dependence: the
 limits are tested on the dynamics themselves, not scaled.
 """
 

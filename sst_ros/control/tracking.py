@@ -106,19 +106,21 @@ class TrackingSums:
         error, torque = np.abs(track.error), track.torque
         count = self.samples + np.arange(1, len(error) + 1)
         square = self._sums[0].mean() + np.cumsum(np.mean(error**2, axis=1))
-        worst = error.max(axis=1)
-        so_far = np.maximum(np.maximum.accumulate(worst), self.largest)
+        largest_error = error.max(axis=1)
+        so_far = np.maximum(np.maximum.accumulate(largest_error), self.largest)
         rows = np.stack([count - 1, track.time, np.sqrt(square / count), so_far], axis=1)
         parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
         self._sums += [np.sum(part, axis=0) for part in parts]
         largest = error.max(axis=0), np.abs(torque).max(axis=0)
         self._largest = np.maximum(self._largest, largest)
         lowest, highest = self._range
-        self._range = np.array([
-            np.minimum(lowest, track.gamma.min(axis=0)),
-            np.maximum(highest, track.gamma.max(axis=0)),
-        ])  # fmt: skip
-        self._settle(track, worst <= self._band())
+        self._range = np.array(
+            [
+                np.minimum(lowest, track.gamma.min(axis=0)),
+                np.maximum(highest, track.gamma.max(axis=0)),
+            ]
+        )
+        self._settle(track, largest_error <= self._band())
         self._first = self._first if self.samples else float(track.time[0])
         self._last, self._last_error = float(track.time[-1]), error[-1]
         while len(self._history) > _KEPT:
@@ -134,9 +136,9 @@ class TrackingSums:
         settling = None
         if self._end is not None and self._settled is not None:
             settling = self._settled - self._end
-        wanted = np.linspace(0, self.samples - 1, ROWS + 1).round()
+        requested = np.linspace(0, self.samples - 1, ROWS + 1).round()
         history = np.vstack([self._history, self._newest])
-        shown = np.unique(np.searchsorted(history[:, 0], wanted))
+        shown = np.unique(np.searchsorted(history[:, 0], requested))
         return TrackingMetrics(
             samples=self.samples,
             seconds=self._last - self._first,

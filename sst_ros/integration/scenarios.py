@@ -242,7 +242,7 @@ def _faults(spec: Spec, name: str, value: Any) -> Iterator[Problem]:
         if _is_some(value):
             accept(spec, value)
     except ValueError:
-        yield Problem(name, value, spec.allowed())
+        yield Problem(name, value, spec.describe())
 
 
 def _is_some(value: Any) -> bool:

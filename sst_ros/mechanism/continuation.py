@@ -159,10 +159,10 @@ def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
     for _ in range(_NEWTON_STEPS):
         t = geometry.e @ rotation.T
         residual = np.sum(r * t, axis=1)
-        worst = float(np.abs(residual).max())
-        if worst < least:
-            best, least = rotation, worst
-        if worst < ROUNDING:
+        largest = float(np.abs(residual).max())
+        if largest < least:
+            best, least = rotation, largest
+        if largest < ROUNDING:
             break
         rotation = rotate(rotation, np.linalg.solve(cross(t, r), -residual))
     return best

@@ -127,7 +127,7 @@ def _nearest(to: Array, angles: Array) -> Array:
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
     """Angle of the rotation between quaternions [rad], shape (...,); exact for tiny angles."""
-    a, b = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    a, b = np.asarray(first), np.asarray(second)
     difference = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return np.asarray(4.0 * np.arcsin(np.minimum(difference / 2.0, 1.0)))
 

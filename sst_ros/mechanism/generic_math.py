@@ -138,9 +138,16 @@ def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
 
 
 def solve_symmetric(
-    xx: Scalar, yy: Scalar, zz: Scalar, xy: Scalar, xz: Scalar, yz: Scalar,
-    fx: Scalar, fy: Scalar, fz: Scalar,
-) -> Triple:  # fmt: skip
+    xx: Scalar,
+    yy: Scalar,
+    zz: Scalar,
+    xy: Scalar,
+    xz: Scalar,
+    yz: Scalar,
+    fx: Scalar,
+    fy: Scalar,
+    fz: Scalar,
+) -> Triple:
     """Solve a symmetric positive definite 3 x 3 system by L D L^T."""
     l21, l31 = xy / xx, xz / xx
     d2 = yy - l21 * xy

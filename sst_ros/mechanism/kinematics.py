@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
-from sst_ros.mechanism.frames import columns, cross, dot, quaternion_of
+from sst_ros.mechanism.frames import angle_between, columns, cross, dot, quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.state import Assembly
 
@@ -158,9 +158,9 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
     for _ in range(_STEPS):
         t = e @ rotation.transpose(0, 2, 1)
         residual = dot(r, t)
-        worst = _largest(residual)
-        better = worst < least[active]
-        least[active[better]], best[active[better]] = worst[better], rotation[better]
+        largest = _largest(residual)
+        better = largest < least[active]
+        least[active[better]], best[active[better]] = largest[better], rotation[better]
         open_ = last > _LAST_STEP
         if not open_.any():
             break
@@ -366,18 +366,13 @@ def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = No
     if not candidates:
         raise NoAdmissibleAssembly("no admissible assembly", angles)
     if len(candidates) > 1:
-        meant = [one for one in candidates if near is not None and _apart(one, near) < NEAR]
-        if len(meant) == 1:
-            return meant[0]
         orientations = quaternion_of(np.stack([one.rotation for one in candidates]))
+        if near is not None:
+            (meant,) = np.nonzero(angle_between(orientations, quaternion_of(near)) < NEAR)
+            if len(meant) == 1:
+                return candidates[int(meant[0])]
         raise AmbiguousAssembly(angles, candidates, orientations)
     return candidates[0]
-
-
-def _apart(assembly: Assembly, near: ArrayLike) -> float:
-    """Angle of the rotation between an assembly and `near` [rad]."""
-    trace = float(np.sum(assembly.rotation * np.asarray(near, dtype=float)))
-    return float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def describe_assemblies(

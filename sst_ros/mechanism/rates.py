@@ -125,9 +125,10 @@ def _legs(
     beta_dot = -(wr @ omega) / c  # Eq. 21
     push = gamma_dot * mu_dot
     gamma_ddot = (
-        normal @ omega_dot + push * np.sum(normal * wr, axis=1)
+        normal @ omega_dot
+        + push * np.sum(normal * wr, axis=1)
         + beta_dot * np.sum(normal * turning, axis=1)
-    ) / c  # Eq. 29  # fmt: skip
+    ) / c  # Eq. 29
     mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * turning, axis=1)  # Eq. 42
     beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c  # Eq. 46
     return gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot

@@ -133,9 +133,17 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
     with np.errstate(divide="ignore", invalid="ignore"):
         cond_j = np.where(singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf)
     found = (
-        angles, mu, beta, admissible & (stroke >= 0.0), stroke, beta.min(axis=-1),
-        geometry.beta_max - beta.max(axis=-1), np.prod(c, axis=-1), det_j2, cond_j,
-    )  # fmt: skip
+        angles,
+        mu,
+        beta,
+        admissible & (stroke >= 0.0),
+        stroke,
+        beta.min(axis=-1),
+        geometry.beta_max - beta.max(axis=-1),
+        np.prod(c, axis=-1),
+        det_j2,
+        cond_j,
+    )
     return Measures(*frozen(*found))
 
 

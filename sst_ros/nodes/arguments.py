@@ -69,12 +69,12 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
     for name, word in vars(given).items():
         spec, option = known[name], _option(name)
         if word is None and spec.kind != "flag":
-            problems.append(Problem(option, None, f"needs a value, which {spec.allowed()}"))
+            problems.append(Problem(option, None, f"needs a value, which {spec.describe()}"))
             continue
         try:
             options += ["-p", f"{name}:={_as_yaml(spec, 'true' if word is None else word)}"]
         except ValueError:
-            problems.append(Problem(option, word, spec.allowed()))
+            problems.append(Problem(option, word, spec.describe()))
     if problems:
         raise InputError(command, problems)
     return ["--ros-args", *ros, *options] if ros or options else []
@@ -154,7 +154,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     for name, spec in _known(command).items():
         value = getattr(defaults, name, False)
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
-        text = f"{spec.doc}; {spec.allowed()}; default: {shown}".replace("%", "%%")
+        text = f"{spec.doc}; {spec.describe()}; default: {shown}".replace("%", "%%")
         parser.add_argument(_option(name), nargs="?", metavar="VALUE", help=text)
     return parser
 

@@ -77,7 +77,7 @@ def declare(
                 name, value, _descriptor(name, spec, name not in changeable), ignore_override=True
             )
         except (InvalidParameterTypeException, InvalidParameterValueException):
-            problems.append(Problem(name, value, spec.allowed()))
+            problems.append(Problem(name, value, spec.describe()))
         values[name] = value
     ours = arguments.known_anywhere()
     for name in sorted(given.keys() - values.keys()):
@@ -124,7 +124,7 @@ def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
         name=name,
         type=(Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value,
         description=spec.doc + unit,
-        additional_constraints=spec.allowed(),
+        additional_constraints=spec.describe(),
         read_only=read_only,
     )
     low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)

@@ -27,7 +27,7 @@ from sst_ros.extras import require
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.scene.scene import Scene
@@ -116,11 +116,7 @@ class InitialValueProblem:
         self, solution: Array | NDArray[np.longdouble], reference: NDArray[np.longdouble]
     ) -> tuple[StateError, StateError]:
         """Distances of states (count + 1, n) at the end, and the largest; nan where unknown."""
-        chord = np.minimum(
-            np.linalg.norm(solution[:, :4] - reference[:, :4], axis=1),
-            np.linalg.norm(solution[:, :4] + reference[:, :4], axis=1),
-        )
-        angle = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
+        angle = angle_between(solution[:, :4], reference[:, :4])
         joints = np.abs(self.joints(solution) - self.joints(reference))
         gamma, rate = joints[:, :3].max(axis=1), joints[:, 9:12].max(axis=1)
         whole = tuple(float(values.max()) for values in (angle, gamma, rate))

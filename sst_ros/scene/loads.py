@@ -147,17 +147,14 @@ class Actuators(Section):
 class Stroke(Section):
     """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
 
-    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a
-    pull. Their damping is given as such, or by the restitution at one impact rate.
+    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a pull. Their
+    damping is given as such, or by the restitution at one impact rate.
     """
 
     at_end: str = choice(
         "what happens at an end of the stroke",
         ("stop", "ignore", "elastic"),
         default="stop",
-        replaced=(
-            ("impact", "rigid impacts are replaced by elastic with restitution and impact_rate"),
-        ),
     )
     stiffness: float | None = number(
         "stiffness of elastic stops", "N m/rad", default=None, above=0.0

@@ -76,7 +76,7 @@ class Sweep(Section):
 class Spiral(Section):
     """E winds outwards from where it is: tilt phi, its direction theta, and psi about E.
 
-    R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero with one minimum-jerk law.
+    R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero by one minimum jerk.
     """
 
     phi: float = number("tilt at the end", "rad", least=0.0, most=3.141592653589793)

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,10 +63,6 @@ __all__ = [
 @dataclass(frozen=True)
 class Scene(Section):
     """All that is simulated."""
-
-    REMOVED: ClassVar[Mapping[str, str]] = MappingProxyType(
-        {"markers": "RViz shows robot_description and the transforms of robot_state_publisher"}
-    )
 
     name: str = text("short name")
     description: str = text("what the scene shows")

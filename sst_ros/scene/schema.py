@@ -10,10 +10,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 from sst_ros.errors import InputError, Problem
 
@@ -36,15 +35,10 @@ class Spec:
     least: float = -math.inf
     most: float = math.inf
     choices: tuple[str, ...] = ()
-    replaced: tuple[tuple[str, str], ...] = ()
     section: type[Section] | None = None
     lengths: tuple[int, ...] = ()
 
-    def refusal(self, value: object) -> str:
-        """Return what is allowed, and what replaces a choice of an older version."""
-        return "; ".join([self.allowed(), *(new for old, new in self.replaced if old == value)])
-
-    def allowed(self) -> str:
+    def describe(self) -> str:
         """Describe the values that are allowed."""
         if self.kind == "number":
             what = "a finite number" if not self.shape else f"{_size(self.shape)} finite numbers"
@@ -131,12 +125,7 @@ def _declare(spec: Spec, default: Any) -> Any:
 
 @dataclass(frozen=True)
 class Section:
-    """Base of every part of a document; refuses what its fields do not allow.
-
-    `REMOVED` names keys of earlier versions, which are read over with a warning, and what to use.
-    """
-
-    REMOVED: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Base of every part of a document; refuses what its fields do not allow."""
 
     def __post_init__(self) -> None:
         problems = []
@@ -147,7 +136,7 @@ class Section:
             try:
                 object.__setattr__(self, name, accept(spec, value))
             except ValueError:
-                problems.append(Problem(name, value, spec.refusal(value)))
+                problems.append(Problem(name, value, spec.describe()))
         if not problems:
             problems = list(self.check())
         if problems:

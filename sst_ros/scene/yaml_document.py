@@ -1,73 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML text to a checked document and back; reports every fault with its line."""
+"""YAML text to a checked document and back; reports every fault with its line.
+
+Between them stand nested dicts, whose values have keys, as in "star.inertia.zz" or
+"springs[0].rest".
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
-
-
-def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with other values; a list without an index means all of its entries.
-
-    So does a single value in place of a list of numbers.
-
-    A section that the document does not have is made; None takes a value or a section away.
-
-    Raises:
-        KeyError: a key does not fit the document; its argument is the key.
-
-    """
-    changed: dict[str, Any] = plain(document)
-    for key, value in values.items():
-        try:
-            _set(changed, str(key).split("."), plain(value))
-        except (AttributeError, IndexError, TypeError, ValueError):
-            raise KeyError(key) from None
-    return changed
-
-
-def plain(value: Any) -> Any:
-    """Turn arrays, NumPy numbers, tuples and mappings into what YAML has."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    return value
-
-
-def _set(section: dict[str, Any], words: list[str], value: Any) -> None:
-    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
-    if parts is None:
-        raise ValueError(words[0])
-    name, index = parts.groups()
-    if len(words) == 1 and index is not None:
-        section[name][int(index)] = value
-        return
-    if len(words) == 1:
-        known = section.get(name)
-        if isinstance(known, list) and isinstance(value, (int, float)):
-            value = [value] * len(known)
-        section.update({name: value})
-        if value is None:
-            del section[name]
-        return
-    below = section.setdefault(name, {} if index is None else [])
-    entries = below if isinstance(below, list) else [below]
-    for entry in entries if index is None else [entries[int(index)]]:
-        _set(entry, words[1:], value)
-
 
 S = TypeVar("S", bound=Section)
 
@@ -161,6 +110,59 @@ def values_of(document: Section) -> dict[str, Any]:
     return tree
 
 
+def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with other values; a list without an index means all of its entries.
+
+    So does a single value in place of a list of numbers.
+
+    A section that the document does not have is made; None takes a value or a section away.
+
+    Raises:
+        KeyError: a key does not fit the document; its argument is the key.
+
+    """
+    changed: dict[str, Any] = plain(document)
+    for key, value in values.items():
+        try:
+            _set(changed, str(key).split("."), plain(value))
+        except (AttributeError, IndexError, TypeError, ValueError):
+            raise KeyError(key) from None
+    return changed
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays, NumPy numbers, tuples and mappings into what YAML has."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return value
+
+
+def _set(section: dict[str, Any], words: list[str], value: Any) -> None:
+    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
+    if parts is None:
+        raise ValueError(words[0])
+    name, index = parts.groups()
+    if len(words) == 1 and index is not None:
+        section[name][int(index)] = value
+        return
+    if len(words) == 1:
+        known = section.get(name)
+        if isinstance(known, list) and isinstance(value, (int, float)):
+            value = [value] * len(known)
+        section.update({name: value})
+        if value is None:
+            del section[name]
+        return
+    below = section.setdefault(name, {} if index is None else [])
+    entries = below if isinstance(below, list) else [below]
+    for entry in entries if index is None else [entries[int(index)]]:
+        _set(entry, words[1:], value)
+
+
 def dump(document: Section) -> str:
     """Write a document as YAML that `read` turns into an equal one."""
     return str(yaml.safe_dump(_tree(document), sort_keys=False, allow_unicode=True))
@@ -194,11 +196,8 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
     for key_node, value_node in node.value:
         name = str(_plain(key_node))
         key = f"{path}.{name}" if path else name
-        if name in cls.REMOVED:
-            message = f"line {_line(key_node)}: {key} is ignored: {cls.REMOVED[name]}"
-            warnings.warn(message, FutureWarning, stacklevel=2)
-        elif name not in known:
-            allowed = "unknown key; allowed are " + ", ".join(known)
+        if name not in known:
+            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
             problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
         elif name in lines:
             allowed = f"is given twice, first on line {lines[name]}"
@@ -209,7 +208,7 @@ def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Probl
     for field in dataclasses.fields(cls):
         if field.default is dataclasses.MISSING and field.name not in lines:
             key = f"{path}.{field.name}" if path else field.name
-            allowed = "is missing; " + known[field.name].allowed()
+            allowed = "is missing; " + known[field.name].describe()
             problems.append(Problem(key, None, allowed, _line(node)))
     if len(problems) > before:
         return None
@@ -237,7 +236,7 @@ def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> 
     try:
         return accept(spec, _read_scalar(spec, node, value))
     except ValueError:
-        problems.append(Problem(key, value, spec.refusal(value), _line(node)))
+        problems.append(Problem(key, value, spec.describe(), _line(node)))
         return None
 
 

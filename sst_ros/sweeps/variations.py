@@ -215,7 +215,7 @@ def _refuse_ends(kind: str, values: Array, targets: Sequence[Target], factor: bo
             numbers = numbers[np.isfinite(numbers)]
         if not np.all((numbers > spec.above) & (numbers >= spec.least) & (numbers <= spec.most)):
             raise ValueError(
-                f"{spec.allowed()}; it reaches from {numbers.min()} to {numbers.max()}"
+                f"{spec.describe()}; it reaches from {numbers.min()} to {numbers.max()}"
             )
 
 

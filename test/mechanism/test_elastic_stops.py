@@ -11,7 +11,6 @@ from symmetric_motion import inertia
 from symmetric_motion import inertia_slope as slope
 
 from sst_ros.dynamics.model import damping_of
-from sst_ros.errors import InputError
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
@@ -113,8 +112,3 @@ def energy(simulation):
 def impact_rate():
     """Rate at pi/2 of a motion that keeps its energy, from rate 1 at pi/4."""
     return np.sqrt(inertia(EXAMPLE1, 0.0) / inertia(EXAMPLE1, np.pi / 4))
-
-
-def test_rigid_impacts_are_refused_with_what_replaces_them():
-    with pytest.raises(InputError, match="replaced by elastic with restitution and impact_rate"):
-        Stroke(at_end="impact")

@@ -117,7 +117,7 @@ def test_help_has_every_parameter_with_default_and_bounds(command):
     text = " ".join(help_text(command).split())
     for name, spec in specs(COMMANDS[command][1]).items():
         assert f"--{name.replace('_', '-')} " in text
-        assert spec.allowed() in text
+        assert spec.describe() in text
 
 
 @given(st.text(st.characters(categories=["L", "N", "P", "S"]), min_size=1))
