@@ -96,7 +96,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
 
     def publish(stamp_ns: int) -> None:
         for reader in readers:
-            reader.arrived(stamp_ns)
+            reader.read(stamp_ns)
         if number > 3:
             log.append(ZERO, ZERO, 2)
             if len(log) == LOG_TICKS:

@@ -74,7 +74,7 @@ def follow(name: str, bag: Path, mode: str, seconds: float, *, model: str | None
 
     """
     run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
-    with _recorded(bag, publish_rate=CONTROL_RATE, **run):
+    with _record(bag, publish_rate=CONTROL_RATE, **run):
         followed = {"scene": model or name, "mode": mode, "hold": HOLD_S, "rate": CONTROL_RATE}
         followed |= {"stamped": True, "feedforward_at": "middle"}
         waits = {"min_subscribers": 2, "wait_for_recorder": True}
@@ -101,14 +101,14 @@ def record(name: str, bag: Path, *, rate: int = 0, hold: str = "middle") -> None
     run = {"rate": rate, "publish_rate": rate} if rate else {}
     played = {"hold": hold, **({"rate": rate} if rate else {})}
     with (
-        _recorded(bag, scene=name, sync="lockstep", duration=duration, **run),
+        _record(bag, scene=name, sync="lockstep", duration=duration, **run),
         _node("torque_player", scene=name, stamped=True, min_subscribers=2, **played) as player,
     ):
         _wait_for_end("torque_player", player, duration + _END_S)
 
 
 @contextmanager
-def _recorded(bag: Path, **run: object) -> Iterator[None]:
+def _record(bag: Path, **run: object) -> Iterator[None]:
     """Record a run of the simulator, which ends by itself after what the block does."""
     with _node("recorder", output=str(bag)) as recorder:
         with _node("simulator", **run) as simulator:

@@ -17,7 +17,7 @@ from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
 from sst_ros.extras import MissingDependency, require
-from sst_ros.host.output import require_free, writing
+from sst_ros.host.output import require_free, write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array
@@ -79,7 +79,7 @@ def paper(out: Path) -> list[LargestDifference]:
     found: list[LargestDifference] = []
     paths: list[Path] = []
     notes: list[str] = []
-    with writing(out, "paper"):
+    with write_into(out, "paper"):
         for name in demo.EXAMPLES:
             scene = load(name)
             print(f"{name}: {scene.description}", flush=True)

@@ -30,7 +30,7 @@ PARAMETER_SERVICES = (
     "set_parameters",
     "set_parameters_atomically",
 )
-SIMULATION_INTERFACES = tuple(simulation_interfaces.SERVICES)
+SIMULATION_INTERFACES = simulation_interfaces.SERVICES
 
 
 class Described(NamedTuple):

@@ -10,7 +10,7 @@ from sst_ros.control.plan import examine
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.time_scaling import as_json, table, time_scaling, write_torques
 from sst_ros.errors import InputError, Problem
-from sst_ros.host.output import require_free, writing
+from sst_ros.host.output import require_free, write_into
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.recording.recorded_motion import samples
@@ -104,6 +104,6 @@ def run_identification(options: argparse.Namespace) -> None:
         lines, scene = found.table(), found.scene
     print(lines, end="")
     if options.out is not None:
-        with writing(options.out.parent, "identify"):
+        with write_into(options.out.parent, "identify"):
             options.out.write_text(dump(scene), encoding="utf-8")
         print(f"wrote {options.out}")

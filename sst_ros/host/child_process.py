@@ -101,7 +101,7 @@ def words(given: dict[str, object]) -> list[str]:
     return [word for key, value in values for word in ("-p", f"{key}:={value}")]
 
 
-def orphaned() -> bool:
+def is_orphan() -> bool:
     """Return whether the process that started this one, and without which it ends, has ended."""
     parent = os.environ.get(PARENT)
     return parent is not None and os.getppid() != int(parent)

@@ -50,7 +50,7 @@ def require_free(out: Path, origin: str, *, force: bool = False, option: str = "
 
 
 @contextmanager
-def writing(out: Path, origin: str) -> Iterator[None]:
+def write_into(out: Path, origin: str) -> Iterator[None]:
     """Make the folder `out` for a block that writes into it.
 
     Raises:

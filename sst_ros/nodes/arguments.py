@@ -58,7 +58,7 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
         InputError: lists every word that is no argument of the node, with the closest one.
 
     """
-    known = _known(command)
+    known = _specs_of(command)
     plain, ros = _split(words)
     problems = [*_ros_faults(ros, known)]
     # A parameter is an option by its name, too: --publish_rate.
@@ -132,7 +132,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return plain, ros
 
 
-def _known(command: str) -> dict[str, Spec]:
+def _specs_of(command: str) -> dict[str, Spec]:
     return {**specs(COMMANDS[command][1]), USE_SIM_TIME: Spec("flag", "follow /clock")}
 
 
@@ -151,7 +151,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
         argument_default=argparse.SUPPRESS,
     )
     defaults = COMMANDS[command][1]()
-    for name, spec in _known(command).items():
+    for name, spec in _specs_of(command).items():
         value = getattr(defaults, name, False)
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
         text = f"{spec.doc}; {spec.describe()}; default: {shown}".replace("%", "%%")

@@ -103,11 +103,11 @@ class InverseDynamicsController:
 
     def _answer(self, state: JointState) -> None:
         """Answer a state: of the run, or shown before it."""
-        self._commands.received()
-        self._seen = self._measured(state)
+        self._commands.restart_timeout()
+        self._seen = self._measure(state)
         if not self._has_subscribers():
             return
-        stamp_ns = self._commands.answering(state)
+        stamp_ns = self._commands.answer_to(state)
         if stamp_ns == 0:
             command = None if self._began else self._follower.preview(self._seen)
             if command is not None:
@@ -125,12 +125,12 @@ class InverseDynamicsController:
 
     def _has_subscribers(self) -> bool:
         """Whether the subscribers are there that the parameters ask for."""
-        if self._began or not self._commands.subscribed():
+        if self._began or not self._commands.has_subscribers():
             return self._began
         recorded = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in recorded)
 
-    def _measured(self, state: JointState) -> Measurement:
+    def _measure(self, state: JointState) -> Measurement:
         """Read the actuators, which may come in any order, among others.
 
         Raises:
@@ -177,7 +177,7 @@ class InverseDynamicsController:
             self._refuse(error)
             return False
         finally:
-            self._commands.received()  # no message could be received during the check
+            self._commands.restart_timeout()  # no message could be received during the check
         if tracking is not None:
             print(table(tracking), flush=True)
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
@@ -277,7 +277,7 @@ class FollowJointTrajectoryServer:
     def sample(self, state: JointState, measured: Measurement, command: Command) -> None:
         """Test the tolerances of the active goal at a sample of the run that was answered."""
         active = self._active
-        if active is None or self._canceled(active):
+        if active is None or self._end_if_canceled(active):
             return
         time = self._follower.time
         active.feedback = state.header.stamp, time, measured, command
@@ -291,7 +291,7 @@ class FollowJointTrajectoryServer:
 
     def interrupt(self, reason: str) -> None:
         """Abort the active goal; what is followed now is not its concern any more."""
-        if self._active is not None and not self._canceled(self._active):
+        if self._active is not None and not self._end_if_canceled(self._active):
             self._end(ErrorCode.INVALID_GOAL, reason)
 
     def close(self) -> None:
@@ -323,7 +323,7 @@ class FollowJointTrajectoryServer:
             self._follower.stop()
         return CancelResponse.ACCEPT
 
-    def _canceled(self, active: _ActiveGoal) -> bool:
+    def _end_if_canceled(self, active: _ActiveGoal) -> bool:
         if active.handle.is_cancel_requested:
             self._end(ErrorCode.SUCCESSFUL, "canceled")
         return self._active is None
@@ -338,7 +338,7 @@ class FollowJointTrajectoryServer:
     def _report(self) -> None:
         """Publish feedback of the last sample, once."""
         active = self._active
-        if active is None or self._canceled(active) or active.feedback is None:
+        if active is None or self._end_if_canceled(active) or active.feedback is None:
             return
         (stamp, time, measured, command), active.feedback = active.feedback, None
         desired, total = command.desired, command.torque

@@ -52,7 +52,7 @@ class Reader:
     """Messages of a topic, each as soon as it has arrived.
 
     Attributes:
-        waiting: a message is known that arrived after the time last given to `arrived`.
+        waiting: a message is known that arrived after the time last given to `read`.
 
     """
 
@@ -65,7 +65,7 @@ class Reader:
         self._published = True
         self.waiting = False
 
-    def arrived(self, until_ns: float) -> Sequence[Any]:
+    def read(self, until_ns: float) -> Sequence[Any]:
         """Return the next messages that arrived until this monotonic time [ns].
 
         They are MOST_WAITING at most. A topic without publishers is looked at every 20 ms, because

@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 
 from sst_ros.errors import InputError, SstError
-from sst_ros.host.child_process import orphaned
+from sst_ros.host.child_process import is_orphan
 from sst_ros.nodes import arguments, signals
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -92,14 +92,14 @@ def run(words: Sequence[str]) -> int:
         print(f"{command}: {error}", file=sys.stderr)
         return 1
     finally:
-        with _bounded():
+        with _bound_time():
             rclpy.try_shutdown()
         signals.ignore()
     return 0
 
 
 @contextlib.contextmanager
-def _bounded() -> Iterator[None]:
+def _bound_time() -> Iterator[None]:
     """End the process, with a traceback and status 1, where the middleware hangs for ten seconds.
 
     Fast DDS 3.2 deadlocks now and then when another node leaves (eProsima/Fast-DDS issue 6502), and
@@ -154,7 +154,7 @@ def spin(worker: Worker) -> None:
     callbacks = _Callbacks(worker.node)
     callbacks.start()
     try:
-        while callbacks.is_alive() and not (signals.stop.is_set() or orphaned()):
+        while callbacks.is_alive() and not (signals.stop.is_set() or is_orphan()):
             if worker.done.wait(_POLL_S):
                 break
         callbacks.end()
@@ -164,7 +164,7 @@ def spin(worker: Worker) -> None:
         try:
             worker.close()
         finally:
-            with _bounded():
+            with _bound_time():
                 _wait_for_subscribers(worker.node.publishers)
                 callbacks.shut_down()
                 worker.node.destroy_node()

@@ -293,7 +293,7 @@ class SimulatorTopics:
             self._description = own["robot_description"].publisher(node)
             self._description.publish(String(data=urdf(scene)))
         self.diagnostics = own["diagnostics"].publisher(node)
-        self._awaited = self._named(given.wait_for_subscribers)
+        self._awaited = self._find_publishers(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
@@ -371,7 +371,7 @@ class SimulatorTopics:
             at = stamp(stamp_ns if publisher is self._joints else 0)
             publisher.publish(message(at, (quaternion, joints, torque)))
 
-    def phase_changed(self, phase: str) -> None:
+    def publish_phase(self, phase: str) -> None:
         """Publish and log the phase, with the reason of a fault."""
         self._phase.publish(String(data=phase))
         log = self._node.get_logger()
@@ -399,7 +399,7 @@ class SimulatorTopics:
         pairs = zip(publishers, (of.joint_states, of.orientation, of.euler_zyz), strict=True)
         return [pair for pair in pairs if pair[0] in self._read]
 
-    def _named(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
+    def _find_publishers(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
         own = {publisher.topic_name: publisher for publisher in self._node.publishers}
         found = [self._node.resolve_topic_name(name) for name in names if name]
         if unknown := [name for name in found if name not in own]:

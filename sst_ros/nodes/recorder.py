@@ -123,8 +123,8 @@ class Recorder:
         text = f"{self._bag.messages} messages of {len(heard)} topics recorded"
         self.node.get_logger().info(text)
         lost = [f"{one.lost} of {name}" for name, one in self._recorded.items() if one.lost]
-        faults = [f"no message of {_listed(self._missing())}"] if self._missing() else []
-        faults += [f"lost messages: {_listed(lost)}"] if lost else []
+        faults = [f"no message of {_join(self._missing())}"] if self._missing() else []
+        faults += [f"lost messages: {_join(lost)}"] if lost else []
         if faults:
             raise RecordingIncomplete(
                 f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})"
@@ -159,7 +159,7 @@ class Recorder:
                 self._wait_for(waiting or self._wanted)
 
     def _wait_for(self, names: set[str]) -> None:
-        text, log = f"waiting for {_listed(names)}", self.node.get_logger()
+        text, log = f"waiting for {_join(names)}", self.node.get_logger()
         if self._timeout_s and time.monotonic() - self._began_s > self._timeout_s:
             log.error(f"{text}: given up after {self._timeout_s:g} s")
             self.done.set()
@@ -235,7 +235,7 @@ def _bag_qos(asked: QoSProfile) -> Qos:
     )
 
 
-def _listed(names: Iterable[str]) -> str:
+def _join(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
 

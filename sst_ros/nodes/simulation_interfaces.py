@@ -3,6 +3,10 @@
 
 The same state machine as that of ~/pause, ~/step and ~/reset answers. STOPPED is a run at its
 initial state that is paused. The numbers are those of the package's messages.
+
+The entity `star` is the manipulator. It turns about O, the origin of base_link. Its orientation and
+angular velocity determine the angles and rates of all joints, so to set them is to set the state of
+the joints.
 """
 
 from __future__ import annotations
@@ -28,23 +32,115 @@ from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import BASE_FRAME, Quaternion, Vector3
 
+try:
+    from simulation_interfaces import action, srv
+except ImportError:  # not part of every installation, nor of the wheels
+    action = srv = None
+
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
 INVALID_POSE = 101
 
+_UNKNOWN = f"there is no entity {{!r}}, only {NAME!r}"
 _UNIT = 1e-3
 """Largest deviation of a quaternion's length from 1; it is normalised."""
 _SAME = 1e-6
 """Largest angle between an orientation and the assembly at its actuator angles [rad]."""
+STOPPED, PLAYING, PAUSED, QUITTING = range(4)
+ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
+SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
+FEATURES = (10, 11, 20, 22, 24, 25, 26, 31, 32, 33)
+"""Get and set the state of an entity, reset, reset of the state, get and set the state of the
+simulation, pause, one step, many steps, many steps by an action."""
+SERVICES = (
+    *("get_entities", "get_entities_states", "get_entity_state", "set_entity_state"),
+    *("get_simulation_state", "set_simulation_state", "get_simulator_features"),
+    *("reset_simulation", "step_simulation", "spawn_entity"),
+)
+"""Names of the services, and of the methods that answer them."""
+INFORMATION = (
+    "sst_ros: the entity `star` has the state of the joints, which joint_states publishes and "
+    "~/set_state takes; ROS time continues over a reset"
+)
 
 
-class SimulatedStar:
-    """Answers the services of entities; each takes a request and fills a response."""
+def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:
+    """Create the services and the action if the package is installed; return whether it is."""
+    if srv is None:
+        return False
+    answers = SimulationInterfaces(loop, leave)
+    for name in SERVICES:
+        kind = getattr(srv, name.title().replace("_", ""))
+        qos = topics.SERVICE_QOS
+        node.create_service(kind, f"~/{name}", getattr(answers, name), qos_profile=qos)
+    StepsAction(node, loop)
+    return True
 
-    def __init__(self, loop: RunLoop) -> None:
-        self._loop = loop
+
+class SimulationInterfaces:
+    """Answers the services; each takes a request and fills a response.
+
+    Args:
+        loop: the run.
+        leave: ends the node.
+
+    """
+
+    def __init__(self, loop: RunLoop, leave: Callable[[], None]) -> None:
+        self._loop, self._leave = loop, leave
         self._space = ActuatorSpaceMap(loop.simulation.geometry)
+
+    def get_simulator_features(self, _: Any, response: Any) -> Any:
+        """List the features."""
+        response.features.features = list(FEATURES)
+        response.features.custom_info = INFORMATION
+        return response
+
+    def get_simulation_state(self, _: Any, response: Any) -> Any:
+        """Return the state of the simulation."""
+        response.state.state = self._state()
+        return answer(response, OK)
+
+    def set_simulation_state(self, request: Any, response: Any) -> Any:
+        """Change the state of the simulation."""
+        requested = request.state.state
+        if requested == self._state():
+            return answer(response, ALREADY_THERE)
+        if requested == PAUSED and self._state() == STOPPED:
+            text = "a stopped simulation can be started, not paused"
+            return answer(response, INCORRECT_TRANSITION, text)
+        if requested == STOPPED:
+            pause = partial(self._loop.pause, True)
+            paused = self._loop.ask(pause).success
+            self._ask(response, self._loop.reset)
+            if not paused:  # out of a fault a reset comes first
+                self._loop.ask(pause)
+            return response
+        if requested in (PLAYING, PAUSED):
+            return self._ask(response, partial(self._loop.pause, requested == PAUSED))
+        if requested == QUITTING:
+            self._leave()
+            return answer(response, OK)
+        return answer(response, UNSUPPORTED, "the scene is loaded at the start and stays")
+
+    def reset_simulation(self, request: Any, response: Any) -> Any:
+        """Reset; there is nothing spawned, and ROS time is never reset."""
+        scope = request.scope or SCOPE_ALL
+        if scope != SCOPE_ALL and scope & ~(SCOPE_STATE | SCOPE_SPAWNED):
+            return answer(response, UNSUPPORTED, "ROS time continues; reset the state")
+        if scope & SCOPE_STATE:
+            return self._ask(response, self._loop.reset)
+        return answer(response, OK)
+
+    def step_simulation(self, request: Any, response: Any) -> Any:
+        """Step a paused run by some samples."""
+        return self._ask(response, partial(self._loop.step, int(request.steps)))
+
+    def spawn_entity(self, request: Any, response: Any) -> Any:
+        """Refuse, by the name of what was to be spawned."""
+        text = f"{request.name or 'nothing'} is not spawned: the scene has one manipulator"
+        return answer(response, UNSUPPORTED, text)
 
     def get_entities(self, request: Any, response: Any) -> Any:
         """List the star, where the filter matches its name."""
@@ -70,19 +166,19 @@ class SimulatedStar:
     def get_entity_state(self, request: Any, response: Any) -> Any:
         """Return pose and twist in base_link; the acceleration is left at zero."""
         if request.entity != NAME:
-            return _unknown(request, response)
+            return answer(response, NOT_FOUND, _UNKNOWN.format(request.entity))
         self._fill(response.state)
         return answer(response, OK)
 
     def set_entity_state(self, request: Any, response: Any) -> Any:
         """Set the state of a run that waits or is paused; the acceleration is ignored."""
         if request.entity != NAME:
-            return _unknown(request, response)
+            return answer(response, NOT_FOUND, _UNKNOWN.format(request.entity))
         frame, pose, twist = request.state.header.frame_id, request.state.pose, request.state.twist
         if frame not in ("", "world", BASE_FRAME):
             return answer(response, FAILED, f"frame_id {frame!r} must be {BASE_FRAME}")
         now = self._loop.simulation.state
-        quaternion, rate = now.quaternion, _turned(now.quaternion, now.body_rate)
+        quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
         if getattr(request, "set_pose", True):  # the flags are new in 2.1
             try:
                 quaternion = _unit(_numbers(pose.orientation, "xyzw"))
@@ -101,7 +197,7 @@ class SimulatedStar:
             gamma, gamma_dot = self._actuators(quaternion, rate)
         except (AssemblyError, ArithmeticError) as error:
             return answer(response, INVALID_POSE, str(error) or "the manipulator is singular there")
-        return replied(response, self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot)))
+        return self._ask(response, partial(self._loop.set_state, gamma, gamma_dot))
 
     def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
@@ -124,143 +220,11 @@ class SimulatedStar:
         state = self._loop.simulation.state
         message.header.frame_id = BASE_FRAME
         _write(message.pose.orientation, "xyzw", state.quaternion)
-        _write(message.twist.angular, "xyz", _turned(state.quaternion, state.body_rate))
+        _write(message.twist.angular, "xyz", _turn(state.quaternion, state.body_rate))
         return message
 
-
-def answer(response: Any, code: int, text: str = "") -> Any:
-    """Fill the result of a response, and return the response."""
-    response.result.result, response.result.error_message = code, text
-    return response
-
-
-def replied(response: Any, reply: Reply) -> Any:
-    """Fill the result of a response from a reply of the run, and return the response."""
-    return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
-
-
-def _unknown(request: Any, response: Any) -> Any:
-    return answer(response, NOT_FOUND, f"there is no entity {request.entity!r}, only {NAME!r}")
-
-
-def _turned(quaternion: Quaternion, vector: Vector3) -> Vector3:
-    """From {E} into base_link."""
-    x, y, z = (rotation_matrix(quaternion) @ vector).tolist()
-    return x, y, z
-
-
-def _numbers(message: Any, names: str) -> Any:
-    numbers = tuple(getattr(message, name) for name in names)
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{type(message).__name__} must be finite numbers")
-    return numbers
-
-
-def _unit(quaternion: Quaternion) -> Quaternion:
-    length = float(np.linalg.norm(quaternion))
-    if not abs(length - 1.0) < _UNIT:
-        raise ValueError(f"orientation has length {length:.6g}, must be 1")
-    x, y, z, w = (part / length for part in quaternion)
-    return x, y, z, w
-
-
-def _write(message: Any, names: str, values: Sequence[float]) -> None:
-    for name, value in zip(names, values, strict=True):
-        setattr(message, name, value)
-
-
-try:
-    from simulation_interfaces import action, srv
-except ImportError:  # not part of every installation, nor of the wheels
-    action = srv = None
-
-STOPPED, PLAYING, PAUSED, QUITTING = range(4)
-ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
-SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
-FEATURES = (10, 11, 20, 22, 24, 25, 26, 31, 32, 33)
-"""Get and set the state of an entity, reset, reset of the state, get and set the state of the
-simulation, pause, one step, many steps, many steps by an action."""
-SERVICES = {
-    "get_entities": "GetEntities",
-    "get_entities_states": "GetEntitiesStates",
-    "get_entity_state": "GetEntityState",
-    "get_simulation_state": "GetSimulationState",
-    "get_simulator_features": "GetSimulatorFeatures",
-    "reset_simulation": "ResetSimulation",
-    "set_entity_state": "SetEntityState",
-    "set_simulation_state": "SetSimulationState",
-    "spawn_entity": "SpawnEntity",
-    "step_simulation": "StepSimulation",
-}
-"""Types of the services, by name; also the names of the methods that answer them."""
-INFORMATION = (
-    "sst_ros: the entity `star` has the state of the joints, which joint_states publishes and "
-    "~/set_state takes; ROS time continues over a reset"
-)
-
-
-class SimulationInterfaces:
-    """Answers the services; each takes a request and fills a response.
-
-    Args:
-        loop: the run.
-        leave: ends the node.
-
-    """
-
-    def __init__(self, loop: RunLoop, leave: Callable[[], None]) -> None:
-        self._loop, self._leave = loop, leave
-
-    def get_simulator_features(self, _: Any, response: Any) -> Any:
-        """List the features."""
-        response.features.features = list(FEATURES)
-        response.features.custom_info = INFORMATION
-        return response
-
-    def get_simulation_state(self, _: Any, response: Any) -> Any:
-        """Return the state of the simulation."""
-        response.state.state = self._state()
-        return answer(response, OK)
-
-    def set_simulation_state(self, request: Any, response: Any) -> Any:
-        """Change the state of the simulation."""
-        wanted = request.state.state
-        if wanted == self._state():
-            return answer(response, ALREADY_THERE)
-        if wanted == PAUSED and self._state() == STOPPED:
-            text = "a stopped simulation can be started, not paused"
-            return answer(response, INCORRECT_TRANSITION, text)
-        if wanted == STOPPED:
-            paused = self._loop.ask(partial(self._loop.pause, True))
-            done = self._loop.ask(self._loop.reset)
-            if not paused.success:  # out of a fault a reset comes first
-                self._loop.ask(partial(self._loop.pause, True))
-            return replied(response, done)
-        if wanted in (PLAYING, PAUSED):
-            return replied(response, self._loop.ask(partial(self._loop.pause, wanted == PAUSED)))
-        if wanted == QUITTING:
-            self._leave()
-            return answer(response, OK)
-        return answer(response, UNSUPPORTED, "the scene is loaded at the start and stays")
-
-    def reset_simulation(self, request: Any, response: Any) -> Any:
-        """Reset; there is nothing spawned, and ROS time is never reset."""
-        scope = request.scope or SCOPE_ALL
-        if scope != SCOPE_ALL and scope & ~(SCOPE_STATE | SCOPE_SPAWNED):
-            text = "ROS time continues; reset the state"
-            return answer(response, UNSUPPORTED, text)
-        if scope & SCOPE_STATE:
-            return replied(response, self._loop.ask(self._loop.reset))
-        return answer(response, OK)
-
-    def step_simulation(self, request: Any, response: Any) -> Any:
-        """Step a paused run by some samples."""
-        return replied(response, self._loop.ask(partial(self._loop.step, int(request.steps))))
-
-    def spawn_entity(self, request: Any, response: Any) -> Any:
-        """Refuse, by the name of what was to be spawned."""
-        text = f"{request.name or 'nothing'} is not spawned: the scene has one manipulator"
-        return answer(response, UNSUPPORTED, text)
+    def _ask(self, response: Any, request: Callable[[], Reply]) -> Any:
+        return answer_with(response, self._loop.ask(request))
 
     def _state(self) -> int:
         if self._loop.phase is Phase.PAUSED and not self._loop.begun:
@@ -300,17 +264,41 @@ class StepsAction:
                 break
             feedback.completed_steps, feedback.remaining_steps = done, steps - done
             handle.publish_feedback(feedback)
-        goal.end(replied(action.SimulateSteps.Result(), reply), success=reply.success)
+        goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
 
 
-def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:
-    """Create the services and the action if the package is installed; return whether it is."""
-    if srv is None:
-        return False
-    answers, star = SimulationInterfaces(loop, leave), SimulatedStar(loop)
-    for name, kind in SERVICES.items():
-        handler = getattr(star if hasattr(star, name) else answers, name)
-        qos = topics.SERVICE_QOS
-        node.create_service(getattr(srv, kind), f"~/{name}", handler, qos_profile=qos)
-    StepsAction(node, loop)
-    return True
+def answer(response: Any, code: int, text: str = "") -> Any:
+    """Fill the result of a response, and return the response."""
+    response.result.result, response.result.error_message = code, text
+    return response
+
+
+def answer_with(response: Any, reply: Reply) -> Any:
+    """Fill the result of a response from a reply of the run, and return the response."""
+    return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
+
+
+def _turn(quaternion: Quaternion, vector: Vector3) -> Vector3:
+    """From {E} into base_link."""
+    x, y, z = (rotation_matrix(quaternion) @ vector).tolist()
+    return x, y, z
+
+
+def _numbers(message: Any, names: str) -> Any:
+    numbers = tuple(getattr(message, name) for name in names)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{type(message).__name__} must be finite numbers")
+    return numbers
+
+
+def _unit(quaternion: Quaternion) -> Quaternion:
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1.0) < _UNIT:
+        raise ValueError(f"orientation has length {length:.6g}, must be 1")
+    x, y, z, w = (part / length for part in quaternion)
+    return x, y, z, w
+
+
+def _write(message: Any, names: str, values: Sequence[float]) -> None:
+    for name, value in zip(names, values, strict=True):
+        setattr(message, name, value)

@@ -37,13 +37,13 @@ class TorqueCommands:
             self._message = Float64MultiArray(data=array("d", ZERO))
             self._torques = self._message.data
         self.publisher = topic.publisher(node, simulator=given.simulator)
-        self.received()
+        self.restart_timeout()
 
-    def subscribed(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Whether they have as many subscribers as the parameters ask for."""
         return self.publisher.get_subscription_count() >= self._given.min_subscribers
 
-    def answering(self, state: JointState) -> int:
+    def answer_to(self, state: JointState) -> int:
         """Give the next commands the stamp of a state; return it [ns], 0 where it is no sample."""
         if self._given.stamped:
             self._message.header.stamp = state.header.stamp
@@ -55,7 +55,7 @@ class TorqueCommands:
         self._torques[0], self._torques[1], self._torques[2] = torque
         self.publisher.publish(self._message)
 
-    def received(self) -> None:
+    def restart_timeout(self) -> None:
         """Count the time-out of joint_states from now on."""
         self._received = time.monotonic()
 

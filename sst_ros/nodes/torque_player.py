@@ -63,27 +63,27 @@ class TorquePlayer:
 
     def _answer(self, state: JointState) -> None:
         """Play the torque of the hold that a sample begins; before the run, that of the first."""
-        self._commands.received()
+        self._commands.restart_timeout()
         # Once begun, the simulator may end before its last sample has arrived.
-        if self._start_ns is None and not self._commands.subscribed():
+        if self._start_ns is None and not self._commands.has_subscribers():
             return
-        stamp_ns = self._commands.answering(state)
+        stamp_ns = self._commands.answer_to(state)
         if stamp_ns == 0:
             if self._start_ns is None:
-                self._commands.send(self._held(0))
+                self._commands.send(self._hold(0))
             return
         if self._start_ns is None:
             self._start_ns = self._last_ns = stamp_ns
         elapsed_ns = stamp_ns - self._start_ns
         if elapsed_ns / NANOSECONDS < self._duration:
             self._check_period(stamp_ns)
-            self._commands.send(self._held(elapsed_ns))
+            self._commands.send(self._hold(elapsed_ns))
         else:
             self._commands.send(ZERO)
             self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
             self.done.set()
 
-    def _held(self, elapsed_ns: int) -> Vector3:
+    def _hold(self, elapsed_ns: int) -> Vector3:
         """Torques [N m] from this time of the profile [ns] until the next sample or its end."""
         given = self._parameters
         end_ns = round(self._duration * NANOSECONDS)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.host.output import writing
+from sst_ros.host.output import write_into
 from sst_ros.plot import motion, workspace
 from sst_ros.plot.motion import Solution
 from sst_ros.plot.style import envelope, save_figure, styled
@@ -124,7 +124,7 @@ def save(
     """
     figure.suptitle(title, fontsize=11)
     paths = [out / f"{stem}.{form}" for form in formats]
-    with writing(out, "plot"):
+    with write_into(out, "plot"):
         save_figure(figure, *paths)
     return paths
 

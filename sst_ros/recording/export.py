@@ -14,7 +14,7 @@ import numpy as np
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.host.output import require_free, writing
+from sst_ros.host.output import require_free, write_into
 from sst_ros.recording import signals
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import TIMES, Column
@@ -82,7 +82,7 @@ def export(bag: Path, out: Path, form: str = FORMATS[0], *, force: bool = False)
     """
     require_free(out, "export", force=force)
     run = signals.read(bag)
-    with writing(out, "export"):
+    with write_into(out, "export"):
         paths = []
         for name in run.tables:
             paths.append(out / f"{name}.{form}")

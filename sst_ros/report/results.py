@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_ros.extras import require
-from sst_ros.host.output import writing
+from sst_ros.host.output import write_into
 from sst_ros.integration.codegen import numba_version
 from sst_ros.plot.style import save_figure
 
@@ -69,7 +69,7 @@ def write(
     """
     whole = {**document, "report": made_on()}
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
-    with writing(out, name):
+    with write_into(out, name):
         csv.to_csv(out / f"{name}.csv", index=False)
         (out / f"{name}.json").write_text(text, encoding="utf-8")
         (out / f"{name}.md").write_text(page, encoding="utf-8")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.host.output import writing
+from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import pictures
 from sst_ros.plot.style import save_figure
@@ -80,7 +80,7 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
 
     """
     run = recording.read(bag, damaged=damaged)
-    with writing(out, "report"):
+    with write_into(out, "report"):
         measured, integration, ideal, result = evaluate(run)
         drawn = _pictures(run, integration, ideal, out)
         save_figure(page.overview(run, integration, measured, result), out / PAGE)

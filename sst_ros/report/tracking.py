@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate, table
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.host.output import writing
+from sst_ros.host.output import write_into
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -112,7 +112,7 @@ def report(bag: Path, out: Path) -> str:
         worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
     text = "\n".join(lines)
-    with writing(out, "report"):
+    with write_into(out, "report"):
         (out / TABLE).write_text(text, encoding="utf-8")
     pictures.draw(tracked.recording.signals, out, PICTURES, ["png"])
     return text

@@ -278,14 +278,14 @@ class RunLoop:
 
     def _start(self) -> bool:
         """Start the run, unless it has to wait; return whether it runs."""
-        if not (self._recorded() and (not self._run.waits or self._input.starts_run())):
+        if not (self._has_subscribers() and (not self._run.waits or self._input.starts_run())):
             return False
         if not self._ticks.begin():
             return False
         self._resume()
         return True
 
-    def _recorded(self) -> bool:
+    def _has_subscribers(self) -> bool:
         """Whether the topics of wait_for_subscribers have had subscribers."""
         if self._awaited_since is None:
             return True
@@ -346,7 +346,7 @@ class RunLoop:
                 self._publish_phase()
 
     def _publish_phase(self) -> None:
-        self._output.phase_changed(self._status)
+        self._output.publish_phase(self._status)
 
     def _processor_s(self) -> float:
         """Processor time of the thread of the run [s], where the system has it."""

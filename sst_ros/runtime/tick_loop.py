@@ -54,7 +54,7 @@ class RunOutput(Protocol):
     def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts."""
 
-    def phase_changed(self, phase: str) -> None:
+    def publish_phase(self, phase: str) -> None:
         """Publish the phase, with the reason of a fault."""
 
 
@@ -88,7 +88,7 @@ class Counters:
             self._wall_s += time.monotonic() - self._resumed
             self._resumed = None
 
-    def stepped(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
+    def count(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
         """Count steps of one call: their time [s] and the lateness of their start [ns]."""
         self.ticks += ticks
         self.step_total_s += took_s
@@ -306,7 +306,7 @@ class TickLoop:
             elif paced and not self._lockstep and self._output.unread:
                 unread = self._unread_samples(ticks)
                 ticks += unread * self._ticks_per_sample
-            if paced and not self._pacer.wait(self._interrupted, ticks):
+            if paced and not self._pacer.wait(self._is_interrupted, ticks):
                 return False
             now = time.monotonic_ns()
             while ticks:
@@ -320,10 +320,10 @@ class TickLoop:
                 self._kept = None
                 self._publish()
                 return True
-            if paced and self._interrupted():
+            if paced and self._is_interrupted():
                 return False
 
-    def _interrupted(self) -> bool:
+    def _is_interrupted(self) -> bool:
         late = self.requested.is_set() and time.monotonic() - self._waits_since > _LONGEST_WAIT_S
         return late or self.stopped.is_set()
 
@@ -347,7 +347,7 @@ class TickLoop:
             stamp_ns = max(now, stamp_ns + 1, self._idle_ns) if now else self._idle_ns
         self._output.idle(self.simulation.state, stamp_ns, at_rest=fault)
         self._idle_ns = stamp_ns
-        self._input.idle_shown(stamp_ns)
+        self._input.accept_idle(stamp_ns)
 
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
@@ -371,7 +371,7 @@ class TickLoop:
             self.step_since = 0.0
             done = (simulation.time_ns - before) // self._period_ns
             if done:
-                self.counters.stepped(took, self._pacer.late_ns, done)
+                self.counters.count(took, self._pacer.late_ns, done)
                 self._output.ticks(torque, moment, done)
                 self.held.add(torque, 1e-9 * done * self._period_ns)
                 self._tick += done

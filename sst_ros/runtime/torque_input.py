@@ -26,9 +26,9 @@ class Arrivals(Protocol):
 
     @property
     def waiting(self) -> bool:
-        """Whether a message is known that arrived after the time last given to `arrived`."""
+        """Whether a message is known that arrived after the time last given to `read`."""
 
-    def arrived(self, until_ns: float) -> Sequence[Any]:
+    def read(self, until_ns: float) -> Sequence[Any]:
         """Return the next messages that arrived until this monotonic time [ns], within bounds."""
 
 
@@ -84,7 +84,7 @@ class TorqueInput:
     def clear(self) -> None:
         """Forget the command and what has arrived: zero torque until the next command."""
         for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
-            arrivals.arrived(math.inf)
+            arrivals.read(math.inf)
         self._forget()
 
     def _forget(self) -> None:
@@ -115,7 +115,7 @@ class TorqueInput:
             return False
         return self.moment == ZERO or not 0.0 < timeout_ns < until_ns - self._moment_since
 
-    def idle_shown(self, stamp_ns: int) -> None:
+    def accept_idle(self, stamp_ns: int) -> None:
         """Accept answers to a state that was published with this stamp before the run."""
         self._idle_ns = [self._idle_ns[0] or stamp_ns, stamp_ns]
 
@@ -130,7 +130,7 @@ class TorqueInput:
     def torque(self, simulation: HasState, now_ns: int) -> Vector3:
         """Return the torques of the tick that begins at this monotonic time [ns], in N m."""
         self._take(now_ns)
-        if not self._expired(now_ns):
+        if not self._has_expired(now_ns):
             return self._held
         if not self._damping:
             return ZERO
@@ -145,9 +145,9 @@ class TorqueInput:
         ignored, because they may arrive late.
         """
         found: Vector3 | None = None
-        for _ in self._commands.arrived(math.inf):
+        for _ in self._commands.read(math.inf):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
-        for message in self._commanded(self._stamped.arrived(math.inf)):
+        for message in self._complete(self._stamped.read(math.inf)):
             stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             try:
@@ -162,15 +162,15 @@ class TorqueInput:
         return found
 
     def _take(self, now_ns: int) -> None:
-        for message in self._commands.arrived(now_ns):
+        for message in self._commands.read(now_ns):
             self._use(three, message.data, now_ns)
-        if found := self._stamped.arrived(now_ns):
-            for message in self._commanded(found):
+        if found := self._stamped.read(now_ns):
+            for message in self._complete(found):
                 self._use(torque_by_name, message, now_ns)
         if self._moments is not None:
             self._take_moments(now_ns)
 
-    def _commanded(self, found: Sequence[Any]) -> Sequence[Any]:
+    def _complete(self, found: Sequence[Any]) -> Sequence[Any]:
         """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""
         if not self._run.partial_commands:
             return found
@@ -182,7 +182,7 @@ class TorqueInput:
     def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
             return
-        for message in self._moments.arrived(math.inf if self._run.lockstep else now_ns):
+        for message in self._moments.read(math.inf if self._run.lockstep else now_ns):
             vector = message.wrench.torque
             try:
                 self.moment = three((vector.x, vector.y, vector.z), "moments [N m]")
@@ -211,7 +211,7 @@ class TorqueInput:
         self.reasons[refused.kind] = self.reasons.get(refused.kind, 0) + 1
         self.last_refusal = str(refused)
 
-    def _expired(self, now_ns: int) -> bool:
+    def _has_expired(self, now_ns: int) -> bool:
         timeout_ns = self._run.command_timeout_ns
         old = self.begun and 0.0 < timeout_ns < now_ns - self._since
         self.timeouts += old and not self.stale

@@ -58,7 +58,7 @@ class TrajectoryFollower:
     """
 
     def __init__(self, model: Scene, settings: ControllerNodeParameters) -> None:
-        self._model, self._settings = _limited(model, settings.torque_limit), settings
+        self._model, self._settings = _limit(model, settings.torque_limit), settings
         self._geometry = Geometry.of(model)
         self._period_ns = NANOSECONDS // settings.rate
         self._planned: ReferenceMotion | None = None
@@ -91,7 +91,7 @@ class TrajectoryFollower:
         if self._settings.motion != "topic":
             allowed = "must be topic, for trajectories to be taken"
             raise InputError("joint_trajectory", [Problem("motion", "scene", allowed)])
-        begin = self._standing(seen) if self._last is None else self._last.desired
+        begin = self._reference_at_rest(seen) if self._last is None else self._last.desired
         moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
         if moving and not self._settings.stamped:
             # The check takes longer than a control period; in lockstep the plant waits.
@@ -210,7 +210,7 @@ class TrajectoryFollower:
             self._sums.add(TrackingRecord(time[:, 0], *columns))
             self._rows = array("d")
 
-    def _standing(self, seen: Measurement | None) -> Reference:
+    def _reference_at_rest(self, seen: Measurement | None) -> Reference:
         """Return the reference at rest at the measured angles."""
         if seen is None:
             allowed = "must come first: a trajectory begins there"
@@ -242,7 +242,7 @@ def _samples(bag: str) -> MotionSamples:
     return samples(bag)
 
 
-def _limited(model: Scene, limit: float) -> Scene:
+def _limit(model: Scene, limit: float) -> Scene:
     """Return the model with a torque limit, unless its own is smaller."""
     if not limit:
         return model

@@ -130,7 +130,7 @@ class TrajectoryGoal:
         }
         self.goal = _tolerances("goal_tolerance", message.goal_tolerance, own, problems)
         time = nanoseconds(message.goal_time_tolerance) / NANOSECONDS
-        self.goal_time = _resolved(
+        self.goal_time = _resolve(
             "goal_time_tolerance", time, defaults.goal_time_tolerance, problems
         )
         if problems:
@@ -192,12 +192,12 @@ def _tolerances(
             continue
         for quantity, default in defaults.items():
             value = getattr(tolerance, quantity)
-            resolved = _resolved(f"{place}.{quantity}", value, default, problems)
+            resolved = _resolve(f"{place}.{quantity}", value, default, problems)
             found[tolerance.name][quantity] = resolved
     return found
 
 
-def _resolved(name: str, value: float, default: float, problems: list[Problem]) -> float:
+def _resolve(name: str, value: float, default: float, problems: list[Problem]) -> float:
     if value == NO_TOLERANCE:
         return 0.0
     if not (math.isfinite(value) and value >= 0.0):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.host.output import require_free, writing
+from sst_ros.host.output import require_free, write_into
 from sst_ros.scene.scene import scene_of
 from sst_ros.sweeps.chunk_task import (
     ChunkOutcome,
@@ -129,7 +129,7 @@ def run_study(
     done: set[int] = set()
     if out is not None:
         out = out.resolve()
-        with writing(out, "sweep"):
+        with write_into(out, "sweep"):
             clear_temporary(out)
             done = find_complete(out, study, ready.steps)
             (out / "study.json").write_text(

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sst_ros.extras import require
-from sst_ros.host.output import writing
+from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
 from sst_ros.sweeps.sweep_summary import correlate_early_ends, list_outputs
@@ -51,7 +51,7 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     if shown:
         columns = {name: table[name].to_numpy() for name in shown}
         figures["worst"] = draw_scatter(columns, np.argsort(score)[-MOST_RUNS:], title)
-    with writing(out, "sweep plot"):
+    with write_into(out, "sweep plot"):
         for name, figure in figures.items():
             save_figure(figure, out / f"{name}.png")
     return [out / f"{name}.png" for name in figures]

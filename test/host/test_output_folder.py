@@ -5,7 +5,7 @@ import pytest
 
 from sst_ros.__main__ import main
 from sst_ros.errors import InputError
-from sst_ros.host.output import require_free, results_folder, writing
+from sst_ros.host.output import require_free, results_folder, write_into
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
     with (
         pytest.raises(InputError, match=r"file/out.*can be written"),
-        writing(tmp_path / "file" / "out", "plot"),
+        write_into(tmp_path / "file" / "out", "plot"),
     ):
         pass
 

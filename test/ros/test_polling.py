@@ -49,32 +49,32 @@ def publish(node, *torque):
 def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(node, looks):
     reader = polling.Reader(node, topics.SIMULATOR["commands"])
     for tick in range(100):
-        assert not reader.arrived(tick * MS)
+        assert not reader.read(tick * MS)
     assert len(looks) == 5
 
 
 def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks):
     reader = polling.Reader(node, topics.SIMULATOR["commands"])
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
-    assert not reader.arrived(at)
+    assert not reader.read(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
-    assert not reader.arrived(at + 19 * MS)
-    (taken,) = reader.arrived(at + 20 * MS)
+    assert not reader.read(at + 19 * MS)
+    (taken,) = reader.read(at + 20 * MS)
     assert list(taken.data) == [1.0, 2.0, 3.0]
     before = len(looks)
     for tick in range(10):
-        assert not reader.arrived(at + (21 + tick) * MS)
+        assert not reader.read(at + (21 + tick) * MS)
     assert len(looks) == before + 10  # at each tick from now on
     publisher.publish(Float64MultiArray(data=[4.0, 5.0, 6.0]))
     publisher.wait_for_all_acked()
-    assert len(reader.arrived(at + 32 * MS)) == 1
+    assert len(reader.read(at + 32 * MS)) == 1
 
 
 def test_without_a_time_every_command_is_taken_at_once(node):
     reader = polling.Reader(node, topics.SIMULATOR["commands"])
-    assert not reader.arrived(time.monotonic_ns())
+    assert not reader.read(time.monotonic_ns())
     publish(node, 1.0, 2.0, 3.0)
-    assert len(reader.arrived(math.inf)) == 1
+    assert len(reader.read(math.inf)) == 1
 
 
 def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
@@ -88,5 +88,5 @@ def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
     before = time.thread_time()
     executor.spin_once(timeout_sec=1.0)
     assert time.thread_time() - before < 0.05  # 0.002 asleep, up to 1.0 awake
-    assert len(reader.arrived(math.inf)) == 1
+    assert len(reader.read(math.inf)) == 1
     executor.shutdown()

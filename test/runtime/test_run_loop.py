@@ -52,7 +52,7 @@ class Output:
     def idle(self, state, stamp_ns, *, at_rest):
         self.idles.append((state, at_rest, stamp_ns))
 
-    def phase_changed(self, phase):
+    def publish_phase(self, phase):
         self.phases.append(phase)
         self.unpublished[phase.partition(":")[0]] = len(self.acted) - self.flushed
 
@@ -66,7 +66,7 @@ class Queue(list):
         super().__init__()
         self.asked = []
 
-    def arrived(self, until_ns):
+    def read(self, until_ns):
         self.asked.append(until_ns)
         if self.waiting and len(self.asked) <= 3:
             return ()

@@ -33,7 +33,7 @@ class Queue(list):
     def waiting(self):
         return self.arrived_ns > 0 and len(self) > 0
 
-    def arrived(self, until_ns):
+    def read(self, until_ns):
         if self.arrived_ns > until_ns:
             return ()
         found = self[:MOST_WAITING]
