@@ -4,7 +4,7 @@
 One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k =
 g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The orientation at
 given actuator angles comes from Newton's method, started so close that it stays in the assembly
-mode.
+mode. The observer sees to that from one set of encoder angles to the next, however far apart.
 """
 
 from __future__ import annotations
@@ -45,8 +45,13 @@ from sst_ros.state import Quaternion, Vector3
 ROUNDING = 4e-16
 """Residual abs(r_k . t_k) at which Newton's method ends: rounding."""
 
+CLOSED = 1e-14
+"""Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
+
 _STEPS = 20
+
 _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
+
 _CARRIAGES = tuple(f"r{k}{axis}" for k in range(3) for axis in "xyz")
 
 
@@ -189,12 +194,13 @@ def _solve(rows: list[Any], right: Any) -> tuple[Any, ...]:
     return tuple(part / determinant for part in total)
 
 
-CLOSED = 1e-14
-"""Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
-
-
 class OrientationObserver:
     """Tracks one assembly mode, however far apart successive angles are.
+
+    Its steps are those that `continuation` proves to stay in the mode. The proof needs sigma, the
+    least singular value of J2. The rows of J2 are unit vectors, so its squared singular values sum
+    to 3, the product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for
+    most steps, and cheap. Where a step is too long for that, `continuation` divides it.
 
     Args:
         geometry: base triangle and star.

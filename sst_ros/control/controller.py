@@ -49,8 +49,12 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, choice, number
 from sst_ros.state import Quaternion, State, Vector3, clamp
 
+__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
+
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
+
 SPACES = ("gamma", "so3")
+
 INSTANTS = ("start", "middle")
 
 
@@ -130,9 +134,6 @@ class ControllerSettings(Section):
     def direct(self) -> bool:
         """Whether the gains are given as such, and not by bandwidth."""
         return any(self.stiffness) or any(self.damping)
-
-
-__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
 
 
 class ControlStopped(SstError):
@@ -254,7 +255,7 @@ class Controller:
         if mode == "gravity_pd":
             feedforward = self._inverse.gravity_torque(self._observer.update(measured.gamma))
         elif mode != "pd":
-            feedforward = self._at_desired(desired)
+            feedforward = self._inverse.reference_torque(desired)
         summed: Vector3 = ZERO
         if mode == "computed_torque":
             total, summed = self._compute_torque(desired, measured, error)
@@ -264,7 +265,9 @@ class Controller:
             acceleration, summed = self._feedback(error, rates)
             feedback = _by_joint(self.inertia, acceleration)
         if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
-            feedforward = self._at_desired(self._motion.at(time + 0.5 * self._period_s))
+            feedforward = self._inverse.reference_torque(
+                self._motion.at(time + 0.5 * self._period_s)
+            )
         return self._finish(feedforward, feedback, desired, error, summed)
 
     def _finish(
@@ -281,9 +284,6 @@ class Controller:
         if dot(axpy(1.0, total, -1.0, torque), error) <= 0.0:
             self._sum = axpy(1.0, self._sum, self._period_s, summed)
         return Command(torque, feedforward, feedback, desired, torque != total)
-
-    def _at_desired(self, at: Reference) -> Vector3:
-        return self._inverse.reference_torque(at)
 
     def _compute_torque(
         self, desired: Reference, measured: Measurement, error: Vector3
@@ -334,6 +334,15 @@ class Controller:
         return kp, kd
 
 
+def rotation_vector(quaternion: Quaternion) -> Vector3:
+    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
+    sign = math.copysign(1.0, quaternion[3])
+    x, y, z, w = (sign * part for part in quaternion)
+    sine = math.hypot(x, y, z)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
+    return factor * x, factor * y, factor * z
+
+
 def _three(values: Iterable[float]) -> Vector3:
     first, second, third = map(float, values)
     return first, second, third
@@ -346,12 +355,3 @@ def _by_joint(factors: Vector3, values: Vector3) -> Vector3:
 def _require_finite(numbers: Sequence[float], what: str) -> None:
     if not all(map(math.isfinite, numbers)):
         raise InputError("control", [Problem(what, tuple(numbers), "must be finite numbers")])
-
-
-def rotation_vector(quaternion: Quaternion) -> Vector3:
-    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
-    sign = math.copysign(1.0, quaternion[3])
-    x, y, z, w = (sign * part for part in quaternion)
-    sine = math.hypot(x, y, z)
-    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
-    return factor * x, factor * y, factor * z

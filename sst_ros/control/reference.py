@@ -66,11 +66,6 @@ class ReferenceMotion(ABC):
         """Return the reference at a time [s] between 0 and `duration`."""
 
 
-def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
-    """Return the ends of `count` equal parts of a duration."""
-    return (*(duration * (k / count) for k in range(count)), duration)
-
-
 class StoppingMotion(ReferenceMotion):
     """Another motion from a time on, slowed down to rest by time scaling.
 
@@ -106,6 +101,11 @@ class StoppingMotion(ReferenceMotion):
             multiply(speed, at.gamma_dot),
             second(at.gamma_dot, at.gamma_ddot),
         )
+
+
+def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
+    """Return the ends of `count` equal parts of a duration."""
+    return (*(duration * (k / count) for k in range(count)), duration)
 
 
 def minimum_jerk(u: float) -> tuple[float, float, float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time scaling: the factors by which a motion can be run faster or slower.
+"""What a checked motion asks for, as a table, as JSON and as torques; how fast it can be run.
 
 At `factor` times the speed rates grow by the factor and accelerations by its square. Torques of
 inertia follow the square too, but weight and springs stay, and friction has its own dependence: the
@@ -30,7 +30,9 @@ SLOWEST = 1e-4
 """Slower than this part of the highest factor is not looked for."""
 
 _GRID = 120
+
 _HALVINGS = 45
+
 _DOUBLINGS = 40
 
 

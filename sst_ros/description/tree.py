@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manipulator as a tree of links and joints, as URDF and the view see it.
+"""The manipulator as links and joints, and what the links look like, for URDF and the view.
 
     base_link -gamma_k- actuated_k -mu_k- intermediate_k -beta_1- star
                                                          -beta_2- star_from_2
@@ -7,7 +7,8 @@
 
 All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
 The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it.
-The loops are closed where the three are one.
+The loops are closed where the three are one. Links are drawn as arcs, rods, balls and boxes in
+their own frames; thicknesses are for the eye, arcs and radii are the scene's.
 """
 
 from __future__ import annotations
@@ -23,9 +24,31 @@ from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME
 
 BASE, STAR = BASE_FRAME, "star"
+
 LEGS = (1, 2, 3)
+
 STARS = (STAR, "star_from_2", "star_from_3")
 """{E} as seen from legs 1, 2 and 3."""
+
+Colour = tuple[float, float, float]
+
+GLOBE: Colour = (0.93, 0.94, 0.96)
+
+TRIANGLE: Colour = (0.35, 0.38, 0.42)
+
+STAR_COLOUR: Colour = (0.90, 0.62, 0.00)
+
+STEEL: Colour = (0.60, 0.63, 0.67)
+
+LEG_COLOURS: tuple[Colour, Colour, Colour] = (
+    (0.00, 0.45, 0.70),
+    (0.84, 0.37, 0.00),
+    (0.00, 0.62, 0.45),
+)
+"""Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
+
+STEP = np.radians(6.0)
+"""Arcs are drawn as chords of this length or less: 0.14 % of the radius off."""
 
 
 @dataclass(frozen=True)
@@ -90,23 +113,6 @@ def _leg(geometry: Geometry, k: int) -> tuple[Joint, Joint, Joint]:
         Joint(f"mu_{leg}", name_actuated(leg), name_intermediate(leg), np.eye(3), (-1.0, 0.0, 0.0)),
         Joint(f"beta_{leg}", name_intermediate(leg), STARS[k], star, back),
     )
-
-
-Colour = tuple[float, float, float]
-
-GLOBE: Colour = (0.93, 0.94, 0.96)
-TRIANGLE: Colour = (0.35, 0.38, 0.42)
-STAR_COLOUR: Colour = (0.90, 0.62, 0.00)
-STEEL: Colour = (0.60, 0.63, 0.67)
-LEG_COLOURS: tuple[Colour, Colour, Colour] = (
-    (0.00, 0.45, 0.70),
-    (0.84, 0.37, 0.00),
-    (0.00, 0.62, 0.45),
-)
-"""Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
-
-STEP = np.radians(6.0)
-"""Arcs are drawn as chords of this length or less: 0.14 % of the radius off."""
 
 
 @dataclass(frozen=True)

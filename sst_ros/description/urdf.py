@@ -6,6 +6,11 @@ shown are as closed as those of the simulation. URDF has no loops, no springs, n
 stops and no Stribeck friction: a simulation of the file must add them. No shape is meant for
 collisions.
 
+A scene gives inertias about O, and a mass only where something weighs; URDF wants a mass. Where the
+scene has none, the centre is put at O, about which everything turns: the motion is then the same
+for any mass, under gravity too. The mass written is the one that would have this tensor on the
+sphere of its link, trace / (2 radius^2).
+
 The actuators can be hardware of ros2_control, which drives them over topics by the plug-in
 JointStateTopicSystem of the package joint_state_topic_hardware_interface. It sends the effort of
 the joints of its tag only: passive joints, which have no command, must not be in it.
@@ -41,6 +46,84 @@ from sst_ros.scene.bodies import Inertia, Payload
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import LARGEST, Friction, Scene
 from sst_ros.state import Vector3
+
+PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+
+STATES = ("position", "velocity", "effort")
+
+EVERY_CYCLE = "-1"
+"""Threshold of the change of a command below which the plug-in sends none: the simulator drops a
+command that is not repeated within command_timeout."""
+
+_NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
+     star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they
+     and star are one. """
+
+_ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radius^2), with
+     the centre at O, about which all turns: they change no motion. The tensors are the scene's. """
+
+
+def urdf(scene: Scene) -> str:
+    """Write a scene as a URDF document."""
+    geometry = Geometry.of(scene)
+    joints, drawn = tree(geometry), shapes(scene)
+    owned = bodies(scene)
+    root = ET.Element("robot", name=_name(scene.name))
+    root.append(ET.Comment(_NOTE.format(name=_name(scene.name))))
+    if assumed := ", ".join(body.name for body in owned if body.assumed):
+        root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
+    own = {body.name: body for body in owned}
+    for name in (BASE, *(joint.child for joint in joints)):
+        _link(root, name, own.pop(name, None), drawn.get(name, ()))
+    for body in own.values():
+        _link(root, body.name, body, ())
+    ranges = {joint: (low, high) for joint, low, high in ranges_of([*limits_of(scene, geometry)])}
+    for joint in joints:
+        _joint(root, scene, joint, ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf)))
+    for body in own.values():
+        fixed = ET.SubElement(root, "joint", name=f"{body.name}_fixed", type="fixed")
+        ET.SubElement(fixed, "parent", link=body.link)
+        ET.SubElement(fixed, "child", link=body.name)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def urdf_with_ros2_control(
+    scene: Scene,
+    commands: str = "/sst_simulator/commands_stamped",
+    states: str = "/joint_states",
+) -> str:
+    """Write a scene as URDF with the ros2_control tag of its actuators.
+
+    Until the first joint states arrive, the hardware has the initial state of the scene: without it
+    joint_trajectory_controller, activated before, holds nan, and no command starts the run.
+
+    Args:
+        scene: the scene.
+        commands: topic on which the simulator takes commands by name.
+        states: topic of its joint states.
+
+    """
+    root = ET.fromstring(urdf(scene), ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
+    hardware = ET.SubElement(tag, "hardware")
+    ET.SubElement(hardware, "plugin").text = PLUGIN
+    for name, value in (
+        ("joint_commands_topic", commands),
+        ("joint_states_topic", states),
+        ("trigger_joint_command_threshold", EVERY_CYCLE),
+    ):
+        ET.SubElement(hardware, "param", name=name).text = value
+    initial = scene.initial
+    for name, *start in zip(JOINTS[:3], initial.gamma, initial.gamma_dot, strict=True):
+        joint = ET.SubElement(tag, "joint", name=name)
+        ET.SubElement(joint, "command_interface", name="effort")
+        for state, start_value in zip(STATES, (*start, 0.0), strict=True):
+            interface = ET.SubElement(joint, "state_interface", name=state)
+            ET.SubElement(interface, "param", name="initial_value").text = repr(float(start_value))
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
 
 PAYLOAD = "payload"
 
@@ -109,82 +192,6 @@ def _rotor(scene: Scene, leg: int) -> Body:
 
 def _mass(tensor: Array, radius: float) -> float:
     return float(np.trace(tensor)) / (2.0 * radius**2)
-
-
-_NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
-     star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they
-     and star are one. """
-_ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radius^2), with
-     the centre at O, about which all turns: they change no motion. The tensors are the scene's. """
-
-
-PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
-STATES = ("position", "velocity", "effort")
-EVERY_CYCLE = "-1"
-"""Threshold of the change of a command below which the plug-in sends none: the simulator drops a
-command that is not repeated within command_timeout."""
-
-
-def urdf(scene: Scene) -> str:
-    """Write a scene as a URDF document."""
-    geometry = Geometry.of(scene)
-    joints, drawn = tree(geometry), shapes(scene)
-    owned = bodies(scene)
-    root = ET.Element("robot", name=_name(scene.name))
-    root.append(ET.Comment(_NOTE.format(name=_name(scene.name))))
-    if assumed := ", ".join(body.name for body in owned if body.assumed):
-        root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
-    own = {body.name: body for body in owned}
-    for name in (BASE, *(joint.child for joint in joints)):
-        _link(root, name, own.pop(name, None), drawn.get(name, ()))
-    for body in own.values():
-        _link(root, body.name, body, ())
-    ranges = {joint: (low, high) for joint, low, high in ranges_of([*limits_of(scene, geometry)])}
-    for joint in joints:
-        _joint(root, scene, joint, ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf)))
-    for body in own.values():
-        fixed = ET.SubElement(root, "joint", name=f"{body.name}_fixed", type="fixed")
-        ET.SubElement(fixed, "parent", link=body.link)
-        ET.SubElement(fixed, "child", link=body.name)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def urdf_with_ros2_control(
-    scene: Scene,
-    commands: str = "/sst_simulator/commands_stamped",
-    states: str = "/joint_states",
-) -> str:
-    """Write a scene as URDF with the ros2_control tag of its actuators.
-
-    Until the first joint states arrive, the hardware has the initial state of the scene: without it
-    joint_trajectory_controller, activated before, holds nan, and no command starts the run.
-
-    Args:
-        scene: the scene.
-        commands: topic on which the simulator takes commands by name.
-        states: topic of its joint states.
-
-    """
-    root = ET.fromstring(urdf(scene), ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
-    hardware = ET.SubElement(tag, "hardware")
-    ET.SubElement(hardware, "plugin").text = PLUGIN
-    for name, value in (
-        ("joint_commands_topic", commands),
-        ("joint_states_topic", states),
-        ("trigger_joint_command_threshold", EVERY_CYCLE),
-    ):
-        ET.SubElement(hardware, "param", name=name).text = value
-    initial = scene.initial
-    for name, *start in zip(JOINTS[:3], initial.gamma, initial.gamma_dot, strict=True):
-        joint = ET.SubElement(tag, "joint", name=name)
-        ET.SubElement(joint, "command_interface", name="effort")
-        for state, start_value in zip(STATES, (*start, 0.0), strict=True):
-            interface = ET.SubElement(joint, "state_interface", name=state)
-            ET.SubElement(interface, "param", name="initial_value").text = repr(float(start_value))
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:

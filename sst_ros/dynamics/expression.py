@@ -202,32 +202,6 @@ def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Pr
     return program_of(graph, tuple(inputs), tuple(function(*symbols)))
 
 
-def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) -> Program:
-    """Return what a graph computes, whose first nodes are the inputs."""
-
-    def operand(value: Value) -> float | Operand:
-        return Operand(value.index) if isinstance(value, Expression) else float(value)
-
-    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
-    return Program(inputs, steps, tuple(map(operand, outputs))).prune()
-
-
-def _is_constant(value: Value) -> bool:
-    return not isinstance(value, Expression)
-
-
-def _is(value: Value, number: float) -> bool:
-    return not isinstance(value, Expression) and float(value) == number
-
-
-def _drop_minus(value: Value) -> Value:
-    """Return x where value is -x, else None."""
-    if not isinstance(value, Expression):
-        return None
-    op, args = value.graph.nodes[value.index]
-    return args[0] if op == "neg" else None
-
-
 def with_jacobian(
     function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
 ) -> Program:
@@ -241,6 +215,16 @@ def with_jacobian(
         slopes = _slopes(graph, last, symbols[list(inputs).index(name)])
         everything += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
     return program_of(graph, tuple(inputs), tuple(everything))
+
+
+def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) -> Program:
+    """Return what a graph computes, whose first nodes are the inputs."""
+
+    def operand(value: Value) -> float | Operand:
+        return Operand(value.index) if isinstance(value, Expression) else float(value)
+
+    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
+    return Program(inputs, steps, tuple(map(operand, outputs))).prune()
 
 
 def _slopes(graph: Graph, last: int, by: Expression) -> list[Value]:
@@ -275,3 +259,19 @@ def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -
         "step": lambda: 0.0,
     }
     return 0.0 if not isinstance(d[0], Expression) and d[0] == 0.0 else inner[op]() * d[0]
+
+
+def _is_constant(value: Value) -> bool:
+    return not isinstance(value, Expression)
+
+
+def _is(value: Value, number: float) -> bool:
+    return not isinstance(value, Expression) and float(value) == number
+
+
+def _drop_minus(value: Value) -> Value:
+    """Return x where value is -x, else None."""
+    if not isinstance(value, Expression):
+        return None
+    op, args = value.graph.nodes[value.index]
+    return args[0] if op == "neg" else None

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state in which a scene begins."""
+"""The state of a run from the paper's quantities: its begin, and its derivative by Eqs. 1 to 92.
+
+The derivative is the paper's own, in plain Python. It has the inputs and outputs of the traced one
+(quaternion, body rate, work; drive), so that the same integrators step it. Each evaluation solves
+Eq. 90 for gamma_ddot and takes omega_dot from Eq. 40.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,8 @@ from sst_ros.scene.scene import Scene
 
 SINGULAR = 1.5e-5
 """det J2 below which rounding, over its square, leaves a rate of gamma less than six digits."""
+
+REFUSED = "the equations of the paper have no such term: use equations = quaternion"
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
@@ -50,9 +57,6 @@ def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Arra
         message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
         raise SingularConfiguration(message, determinant)
     return np.asarray(rotation.T @ at.j @ gamma_dot)
-
-
-REFUSED = "the equations of the paper have no such term: use equations = quaternion"
 
 
 def body_acceleration(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orientation of the star: rotation matrices, quaternions (x, y, z, w), ZYZ angles."""
+"""Vectors of three along the last axis; rotation matrices, quaternions (x, y, z, w), ZYZ angles."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from sst_ros.state import Array
 
 _SMALL = 1000
+
 _AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and accelerations of every joint and link, from the actuators or from the star.
+"""Rates and accelerations of every joint and link, and the moments that their joints transmit.
 
-Both directions use one leg equation, Eqs. 9 and 24 to 27. Written with c_k = (r x t).w = (w x r).t:
+From the actuators or from the star, one leg equation serves both, Eqs. 9 and 24 to 27. Written with
+c_k = (r x t).w = (w x r).t:
 
     omega     = w gamma_dot - r mu_dot - t beta_dot
     omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot
@@ -10,6 +11,19 @@ Both directions use one leg equation, Eqs. 9 and 24 to 27. Written with c_k = (r
 Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the star; this
 needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
 and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
+
+The virtual work eliminates the constraint moments. All seven links turn about O, so every joint is
+a revolute about an axis through O: w_k (base to actuated link), r_k (to the intermediate link), t_k
+(the curved prismatic joint, to the star). A joint without friction transmits a moment about O with
+two components, both across its axis. The 9 x 2 components and 3 torques (or accelerations) are as
+many as the 7 x 3 moment balances, so the moments about O are determinate, and each leg gives them
+in closed form: with the rates of change of angular momentum D_1k and D_2k of its links, the moment
+m on the star obeys
+
+    t.m = 0,   r.m = -r.D_2k,   w.m = tau_k - w.(D_1k + D_2k),
+
+three equations with the determinant c_k. Only the moment about O is determinate: the forces in
+the bearings depend on where and how many they are. Divide by a bearing distance to size one.
 """
 
 from __future__ import annotations

@@ -221,7 +221,10 @@ def inverse_dynamics(
 
 @dataclass(frozen=True)
 class EquationOfMotion:
-    """EquationOfMotion at one posture and rate. Arrays are read-only.
+    """M gamma_ddot + h = tau + J^T n_ext at one posture and rate. Arrays are read-only.
+
+    The paper writes T1 gamma_ddot + T2 + tau = 0 (Eq. 90); M = -T1 is symmetric and positive
+    definite and h = -T2 at n_ext = 0 holds the velocity products. Inertia tensors may be full.
 
     Attributes:
         m: mass matrix M = -T1 [kg m^2], shape (3, 3).

@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the star can go, how far every limit is, and how well the actuators hold it there.
+"""Where the star can go, how far every limit is, how well the actuators hold it, what is singular.
 
 A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max, and gamma_k
 lies in its stroke. Two maps: over orientations (direction of s, turn psi about it), where the
 inverse kinematics has one answer, and over gamma, where the direct kinematics has 0 to 3.
+
+Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k = +-w_k, so
+w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever at the edge of what
+is admissible, never inside. Parallel (det J2 = 0): may lie inside when some alpha_k > 180 deg; none
+for all alpha_k < 180 deg and beta_k < 90 deg.
 """
 
 from __future__ import annotations
@@ -20,6 +25,8 @@ from sst_ros.mechanism.frames import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
 
 _BLOCK = 20_000
+
+_BISECTIONS = 55
 
 
 @dataclass(frozen=True)
@@ -251,9 +258,6 @@ def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array,
 def _join(parts: list[Measures]) -> Measures:
     names = Measures.__dataclass_fields__
     return Measures(*frozen(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)))
-
-
-_BISECTIONS = 55
 
 
 @dataclass(frozen=True)

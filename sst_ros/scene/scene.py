@@ -156,8 +156,49 @@ class Scene(Section):
                 yield f"{key}[{k}]", link
 
 
-def _matrix(link: Link) -> Matrix:
-    return np.zeros((3, 3)) if link.inertia is None else link.inertia.matrix
+def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
+    """Return a scene as it is, by its name or path, or built from its document as a dict.
+
+    Raises:
+        InputError: there is no such scene, or its document is refused.
+
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, Mapping):
+        return from_values(Scene, scene, "scene")
+    if isinstance(scene, (str, Path)):
+        return load(scene)
+    allowed = "must be a Scene, the name or path of one, or its document as a dict"
+    raise InputError("scene", [Problem("scene", scene, allowed)])
+
+
+def with_initial(scene: Scene, initial: Any) -> Scene:
+    """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
+
+    Raises:
+        InputError: it is none of these, or its numbers are refused.
+
+    """
+    if initial is None:
+        return scene
+    if isinstance(initial, Initial):
+        return replace(scene, initial=initial)
+    names = ("gamma", "gamma_dot", "orientation")
+    if isinstance(initial, Mapping):
+        unknown = [name for name in initial if name not in names]
+        if unknown or "gamma" not in initial:
+            allowed = "must have the key gamma, and may have gamma_dot and orientation"
+            raise InputError("initial", [Problem("initial", list(initial), allowed)])
+        given = dict(initial)
+    else:
+        try:
+            gamma, gamma_dot = initial
+        except (TypeError, ValueError):
+            allowed = "must be (gamma, gamma_dot), a mapping or Initial"
+            raise InputError("initial", [Problem("initial", initial, allowed)]) from None
+        given = {"gamma": gamma, "gamma_dot": gamma_dot}
+    return replace(scene, initial=Initial(**{name: plain(given[name]) for name in given}))
 
 
 def load(name_or_path: str | Path) -> Scene:
@@ -208,6 +249,10 @@ def share_directory() -> Path:
     raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
 
 
+def _matrix(link: Link) -> Matrix:
+    return np.zeros((3, 3)) if link.inertia is None else link.inertia.matrix
+
+
 def _numbers(
     value: object, key: str, spec: Spec | None = None
 ) -> Iterator[tuple[str, float, Spec]]:
@@ -228,48 +273,3 @@ def _has(cls: type[Section], path: list[str]) -> bool:
     if spec is None or len(path) == 1:
         return spec is not None
     return spec.section is not None and _has(spec.section, path[1:])
-
-
-def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
-    """Return a scene as it is, by its name or path, or built from its document as a dict.
-
-    Raises:
-        InputError: there is no such scene, or its document is refused.
-
-    """
-    if isinstance(scene, Scene):
-        return scene
-    if isinstance(scene, Mapping):
-        return from_values(Scene, scene, "scene")
-    if isinstance(scene, (str, Path)):
-        return load(scene)
-    allowed = "must be a Scene, the name or path of one, or its document as a dict"
-    raise InputError("scene", [Problem("scene", scene, allowed)])
-
-
-def with_initial(scene: Scene, initial: Any) -> Scene:
-    """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
-
-    Raises:
-        InputError: it is none of these, or its numbers are refused.
-
-    """
-    if initial is None:
-        return scene
-    if isinstance(initial, Initial):
-        return replace(scene, initial=initial)
-    names = ("gamma", "gamma_dot", "orientation")
-    if isinstance(initial, Mapping):
-        unknown = [name for name in initial if name not in names]
-        if unknown or "gamma" not in initial:
-            allowed = "must have the key gamma, and may have gamma_dot and orientation"
-            raise InputError("initial", [Problem("initial", list(initial), allowed)])
-        given = dict(initial)
-    else:
-        try:
-            gamma, gamma_dot = initial
-        except (TypeError, ValueError):
-            allowed = "must be (gamma, gamma_dot), a mapping or Initial"
-            raise InputError("initial", [Problem("initial", initial, allowed)]) from None
-        given = {"gamma": gamma, "gamma_dot": gamma_dot}
-    return replace(scene, initial=Initial(**{name: plain(given[name]) for name in given}))

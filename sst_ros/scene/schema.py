@@ -2,7 +2,9 @@
 """Documents as frozen dataclasses: every field has a unit and bounds, which are checked.
 
 A class that derives from `Section` is checked whenever it is built, from YAML or from Python.
-Reading a document gives either the object or one `InputError` with every fault and its line.
+Reading a document gives either the object or one `InputError` with every fault and its line. The
+JSON schema is from the same declarations: editors complete and check YAML with it; what no schema
+can express (inertias, angles that must sum to 360 deg) is left to reading.
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
+
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
+_TEXT = {"type": "string", "pattern": "\\S"}
 
 
 @dataclass(frozen=True)
@@ -219,10 +225,6 @@ def _instance(value: Any, cls: type[Section]) -> Any:
 
 def _size(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape))
-
-
-_DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_TEXT = {"type": "string", "pattern": "\\S"}
 
 
 def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
