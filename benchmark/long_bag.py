@@ -31,7 +31,7 @@ from sst_ros.host.output import slices
 from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording.recording import JOINTS
+from sst_ros.recording.topic_tables import JOINTS
 from sst_ros.report.states import by_columns, initial
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document

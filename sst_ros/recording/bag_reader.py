@@ -1,45 +1,205 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a rosbag2 recording in one pass; every fault of it becomes an InputError."""
+"""The messages of a rosbag2 recording in one pass; every fault of it becomes an InputError.
+
+rosbags reads sqlite3, and what rosbag2 has compressed by file or by message. mcap reads MCAP and
+checks each chunk by its CRC-32. What mcap leaves to its caller is here: the checksums of the index
+(summary) and of the data section, the number of messages, and to go on behind a damaged chunk,
+which needs the place of the next one from the index, or a damaged chunk whose length is whole.
+"""
 
 from __future__ import annotations
 
-import mmap
+import contextlib
+import io
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from io import BytesIO
 from pathlib import Path, PurePath
-from struct import Struct
-from struct import error as StructError
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeAlias
 
-import lz4.frame  # type: ignore[import-untyped]
 import yaml
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, MessageIndex, Schema, Statistics
+from mcap.reader import FOOTER_SIZE
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem
 
-RECORD, MESSAGE = Struct("<BQ"), Struct("<HIQQ")
-ERRORS = (
-    McapError, StructError, ValueError, KeyError, EOFError, RuntimeError, MemoryError,
-    zstandard.ZstdError,
-)  # fmt: skip
-"""What reading a damaged record may raise."""
+_RECORD_HEAD = 9
+"""Bytes of opcode and length before the content of an MCAP record."""
+_DATA_END_SIZE = _RECORD_HEAD + 4
+_PIECE = 1 << 20
 
-_DATA_OPCODES = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
-_SMALLEST_CHUNK = 49
-_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
-    "": lambda content: content,
-    "zstd": lambda content: bytes(zstandard.ZstdDecompressor().decompressobj().decompress(content)),
-    "lz4": lambda content: bytes(lz4.frame.decompress(content)),
-}
+
+class Topic(NamedTuple):
+    """A topic to look for.
+
+    Attributes:
+        key: short name.
+        ending: end of its full name, or the whole name where `anywhere` is False.
+        type: message type.
+        anywhere: any namespace and node name may precede the ending.
+
+    """
+
+    key: str
+    ending: str
+    type: str
+    anywhere: bool = True
+
+    def matches(self, name: str) -> bool:
+        """Return whether a full name is that of this topic."""
+        return name.endswith(self.ending) if self.anywhere else name == self.ending
+
+
+RawMessage: TypeAlias = tuple[str, str, int, bytes]
+"""Topic, type, reception by the recorder [ns], serialized content."""
+
+
+class Bag:
+    """A recording: MCAP or sqlite3, a folder or a single file.
+
+    Args:
+        path: of the recording.
+        requested: topics to read; all others are skipped.
+        damaged: read what is intact of a damaged recording instead of refusing it.
+
+    Attributes:
+        topics: full names of the topics found, by key; complete when `messages` is exhausted.
+        damage: what is damaged or lost, a line for each part.
+        unverified: number of chunks without a checksum.
+
+    Raises:
+        InputError: there is no recording at the path.
+
+    """
+
+    def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
+        if not path.exists():
+            raise refused(path, "bag", str(path), "does not exist")
+        self.path = path
+        self.topics: dict[str, str] = {}
+        self.damage: tuple[str, ...] = ()
+        self.unverified = 0
+        self._requested, self._damaged = requested, damaged
+        self._store = message_types()
+        self._channels: dict[tuple[str, str], Topic | None] = {}
+
+    def messages(self) -> Iterator[tuple[str, int, Any]]:
+        """Yield the messages of the requested topics in the order of the file.
+
+        Each is the key of its topic, its reception by the recorder [ns], and its content.
+
+        Raises:
+            InputError: the recording is damaged, which is known at the end at the latest; it is
+                empty; or two topics match one that is requested.
+
+        """
+        count = 0
+        files = self._mcap_files()
+        for name, message_type, received_ns, data in (
+            self._read_mcap(files) if files else self._read_by_rosbags()
+        ):
+            count += 1
+            topic = self._topic(name, message_type)
+            if topic is None:
+                continue
+            try:
+                content = self._store.deserialize_cdr(data, message_type)
+            except Exception as error:  # rosbags raises anything on bad bytes
+                raise self._not_whole(_one_line(error), f" in {topic.key}") from None
+            yield topic.key, received_ns, content
+        if not count:
+            raise refused(self.path, "messages", 0, "the recording is empty")
+
+    def absence(self, topic: Topic) -> Problem:
+        """Describe that a topic is missing."""
+        others = [f"{name} ({kind})" for name, kind in self._channels if topic.matches(name)]
+        allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
+        return Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
+
+    def _mcap_files(self) -> list[Path]:
+        """Files that are read as they are; none where rosbags reads them."""
+        if not self.path.is_dir():
+            return [self.path] if self.path.suffix == ".mcap" else []
+        try:
+            text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
+            found = yaml.safe_load(text)["rosbag2_bagfile_information"]
+            names = [PurePath(name).name for name in found["relative_file_paths"]]
+            plain = not found["compression_mode"] and all(name.endswith(".mcap") for name in names)
+            files = [self.path / name for name in names] if plain else []
+        except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+            files = []
+        if self._damaged and not all(map(Path.exists, files or [self.path / "metadata.yaml"])):
+            files = sorted(self.path.glob("*.mcap"))
+        return files
+
+    def _read_mcap(self, paths: Sequence[Path]) -> Iterator[RawMessage]:
+        files = [McapFile(path) for path in paths]
+        for file in files:
+            try:
+                yield from file.messages()
+            except OSError as error:
+                raise self._not_whole(_one_line(error)) from None
+            for channel in file.channels.values():
+                self._topic(*channel)
+            if not file.intact and not self._damaged:
+                raise self._not_whole("; ".join(file.describe()), advice=True)
+        self.damage = tuple(line for file in files for line in file.describe())
+        self.unverified = sum(file.unverified for file in files)
+
+    def _read_by_rosbags(self) -> Iterator[RawMessage]:
+        count = 0
+        try:
+            with Reader(self.path) as reader:
+                chosen = [one for one in reader.connections if self._topic(one.topic, one.msgtype)]
+                # With no connection chosen, rosbags reads all of them.
+                for connection, received_ns, data in reader.messages(chosen) if chosen else ():
+                    yield connection.topic, connection.msgtype, int(received_ns), data
+                    count += 1
+        except InputError:
+            raise
+        except Exception as error:  # rosbags and what it is built on raise anything on bad bytes
+            raise self._not_whole(_one_line(error), f" after {count} messages") from None
+
+    def _topic(self, name: str, message_type: str) -> Topic | None:
+        """Return the requested topic of a channel, and note that it was found."""
+        if (name, message_type) in self._channels:
+            return self._channels[name, message_type]
+        topic = next(
+            (one for one in self._requested if one.matches(name) and one.type == message_type), None
+        )
+        self._channels[name, message_type] = topic
+        if topic is not None:
+            names = sorted({self.topics.setdefault(topic.key, name), name})
+            if len(names) > 1:
+                allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
+                raise refused(self.path, topic.key, ", ".join(names), allowed)
+        return topic
+
+    def _not_whole(self, reason: str, where: str = "", *, advice: bool = False) -> InputError:
+        allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
+        allowed += f"reading failed{where}: {reason}; "
+        allowed += "python -m sst_ros recover BAG makes a whole one of what is intact"
+        if advice:
+            allowed += ", --damaged reads it here"
+        return refused(self.path, "bag", self.path.name, allowed)
 
 
 @dataclass
@@ -60,89 +220,18 @@ class Damage:
     begin_ns: int = 0
     end_ns: int = 0
 
-    def add(self, index: MessageIndex) -> None:
-        """Count the messages that the index of a chunk lists for one channel."""
-        times = [time for time, _ in index.records]
-        if times:
-            self.begin_ns = min([self.begin_ns or times[0], *times])
-            self.end_ns = max([self.end_ns, *times])
-            self.messages += len(times)
-
     def describe(self, origin_ns: int) -> str:
         """Name offset, reason and time range, in seconds after `origin_ns`."""
         text = f"byte {self.offset}: {self.reason}"
-        if self.messages:
+        if self.end_ns:
             first, last = ((time - origin_ns) / 1e9 for time in (self.begin_ns, self.end_ns))
-            text += f" ({self.messages} messages, {first:.3f} s to {last:.3f} s)"
+            count = f"{self.messages} messages, " if self.messages else ""
+            text += f" ({count}{first:.3f} s to {last:.3f} s)"
         return text
 
 
-def frame(data: mmap.mmap | bytes, position: int, end: int) -> tuple[int, int]:
-    """Return opcode and end of the record at a position; the end is 0 where there is none."""
-    if position + RECORD.size > end:
-        return 0, 0
-    opcode, length = RECORD.unpack_from(data, position)
-    stop = position + RECORD.size + int(length)
-    return (opcode, stop) if opcode in _DATA_OPCODES and stop <= end else (opcode, 0)
-
-
-def records_of(chunk: Chunk) -> bytes:
-    """Return the records of a chunk, decompressed.
-
-    Raises:
-        ERRORS: they cannot be decompressed, or size or checksum are wrong.
-
-    """
-    records = _DECOMPRESS[chunk.compression](chunk.data)
-    if len(records) != chunk.uncompressed_size:
-        raise ValueError("chunk of wrong size")
-    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
-        raise ValueError("chunk with wrong checksum")
-    return records
-
-
-def next_chunk(data: mmap.mmap, position: int, end: int) -> int:
-    """Find the next chunk that is intact and not empty; 0 where there is none."""
-    while (position := data.find(bytes([Opcode.CHUNK]), position + 1, end)) > 0:
-        _, stop = frame(data, position, end)
-        if stop > position + _SMALLEST_CHUNK:
-            try:
-                if records_of(Chunk.read(stream(data[position + RECORD.size : stop]))):
-                    return position
-            except ERRORS:
-                continue
-    return 0
-
-
-def stream(content: bytes) -> ReadDataStream:
-    """Return content as a stream, which the records of `mcap` are read from."""
-    return ReadDataStream(BytesIO(content))
-
-
-def reason(error: Exception) -> str:
-    """Describe an error in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-MAGIC = b"\x89MCAP0\r\n"
-LIBRARY = "sst_ros"
-"""Name of the writer in files of ours, whose messages are numbered from 1 on in each channel."""
-
-_BODY = RECORD.size + MESSAGE.size
-_FOOTER_SIZE = RECORD.size + 20
-
-
-class McapMessage(NamedTuple):
-    """One message: topic, type, reception by the recorder [ns], serialized content."""
-
-    topic: str
-    type: str
-    received_ns: int
-    data: bytes
-
-
 class McapFile:
-    """Reads one file; the attributes are complete when `messages` is exhausted.
+    """Reads one MCAP file; the attributes are complete when `messages` is exhausted.
 
     Args:
         path: the file.
@@ -168,10 +257,6 @@ class McapFile:
         self.unverified = self.count = self.lost = 0
         self._schemas: dict[int, str] = {}
         self._origin_ns = 0
-        self._expected: int | None = None
-        self._numbered = False
-        self._sequence: dict[int, int] = {}
-        self._skipped = 0
 
     @property
     def intact(self) -> bool:
@@ -187,326 +272,147 @@ class McapFile:
             lines.append(f"{self.path.name}: {self.lost} messages are lost")
         return lines
 
-    def messages(self) -> Iterator[McapMessage]:
+    def messages(self) -> Iterator[RawMessage]:
         """Yield all messages that are intact, in the order of the file."""
-        if not self.path.stat().st_size:
+        with self.path.open("rb") as file:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
+            index, data_end = self._read_index(file)
+            for record in index:
+                self._describe_channel(record)
+            chunks = [one for one in index if isinstance(one, ChunkIndex)]
+            for records in self._read_at(file, chunks) if chunks else self._read_on(file):
+                for record in records:
+                    if not isinstance(record, Message):
+                        self._describe_channel(record)
+                    elif channel := self.channels.get(record.channel_id):
+                        self.count += 1
+                        yield *channel, record.log_time, record.data
+                    else:
+                        reason = f"channel {record.channel_id} is not described"
+                        self.damage.append(Damage(0, reason, 1))
+            if index and not self.damage:
+                self._check_data(file, data_end)
+        self.lost = sum(one.messages for one in self.damage)
+        for record in index:
+            if isinstance(record, Statistics):
+                self.lost = max(self.lost, record.message_count - self.count)
+
+    def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
+        """Return the records of the index and where it begins; none where it is not intact."""
+        footer_at = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
+        file.seek(max(footer_at, 0))
+        end = file.read()
+        if footer_at < len(MCAP0_MAGIC) or end[-len(MCAP0_MAGIC) :] != MCAP0_MAGIC:
             self.cut = True
-            return
-        with (
-            self.path.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        ):
-            end = self._read_summary(data)
-            yield from self._data_section(data, end)
-        by_index = sum(one.messages for one in self.damage)
-        by_statistics = 0 if self._expected is None else self._expected - self.count
-        self.lost = max(by_index, by_statistics, self._skipped)
-
-    def _data_section(self, data: mmap.mmap, end: int) -> Iterator[McapMessage]:
-        """Yield the messages between the magic bytes and `end`."""
-        position, checksum = len(MAGIC), zlib.crc32(MAGIC)
-        broken: Damage | None = None
-        if data[: len(MAGIC)] != MAGIC:
-            self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
-        while position < end:
-            opcode, stop = frame(data, position, end)
-            if not stop:
-                resumed = next_chunk(data, position, end)
-                if not resumed and self.cut:
-                    yield from self._cut_chunk(data, position)
-                    return
-                self.damage.append(Damage(position, "unreadable bytes"))
-                if not resumed:
-                    return
-                broken, position = self.damage[-1], resumed
-                continue
-            content = data[position + RECORD.size : stop]
-            if opcode == Opcode.DATA_END:
-                self._check_data_end(content, checksum, position)
-                return
-            checksum = zlib.crc32(data[position:stop], checksum)
-            try:
-                if opcode == Opcode.CHUNK:
-                    broken = None
-                    yield from self._records(self._verified(content))
-                elif opcode == Opcode.MESSAGE_INDEX:
-                    if broken:
-                        broken.add(MessageIndex.read(stream(content)))
-                else:
-                    yield from self._records(data[position:stop])
-            except ERRORS as error:
-                broken = Damage(position, reason(error))
-                self.damage.append(broken)
-            position = stop
-        if not self.cut:
-            self.damage.append(Damage(position, "the end of the data section is missing"))
-
-    def _verified(self, content: bytes) -> bytes:
-        """Return the records of a chunk; counts it if it has no checksum."""
-        chunk = Chunk.read(stream(content))
-        self._origin_ns = self._origin_ns or chunk.message_start_time
-        records = records_of(chunk)
-        self.unverified += not chunk.uncompressed_crc
-        return records
-
-    def _records(self, records: bytes) -> Iterator[McapMessage]:
-        """Yield the messages among records; schemas and channels are remembered."""
-        position, end = 0, len(records)
-        while position + RECORD.size <= end:
-            opcode, length = RECORD.unpack_from(records, position)
-            begin, stop = position, position + RECORD.size + length
-            position = stop
-            if stop > end:
-                raise ValueError("record longer than its chunk")
-            if opcode == Opcode.MESSAGE:
-                number, sequence, received_ns, _ = MESSAGE.unpack_from(records, begin + RECORD.size)
-                channel = self.channels.get(number)
-                self._follow(number, sequence)
-                if channel is None:
-                    self.damage.append(Damage(0, f"channel {number} is not described", 1))
-                    continue
-                self.count += 1
-                yield McapMessage(*channel, received_ns, records[begin + _BODY : stop])
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER):
-                self._describe(opcode, records[begin + RECORD.size : stop])
-
-    def _describe(self, opcode: int, content: bytes) -> None:
-        fields = stream(content)
-        if opcode == Opcode.HEADER:
-            self._numbered = Header.read(fields).library.startswith(LIBRARY)
-        elif opcode == Opcode.SCHEMA:
-            schema = Schema.read(fields)
-            self._schemas[schema.id] = schema.name
-        else:
-            channel = Channel.read(fields)
-            self.channels[channel.id] = (channel.topic, self._schemas.get(channel.schema_id, ""))
-
-    def _follow(self, number: int, sequence: int) -> None:
-        """Count the messages that are missing between those of one channel."""
-        if self._numbered:
-            self._skipped += max(0, sequence - self._sequence.get(number, 0) - 1)
-            self._sequence[number] = sequence
-
-    def _cut_chunk(self, data: mmap.mmap, position: int) -> Iterator[McapMessage]:
-        """Yield the whole messages of an uncompressed chunk that the file ends in."""
-        content = data[position : len(data)]
-        if len(content) > RECORD.size and content[0] == Opcode.CHUNK:
-            head = RECORD.size + 28
-            if len(content) >= head + 12 and content[head : head + 4] == bytes(4):
-                position += head + 12
-                content = content[head + 12 :]
-        end, complete = len(content), 0
-        while True:
-            opcode, stop = frame(content, complete, end)
-            if not stop or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-                break
-            complete = stop
+            return [], 0
         try:
-            yield from self._records(content[:complete])
-        except ERRORS as error:
-            self.damage.append(Damage(position, reason(error)))
-
-    def _check_data_end(self, content: bytes, checksum: int, position: int) -> None:
-        expected = int.from_bytes(content, "little")
-        if len(content) != 4 or (expected and expected != checksum and not self.damage):
-            self.damage.append(Damage(position, "data section with wrong checksum"))
-
-    def _read_summary(self, data: mmap.mmap) -> int:
-        """Read channels and statistics from the index; return where the data section may end."""
-        size = len(data)
-        footer_at = size - len(MAGIC) - _FOOTER_SIZE
-        if data[size - len(MAGIC) :] != MAGIC or footer_at < len(MAGIC):
-            self.cut = True
-            return size
-        try:
-            opcode, length = RECORD.unpack_from(data, footer_at)
-            footer = Footer.read(stream(data[footer_at + RECORD.size : size - len(MAGIC)]))
-            begin = footer.summary_start or footer_at
-            if (opcode, length) != (Opcode.FOOTER, 20) or not len(MAGIC) <= begin <= footer_at:
+            footer = next(StreamReader(io.BytesIO(end), skip_magic=True).records)
+            if not isinstance(footer, Footer) or footer.summary_start > footer_at:
                 raise ValueError("index with wrong position")
-            if footer.summary_crc and footer.summary_crc != zlib.crc32(data[begin : size - 12]):
+            begin = footer.summary_start or footer_at
+            file.seek(begin)
+            content = file.read()
+            if footer.summary_crc not in (0, zlib.crc32(content[: -4 - len(MCAP0_MAGIC)])):
                 raise ValueError("index with wrong checksum")
-            position = begin
-            while position < footer_at:
-                opcode, stop = frame(data, position, footer_at)
-                if not stop:
-                    raise ValueError("index with unreadable bytes")
-                content = data[position + RECORD.size : stop]
-                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._describe(opcode, content)
-                elif opcode == Opcode.STATISTICS:
-                    self._expected = Statistics.read(stream(content)).message_count
-                position = stop
-        except ERRORS as error:
-            self.damage.append(Damage(footer_at, reason(error)))
-            return size
-        return begin
+            index = list(StreamReader(io.BytesIO(content), skip_magic=True).records)
+            chunks = [one for one in index if isinstance(one, ChunkIndex)]
+            if any(one.chunk_start_offset + one.chunk_length > begin for one in chunks):
+                raise ValueError("index with wrong position")
+            return index, begin
+        except Exception as error:  # mcap raises anything on bad bytes
+            self.damage.append(Damage(footer_at, _one_line(error)))
+            return [], 0
 
+    def _read_at(
+        self, file: IO[bytes], chunks: Sequence[ChunkIndex]
+    ) -> Iterator[Sequence[McapRecord]]:
+        """Yield the records of each chunk, where the index says that it begins."""
+        for one in sorted(chunks, key=lambda one: one.chunk_start_offset):
+            # Each channel of the chunk has a message index: 15 bytes, and 16 for a message.
+            indexed = one.message_index_length - 15 * len(one.message_index_offsets)
+            times = one.message_start_time, one.message_end_time
+            file.seek(one.chunk_start_offset)
+            content = io.BytesIO(file.read(one.chunk_length))
+            records = StreamReader(content, skip_magic=True, emit_chunks=True).records
+            yield self._open(records, Damage(one.chunk_start_offset, "", indexed // 16, *times))
 
-class Topic(NamedTuple):
-    """A topic to look for.
-
-    Attributes:
-        key: short name.
-        ending: end of its full name, or the whole name where `anywhere` is False.
-        type: message type.
-        anywhere: any namespace and node name may precede the ending.
-
-    """
-
-    key: str
-    ending: str
-    type: str
-    anywhere: bool = True
-
-    def matches(self, name: str) -> bool:
-        """Return whether a full name is that of this topic."""
-        return name.endswith(self.ending) if self.anywhere else name == self.ending
-
-
-class Message(NamedTuple):
-    """One message: the key of its topic, reception by the recorder [ns], content."""
-
-    key: str
-    received_ns: int
-    content: Any
-
-
-class Bag:
-    """A recording: MCAP or sqlite3, a folder or a single file.
-
-    Args:
-        path: of the recording.
-        wanted: topics to read; all others are skipped.
-        damaged: read what is intact of a damaged recording instead of refusing it.
-
-    Attributes:
-        topics: full names of the topics found, by key; complete when `messages` is exhausted.
-        damage: what is damaged or lost, a line for each part.
-        unverified: number of chunks without a checksum.
-
-    Raises:
-        InputError: there is no recording at the path.
-
-    """
-
-    def __init__(self, path: Path, wanted: Sequence[Topic], *, damaged: bool = False) -> None:
-        if not path.exists():
-            raise refused(path, "bag", str(path), "does not exist")
-        self.path = path
-        self.topics: dict[str, str] = {}
-        self.damage: tuple[str, ...] = ()
-        self.unverified = 0
-        self._wanted, self._damaged = wanted, damaged
-        self._store = message_types()
-        self._channels: dict[tuple[str, str], Topic | None] = {}
-
-    def messages(self) -> Iterator[Message]:
-        """Yield the messages of the wanted topics, deserialized, in the order of the file.
-
-        Raises:
-            InputError: the recording is damaged, which is known at the end at the latest; it is
-                empty; or two topics match one that is wanted.
-
-        """
-        count = 0
-        files = self._mcap_files()
-        source = self._read_mcap(files) if files else self._read_by_rosbags()
-        for name, message_type, received_ns, data in source:
-            count += 1
-            topic = self._topic(name, message_type)
-            if topic is None:
-                continue
+    def _read_on(self, file: IO[bytes]) -> Iterator[Sequence[McapRecord]]:
+        """Yield the records from the beginning to where they end, or to what is no record."""
+        file.seek(len(MCAP0_MAGIC))
+        records = StreamReader(file, skip_magic=True, emit_chunks=True).records
+        broken: Damage | None = None
+        while True:
+            offset = file.tell()
             try:
-                content = self._store.deserialize_cdr(data, message_type)
-            except Exception as error:  # rosbags raises anything on bad bytes
-                raise self._not_whole(error, f" in {topic.key}") from None
-            yield Message(topic.key, received_ns, content)
-        if not count:
-            raise refused(self.path, "messages", 0, "the recording is empty")
+                record = next(records)
+            except Exception:  # mcap raises anything on bad bytes
+                break
+            if isinstance(record, DataEnd):
+                return
+            if isinstance(record, Chunk):
+                times = record.message_start_time, record.message_end_time
+                broken = Damage(offset, "", 0, *times)
+                yield self._open(iter([record]), broken)
+            elif isinstance(record, MessageIndex):
+                if broken is not None and broken.reason:
+                    broken.messages += len(record.records)
+            else:
+                yield [record]
+        if self.cut:
+            yield from self._read_cut_chunk(file, offset)
+        else:
+            self.damage.append(Damage(offset, "unreadable bytes"))
 
-    def absence(self, topic: Topic) -> Problem:
-        """Describe that a topic is missing."""
-        others = [f"{name} ({kind})" for name, kind in self._channels if topic.matches(name)]
-        allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
-        return Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
-
-    def _read_mcap(self, paths: Sequence[Path]) -> Iterator[McapMessage]:
-        files = [McapFile(path) for path in paths]
-        for file in files:
-            try:
-                yield from file.messages()
-            except OSError as error:
-                raise self._not_whole(error) from None
-            for channel in file.channels.values():
-                self._topic(*channel)
-            if not file.intact and not self._damaged:
-                raise self._not_whole("; ".join(file.describe()), advice=True)
-        self.damage = tuple(line for file in files for line in file.describe())
-        self.unverified = sum(file.unverified for file in files)
-
-    def _read_by_rosbags(self) -> Iterator[McapMessage]:
-        """Read sqlite3, and what rosbag2 has compressed by file or by message."""
-        count = 0
+    def _open(self, records: Iterator[McapRecord], place: Damage) -> Sequence[McapRecord]:
+        """Return the records in a chunk that comes next; none, and note it, if it is damaged."""
+        self._origin_ns = self._origin_ns or place.begin_ns
         try:
-            with Reader(self.path) as reader:
-                for connection in reader.connections:
-                    self._topic(connection.topic, connection.msgtype)
-                wanted = [
-                    connection
-                    for connection in reader.connections
-                    if self._topic(connection.topic, connection.msgtype)
-                ]
-                # With no connection chosen, rosbags reads all of them.
-                for connection, received_ns, data in reader.messages(wanted) if wanted else ():
-                    yield McapMessage(connection.topic, connection.msgtype, int(received_ns), data)
-                    count += 1
-        except InputError:
-            raise
-        except Exception as error:  # rosbags and what it is built on raise anything on bad bytes
-            raise self._not_whole(error, f" after {count} messages") from None
+            chunk = next(records)
+            if not isinstance(chunk, Chunk):
+                raise ValueError("no chunk where the index has one")
+            found = breakup_chunk(chunk, validate_crc=True)
+        except CRCValidationError:
+            place.reason = "chunk with wrong checksum"
+        except Exception as error:  # mcap raises anything on bad bytes
+            place.reason = _one_line(error)
+        else:
+            self.unverified += not chunk.uncompressed_crc
+            return found
+        self.damage.append(place)
+        return ()
 
-    def _mcap_files(self) -> list[Path]:
-        """Files that are read as they are; none where rosbags reads them."""
-        if not self.path.is_dir():
-            return [self.path] if self.path.suffix == ".mcap" else []
+    def _read_cut_chunk(self, file: IO[bytes], offset: int) -> Iterator[Sequence[McapRecord]]:
+        """Yield the whole records of an uncompressed chunk that the file ends in."""
+        file.seek(offset)
+        with contextlib.suppress(Exception):  # the file ends anywhere
+            if file.read(_RECORD_HEAD)[0] != Opcode.CHUNK:
+                return
+            chunk = Chunk.read(ReadDataStream(file))
+            if not chunk.compression and len(chunk.data) < chunk.uncompressed_size:
+                for record in StreamReader(io.BytesIO(chunk.data), skip_magic=True).records:
+                    yield [record]
+
+    def _describe_channel(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            self.channels[record.id] = (record.topic, self._schemas.get(record.schema_id, ""))
+
+    def _check_data(self, file: IO[bytes], end: int) -> None:
+        """Check the data section, which ends at `end`: also what lies between its chunks."""
+        begin, checksum = end - _DATA_END_SIZE, 0
+        file.seek(0)
+        for _ in range(0, begin, _PIECE):
+            checksum = zlib.crc32(file.read(min(_PIECE, begin - file.tell())), checksum)
         try:
-            text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
-            found = yaml.safe_load(text)["rosbag2_bagfile_information"]
-            names = [PurePath(name).name for name in found["relative_file_paths"]]
-            plain = not found["compression_mode"] and all(name.endswith(".mcap") for name in names)
-            files = [self.path / name for name in names] if plain else []
-        except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
-            files = []
-        if self._damaged and not all(map(Path.exists, files or [self.path / "metadata.yaml"])):
-            files = sorted(self.path.glob("*.mcap"))
-        return files
-
-    def _topic(self, name: str, message_type: str) -> Topic | None:
-        """Return the wanted topic of a channel, and note that it was found."""
-        if (name, message_type) in self._channels:
-            return self._channels[name, message_type]
-        topic = next(
-            (one for one in self._wanted if one.matches(name) and one.type == message_type), None
-        )
-        self._channels[name, message_type] = topic
-        if topic is not None:
-            names = sorted({self.topics.setdefault(topic.key, name), name})
-            if len(names) > 1:
-                allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
-                raise refused(self.path, topic.key, ", ".join(names), allowed)
-        return topic
-
-    def _not_whole(
-        self, reason: Exception | str, where: str = "", *, advice: bool = False
-    ) -> InputError:
-        text = " ".join(str(reason).split()) or type(reason).__name__
-        allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
-        allowed += f"reading failed{where}: {text}; "
-        allowed += "python -m sst_ros recover BAG makes a whole one of what is intact"
-        if advice:
-            allowed += ", --damaged reads it here"
-        return refused(self.path, "bag", self.path.name, allowed)
+            record = next(StreamReader(file, skip_magic=True).records)
+        except Exception:  # mcap raises anything on bad bytes
+            record = None
+        if not isinstance(record, DataEnd) or file.tell() != end:
+            self.damage.append(Damage(begin, "the end of the data section is missing"))
+        elif record.data_section_crc not in (0, checksum):
+            self.damage.append(Damage(begin, "data section with wrong checksum"))
 
 
 @cache
@@ -518,3 +424,7 @@ def message_types() -> Any:
 def refused(path: Path, key: str, value: object, allowed: str) -> InputError:
     """Make the error about one fault of a recording."""
     return InputError(str(path), [Problem(key, value, allowed)])
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 recording in MCAP, with checksums, chunk by chunk."""
+"""Writes a rosbag2 recording in MCAP, with checksums, chunk by chunk, or a damaged one anew."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mcap.writer import CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Connection, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.enums import CompressionMode
 
 from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.recording.bag_reader import LIBRARY, MAGIC, McapFile, message_types
+from sst_ros.recording.bag_reader import McapFile, message_types, refused
 
 VERSION: Final = 9
 FLUSH_PERIOD_S = 1.0
@@ -42,7 +42,7 @@ class _McapStorage:
             compression=CompressionType.NONE,
             enable_data_crcs=True,
         )
-        self._writer.start("ros2", LIBRARY)
+        self._writer.start("ros2", "sst_ros")
         self._schemas: dict[str, int] = {}
         self._channels: dict[int, int] = {}
         self._sequence: Counter[int] = Counter()
@@ -57,10 +57,11 @@ class _McapStorage:
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Add a topic."""
+        offered = {"offered_qos_profiles": offered_qos_profiles}
+        schema = self._schemas[connection.msgtype]
         self._channels[connection.id] = self._writer.register_channel(
-            connection.topic, "cdr", self._schemas[connection.msgtype],
-            {"offered_qos_profiles": offered_qos_profiles},
-        )  # fmt: skip
+            connection.topic, "cdr", schema, offered
+        )
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         """Add a message."""
@@ -209,18 +210,18 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:
-        raise _refused(path, len(files), "must hold one .mcap file")
+        raise refused(path, "bag", len(files), "must hold one .mcap file")
     try:
         with files[0].open("rb") as opened:
-            begin = opened.read(len(MAGIC))
+            begin = opened.read(len(MCAP0_MAGIC))
     except OSError as problem:
-        raise _refused(path, str(files[0]), f"must be readable ({problem})") from None
-    if sum(one != right for one, right in zip(begin, MAGIC, strict=False)) > 1 or not begin:
-        raise _refused(path, files[0].name, "must be an MCAP file")
+        raise refused(path, "bag", str(files[0]), f"must be readable ({problem})") from None
+    if sum(one != right for one, right in zip(begin, MCAP0_MAGIC, strict=False)) > 1 or not begin:
+        raise refused(path, "bag", files[0].name, "must be an MCAP file")
     file = McapFile(files[0])
     target = out or path.with_name(f"{path.stem}_recovered")
     if target.exists():
-        raise _refused(target, str(target), "must be a new folder")
+        raise refused(target, "bag", str(target), "must be a new folder")
     writer: BagWriter | None = None
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
@@ -233,14 +234,10 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             connections[topic, kind] = writer.connect(topic, kind)
         writer.write(connections[topic, kind], received_ns, data)
     if writer is None:
-        raise _refused(path, 0, "holds no message that was saved")
+        raise refused(path, "bag", 0, "holds no message that was saved")
     try:
         writer.close()
     except WriterError as problem:
-        raise _refused(target, str(target), f"cannot be written ({problem})") from None
+        raise refused(target, "bag", str(target), f"cannot be written ({problem})") from None
     damage = [*file.describe(), *([f"{unknown} messages of unknown types"] if unknown else [])]
     return Recovered(target, writer.messages, file.lost + unknown, file.cut, tuple(damage))
-
-
-def _refused(path: Path, value: object, allowed: str) -> InputError:
-    return InputError(str(path), [Problem("bag", value, allowed)])

@@ -16,20 +16,17 @@ from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import signals
 from sst_ros.recording.bag_reader import refused
 from sst_ros.recording.export import table_of
-from sst_ros.recording.signals import Integers, Series, Signals, aligned, places, usual
+from sst_ros.recording.signals import Integers, Series, Signals, places
 from sst_ros.recording.topic_tables import (
-    ACTUATED,
     COMMANDS,
     DIAGNOSTICS,
     EULER,
     JOINT_STATES,
-    JOINTS,
-    KINDS,
-    MOMENTS,
     ORIENTATION,
     SCENE,
     STAMPED_COMMANDS,
     TICKS,
+    TopicTable,
 )
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque import TorqueTable
@@ -38,6 +35,11 @@ from sst_ros.state import NANOSECONDS
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+ESSENTIAL = (JOINT_STATES.topic.key, ORIENTATION.topic.key, TICKS.topic.key, SCENE.key)
+"""Topics without which a recording is not that of a run."""
+OPTIONAL = (EULER.topic.key, DIAGNOSTICS.key, COMMANDS.topic.key)
 
 
 @dataclass(frozen=True)
@@ -76,62 +78,12 @@ class Ticks:
     @property
     def period_ns(self) -> int:
         """The usual length of a tick [ns]."""
-        return usual(self.end_ns - self.start_ns)
+        return _usual(self.end_ns - self.start_ns)
 
     @property
     def gaps(self) -> int:
         """How often a tick does not begin where the one before ended."""
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
-
-
-def finite(found: Signals, key: str, width: int) -> Series:
-    """Return the rows of a topic, none where it was not recorded; moments of ticks may be nan."""
-    if key not in found.topic_series:
-        empty = np.empty(0, dtype=np.int64)
-        return Series((), empty, empty, np.empty((0, width)))
-    series = found.topic_series[key]
-    bad = ~np.isfinite(series.values[:, : 4 if key == TICKS.topic.key else None]).all(axis=1)
-    if bad.any():
-        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refused(found.path, key, row, f"is not finite at stamp {stamp} ns")
-    return series
-
-
-def ticks_of(path: Path, series: Series, start_ns: int) -> Ticks:
-    """Return the ticks of a run that starts at `start_ns`; they must not overlap."""
-    starts = series.stamp_ns
-    ends = starts + series.values[:, 0].astype(np.int64)
-    overlap = starts[1:] < ends[:-1]
-    if overlap.any():
-        at = int(starts[1:][overlap][0])
-        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refused(path, "applied_torques", at, allowed)
-    moment = series.values[:, 4:]
-    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-    return Ticks(
-        starts - start_ns, ends - start_ns, series.values[:, 1:4], moment if known else None
-    )
-
-
-def commands_of(found: Signals) -> Commands:
-    """Put the commands of both topics in order of their reception."""
-    keys = (COMMANDS.topic.key, STAMPED_COMMANDS.topic.key)
-    parts = [found.topic_series[key] for key in keys if key in found.topic_series]
-    if not parts:
-        none = np.empty(0, dtype=np.int64)
-        return Commands(none, none, np.empty((0, 3)))
-    received = np.concatenate([part.received_ns for part in parts])
-    stamps = np.concatenate([part.stamp_ns for part in parts])
-    torque = np.concatenate([part.values for part in parts])
-    order = np.argsort(received, kind="stable")
-    return Commands(received[order], stamps[order], torque[order])
-
-
-__all__ = ["ACTUATED", "JOINTS", "KINDS", "MOMENTS", "Commands", "Recording", "Ticks", "read"]
-
-ESSENTIAL = (JOINT_STATES.topic.key, ORIENTATION.topic.key, TICKS.topic.key, SCENE.key)
-"""Topics without which a recording is not that of a run."""
-OPTIONAL = (EULER.topic.key, DIAGNOSTICS.key, COMMANDS.topic.key)
 
 
 @dataclass(frozen=True)
@@ -184,7 +136,7 @@ class Recording:
     def period_ns(self) -> int:
         """The usual time between two samples [ns]; the last one may come early."""
         spacing = np.diff(self.time_ns)
-        return usual(spacing[:-1] if len(spacing) > 1 else spacing)
+        return _usual(spacing[:-1] if len(spacing) > 1 else spacing)
 
     @cached_property
     def effort_difference(self) -> Array:
@@ -225,18 +177,20 @@ class Recording:
         except ValueError:
             error_estimate = np.nan
         fault = reported.get("fault", "")
+        ticks = self.ticks
         return Trajectory(
-            self.scene, self.seconds[known], self.quaternion[known], body_rate[known],
+            self.scene,
+            self.seconds[known],
+            self.quaternion[known],
+            body_rate[known],
             self.effort[known],
             joints=joints[known],
             status=1 if fault else 0,
             message=fault or reported.get("phase", "recorded"),
             method=reported.get("integrator", ""),
             error_estimate=error_estimate,
-            law=None if self.ticks.gaps else TorqueTable(
-                self.ticks.start_ns / NANOSECONDS, self.ticks.torque
-            ),
-        )  # fmt: skip
+            law=None if ticks.gaps else TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque),
+        )
 
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas: samples, ticks, commands, commands_stamped, external_moment.
@@ -260,17 +214,8 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
         InputError: it is no recording of a run, or a damaged one; the error names the fault.
 
     """
-    return of(signals.read(Path(path), damaged=damaged))
-
-
-def of(found: Signals) -> Recording:
-    """Make arrays of a whole run from the columns of a recording.
-
-    Raises:
-        InputError: a topic is missing, or its numbers are not those of a run.
-
-    """
-    path = found.path
+    path = Path(path)
+    found = signals.read(path, damaged=damaged)
     absent = [found.absent[key] for key in ESSENTIAL if key in found.absent]
     if absent:
         raise InputError(str(path), absent)
@@ -282,24 +227,23 @@ def of(found: Signals) -> Recording:
         if one.name.endswith("run") and "phase" in one.values
     )
     joints, orientation, euler, ticks = (
-        finite(found, source.topic.key, len(source.columns))
-        for source in (JOINT_STATES, ORIENTATION, EULER, TICKS)
+        _finite_rows(found, table) for table in (JOINT_STATES, ORIENTATION, EULER, TICKS)
     )
-    if len(joints.stamp_ns) < 2:
+    stamps = joints.stamp_ns
+    if len(stamps) < 2:
         allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
         if reports and (fault := reports[-1][1].get("fault")):
             allowed += f"; the simulator reports: {fault}"
-        raise refused(path, "joint_states", len(joints.stamp_ns), allowed)
+        raise refused(path, "joint_states", len(stamps), allowed)
     if not len(ticks.stamp_ns):
         raise refused(path, "applied_torques", 0, "the run has no recorded torque")
-    stamps = joints.stamp_ns
     start_ns = min(int(stamps[0]), int(ticks.stamp_ns[0]))
-    quaternion = aligned(stamps, orientation.stamp_ns, orientation.values)
+    quaternion = _rows_at(stamps, orientation)
     with np.errstate(over="ignore"):  # too long is refused just below
         length = np.sqrt(np.einsum("ij,ij->i", quaternion, quaternion))
     if np.any(np.abs(length - 1.0) > 1e-6):  # nan compares False: lost is not wrong
-        worst = float(length[np.abs(length - 1.0) > 1e-6][0])
-        raise refused(path, "orientation", worst, "quaternions must have length 1")
+        wrong = float(length[np.abs(length - 1.0) > 1e-6][0])
+        raise refused(path, "orientation", wrong, "quaternions must have length 1")
     gamma, mu, beta, gamma_dot, mu_dot, beta_dot, effort = np.split(joints.values, 7, axis=1)
     return Recording(
         path=path,
@@ -315,11 +259,69 @@ def of(found: Signals) -> Recording:
         beta_dot=beta_dot,
         effort=effort,
         quaternion=quaternion,
-        euler=aligned(stamps, euler.stamp_ns, euler.values),
-        ticks=ticks_of(path, ticks, start_ns),
+        euler=_rows_at(stamps, euler),
+        ticks=_ticks(path, ticks, start_ns),
         idle_states=found.idle_states,
-        commands=commands_of(found),
+        commands=_commands(found),
         reports=reports,
         missing=tuple(key for key in OPTIONAL if key in found.absent),
         signals=found,
     )
+
+
+def _finite_rows(found: Signals, table: TopicTable) -> Series:
+    """Return the rows of a topic, none where it was not recorded; moments of ticks may be nan."""
+    key = table.topic.key
+    if key not in found.topic_series:
+        none = np.empty(0, dtype=np.int64)
+        return Series((), none, none, np.empty((0, len(table.columns))))
+    series = found.topic_series[key]
+    bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
+    if bad.any():
+        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
+        raise refused(found.path, key, row, f"is not finite at stamp {stamp} ns")
+    return series
+
+
+def _rows_at(stamps_ns: Integers, series: Series) -> Array:
+    """Pick the rows at the stamps; nan where there is none."""
+    if np.array_equal(stamps_ns, series.stamp_ns):
+        return series.values
+    result = np.full((len(stamps_ns), series.values.shape[1]), np.nan)
+    there = places(series.stamp_ns, stamps_ns)
+    result[there >= 0] = series.values[there[there >= 0]]
+    return result
+
+
+def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
+    """Return the ticks of a run that starts at `start_ns`; they must not overlap."""
+    starts = series.stamp_ns
+    ends = starts + series.values[:, 0].astype(np.int64)
+    overlap = starts[1:] < ends[:-1]
+    if overlap.any():
+        at = int(starts[1:][overlap][0])
+        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
+        raise refused(path, "applied_torques", at, allowed)
+    torque, moment = series.values[:, 1:4], series.values[:, 4:]
+    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+    return Ticks(starts - start_ns, ends - start_ns, torque, moment if known else None)
+
+
+def _commands(found: Signals) -> Commands:
+    """Put the commands of both topics in order of their reception."""
+    keys = (COMMANDS.topic.key, STAMPED_COMMANDS.topic.key)
+    parts = [found.topic_series[key] for key in keys if key in found.topic_series]
+    if not parts:
+        none = np.empty(0, dtype=np.int64)
+        return Commands(none, none, np.empty((0, 3)))
+    received = np.concatenate([part.received_ns for part in parts])
+    stamps = np.concatenate([part.stamp_ns for part in parts])
+    torque = np.concatenate([part.values for part in parts])
+    order = np.argsort(received, kind="stable")
+    return Commands(received[order], stamps[order], torque[order])
+
+
+def _usual(lengths_ns: Integers) -> int:
+    """Return the most frequent length, the shortest where several are."""
+    values, counts = np.unique(lengths_ns, return_counts=True)
+    return int(values[np.argmax(counts)])

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording.bag_reader import Bag, Message, refused
+from sst_ros.recording.bag_reader import Bag, refused
 from sst_ros.recording.topic_tables import (
     DIAGNOSTICS,
     EULER,
@@ -58,28 +58,12 @@ class Series:
     values: Array
 
 
-def aligned(wanted_ns: Integers, stamps_ns: Integers, rows: Array) -> Array:
-    """Pick the rows at the wanted stamps; nan where there is none."""
-    if np.array_equal(wanted_ns, stamps_ns):
-        return rows
-    result = np.full((len(wanted_ns), rows.shape[1]), np.nan)
-    there = places(stamps_ns, wanted_ns)
-    result[there >= 0] = rows[there[there >= 0]]
-    return result
-
-
-def places(among_ns: Integers, wanted_ns: Integers) -> Integers:
-    """Find where each wanted time stands among ascending ones; -1 where it does not."""
+def places(among_ns: Integers, times_ns: Integers) -> Integers:
+    """Find where each time stands among ascending ones; -1 where it does not."""
     if not len(among_ns):
-        return np.full(len(wanted_ns), -1)
-    at = np.minimum(np.searchsorted(among_ns, wanted_ns), len(among_ns) - 1)
-    return np.where(among_ns[at] == wanted_ns, at, -1)
-
-
-def usual(lengths_ns: Integers) -> int:
-    """Return the most frequent length, the shortest where several are."""
-    values, counts = np.unique(lengths_ns, return_counts=True)
-    return int(values[np.argmax(counts)])
+        return np.full(len(times_ns), -1)
+    at = np.minimum(np.searchsorted(among_ns, times_ns), len(among_ns) - 1)
+    return np.where(among_ns[at] == times_ns, at, -1)
 
 
 @dataclass(frozen=True)
@@ -124,17 +108,17 @@ class Signals:
     def tables(self) -> dict[str, Series]:
         """Rows by the names of `TABLES`; only what was recorded."""
         result = {}
-        for name, sources in TABLES.items():
-            keys = [source.topic.key for source in sources]
+        for name, tables in TABLES.items():
+            keys = [table.topic.key for table in tables]
             parts = [self.topic_series[key] for key in keys if key in self.topic_series]
             if parts:
-                result[name] = _side_by_side(parts) if len(parts) > 1 else parts[0]
+                result[name] = _join(parts) if len(parts) > 1 else parts[0]
         return result
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
         """Keys of the topics that are not in the recording, or without a row of the run."""
-        keys = [source.topic.key for source in TOPIC_TABLES]
+        keys = [table.topic.key for table in TOPIC_TABLES]
         found = [*self.topic_series, *([SCENE.key] if self.scene else [])]
         return tuple(key for key in (*keys, SCENE.key) if key not in found)
 
@@ -181,36 +165,43 @@ def read(path: Path, *, damaged: bool = False) -> Signals:
         InputError: there is no recording, it is damaged, or it has nothing of a run.
 
     """
-    wanted = [*(source.topic for source in TOPIC_TABLES), SCENE, DIAGNOSTICS]
-    bag = Bag(path, wanted, damaged=damaged)
-    collected = {source.topic.key: _Rows(source) for source in TOPIC_TABLES}
+    requested = [*(table.topic for table in TOPIC_TABLES), SCENE, DIAGNOSTICS]
+    bag = Bag(path, requested, damaged=damaged)
+    collected = {table.topic.key: _Rows(table) for table in TOPIC_TABLES}
     scenes: set[str] = set()
     statuses: list[Status] = []
-    for message in bag.messages():
-        if message.key == SCENE.key:
-            scenes.add(message.content.data)
-        elif message.key == DIAGNOSTICS.key:
-            statuses += _statuses(message)
+    for key, received_ns, content in bag.messages():
+        if key == SCENE.key:
+            scenes.add(content.data)
+        elif key == DIAGNOSTICS.key:
+            for status in content.status:
+                values = {pair.key: pair.value for pair in status.values}
+                statuses.append(Status(received_ns, status.name, values))
         else:
             try:
-                collected[message.key].add(message)
+                collected[key].add(received_ns, content)
             except InvalidMessage as error:
-                raise refused(path, message.key, error.value, str(error)) from None
+                raise refused(path, key, error.value, str(error)) from None
     idle = collected[JOINT_STATES.topic.key].skipped
     series = {key: collected.pop(key).series(path) for key in list(collected)}
     found = {key: one for key, one in series.items() if len(one.stamp_ns)}
     if not found:
-        allowed = "must have at least one of " + ", ".join(s.topic.ending for s in TOPIC_TABLES)
+        allowed = "must have at least one of " + ", ".join(t.topic.ending for t in TOPIC_TABLES)
         raise refused(path, "topics", None, allowed)
+    if len(scenes) > 1:
+        raise refused(path, "scene", len(scenes), "the recording must hold one scene")
+    stamped = [table.topic.key for table in (*TABLES["samples"], TICKS)]
+    starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
+    origin = f"{path}: {bag.topics.get(SCENE.key)}"
     return Signals(
         path=path,
-        scene=_scene(path, scenes, bag.topics.get(SCENE.key, "scene")),
-        start_ns=_start(found),
+        scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
+        start_ns=min(starts or [int(series.received_ns[0]) for series in found.values()]),
         topic_series=found,
         idle_states=idle,
         statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
         topics=bag.topics,
-        absent={one.key: bag.absence(one) for one in wanted if one.key not in bag.topics},
+        absent={one.key: bag.absence(one) for one in requested if one.key not in bag.topics},
         damage=bag.damage,
         unverified=bag.unverified,
     )
@@ -219,51 +210,45 @@ def read(path: Path, *, damaged: bool = False) -> Signals:
 class _Rows:
     """The rows of one topic, kept compact: an hour at 500 Hz has 1.8 million of them."""
 
-    def __init__(self, source: TopicTable) -> None:
-        self._source = source
+    def __init__(self, table: TopicTable) -> None:
+        self._table = table
         self._stamps, self._received, self._values = array("q"), array("q"), array("d")
         self.skipped = 0
 
-    def add(self, message: Message) -> None:
-        rows = self._source.rows(message.content)
+    def add(self, received_ns: int, content: Any) -> None:
+        rows = self._table.rows(content)
         self.skipped += not rows
         for stamp, values in rows:
             self._stamps.append(stamp)
-            self._received.append(message.received_ns)
+            self._received.append(received_ns)
             self._values.extend(values)
 
     def series(self, path: Path) -> Series:
-        columns = self._source.columns
+        """Return the rows in order of time, one at each stamp."""
+        columns = self._table.columns
         stamps = np.frombuffer(self._stamps, dtype=np.int64)
         received = np.frombuffer(self._received, dtype=np.int64)
         values = np.frombuffer(self._values, dtype=float).reshape(len(stamps), len(columns))
-        key = stamps if self._source.stamped else received
+        key = stamps if self._table.stamped else received
         if np.any(key[1:] < key[:-1]):
             order = np.argsort(key, kind="stable")
             stamps, received, values = stamps[order], received[order], values[order]
-        if self._source.stamped:
+        if self._table.stamped:
             again = np.flatnonzero(stamps[1:] == stamps[:-1])
-            if self._source in (ORIENTATION, EULER):  # an idle state shows the last sample again
+            if self._table in (ORIENTATION, EULER):  # an idle state shows the last sample again
                 again = again[~(values[again] == values[again + 1]).all(axis=1)]
             if len(again):
                 allowed = f"stamp {stamps[again[0]]} ns comes twice; record one simulator a bag"
-                raise refused(path, self._source.topic.key, len(again), allowed)
+                raise refused(path, self._table.topic.key, len(again), allowed)
             stays = np.append(True, stamps[1:] != stamps[:-1])[: len(stamps)]
             if not stays.all():
                 stamps, received, values = stamps[stays], received[stays], values[stays]
-        if self._source is TICKS and np.isnan(values[:, -3:]).all():
+        if self._table is TICKS and np.isnan(values[:, -3:]).all():
             columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
         return Series(columns, stamps, received, values)
 
 
-def _statuses(message: Message) -> list[Status]:
-    return [
-        Status(message.received_ns, one.name, {pair.key: pair.value for pair in one.values})
-        for one in message.content.status
-    ]
-
-
-def _side_by_side(parts: Sequence[Series]) -> Series:
+def _join(parts: Sequence[Series]) -> Series:
     """Put topics side by side at all stamps that any of them has."""
     stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
     received = np.zeros(len(stamps), dtype=np.int64)
@@ -276,15 +261,3 @@ def _side_by_side(parts: Sequence[Series]) -> Series:
         received[at] = np.where(received[at] > 0, received[at], part.received_ns)
     columns = tuple(column for part in parts for column in part.columns)
     return Series(columns, stamps, received, np.concatenate(values, axis=1))
-
-
-def _start(found: dict[str, Series]) -> int:
-    stamped = [source.topic.key for source in (*TABLES["samples"], TICKS)]
-    firsts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
-    return min(firsts or [int(series.received_ns[0]) for series in found.values()])
-
-
-def _scene(path: Path, texts: set[str], topic: str) -> Scene | None:
-    if len(texts) > 1:
-        raise refused(path, "scene", len(texts), "the recording must hold one scene")
-    return yaml_document.read(Scene, texts.pop(), f"{path}: {topic}") if texts else None

@@ -2,14 +2,16 @@
 """Damaged and cut recordings: no silent difference, no traceback, losses counted."""
 
 import random
+import struct
 
 import numpy as np
 import pytest
+from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
 
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
-from sst_ros.recording.bag_reader import MAGIC, McapFile
+from sst_ros.recording.bag_reader import McapFile
 from sst_ros.recording.bag_writer import recover
 from sst_ros.recording.export import export
 from sst_ros.scene import scene
@@ -86,7 +88,7 @@ def check_cuts(whole, folder, count, seed):
     content, messages = content_of(whole), messages_of(whole)
     generator = random.Random(seed)
     for number in range(count):
-        size = generator.randrange(len(MAGIC), len(content))
+        size = generator.randrange(len(MCAP0_MAGIC), len(content))
         bag = damaged_copy(folder / str(number), whole, content[:size])
         with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
             recording.read(bag)
@@ -102,6 +104,27 @@ def check_cuts(whole, folder, count, seed):
 
 def test_a_changed_byte_is_never_silent(whole, tmp_path):
     assert check_flips(whole, tmp_path, 100, seed=1) >= 99
+
+
+def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, tmp_path):
+    """In the first bytes of every record: its kind, its length and what else it is known by."""
+    content, generator = content_of(whole), random.Random(5)
+    heads, position = [0], len(MCAP0_MAGIC)
+    while position < len(content) - len(MCAP0_MAGIC):
+        heads.append(position)
+        position += 9 + struct.unpack_from("<Q", content, position + 1)[0]
+    assert len(heads) > 40 and position == len(content) - len(MCAP0_MAGIC)
+    path = tmp_path / "bag.mcap"
+    expected = list(McapFile(next(whole.glob("*.mcap"))).messages())
+    for at in [head + generator.randrange(24) for head in heads for _ in range(4)]:
+        changed = bytearray(content)
+        changed[min(at, len(content) - 1)] ^= 1 << generator.randrange(8)
+        path.write_bytes(changed)
+        file = McapFile(path)
+        kept = list(file.messages())
+        assert not file.intact and file.describe(), f"byte {at}: a silent difference"
+        assert set(kept) <= set(expected), f"byte {at}: an invented message"
+        assert len(expected) - len(kept) == file.lost <= CHUNK, f"byte {at}: losses not counted"
 
 
 def test_a_cut_recording_keeps_what_lies_before_the_cut(whole, tmp_path):

@@ -6,6 +6,7 @@ import signal
 
 import numpy as np
 import pytest
+from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
 from std_msgs.msg import Float64MultiArray
 
@@ -92,7 +93,7 @@ def test_every_cut_gives_what_lies_before_it(nodes, observer, tmp_path):
 
 def test_what_cannot_be_recovered_is_refused(tmp_path):
     (tmp_path / "noise.mcap").write_bytes(b"no bag at all")
-    (tmp_path / "empty.mcap").write_bytes(bag_writer.MAGIC)
+    (tmp_path / "empty.mcap").write_bytes(MCAP0_MAGIC)
     (tmp_path / "folder").mkdir()
     for name, said in (
         ("noise.mcap", "must be an MCAP file"),
