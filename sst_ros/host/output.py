@@ -18,7 +18,7 @@ _PARTS = 50
 
 
 def results_folder(bag: Path, kind: str) -> Path:
-    """Return the default folder of the results of a recording, beside it: `BAG_kind`."""
+    """Return the default folder of the results of a recording, beside it: BAG_kind."""
     path = bag.resolve() if bag.name in ("", "..") else bag
     name = path.stem if path.suffix in _BAG_SUFFIXES else path.name
     return path.with_name(f"{name}_{kind}")

@@ -127,7 +127,7 @@ def _is_body(body: Any, reach: float) -> Mask:
     mass = body.mass
     valid: Mask = np.asarray((x * x + y * y + z * z <= reach * reach) | np.equal(mass, 0.0))
     if body.inertia is None:
-        # A point mass is what `_mass_problems` refuses; without mass there is nothing to check.
+        # A point with mass is refused in the scene, too; without mass there is nothing to check.
         return np.asarray(valid & np.equal(mass, 0.0))
     xx, yy, zz, xy, xz, yz = _tensor(body.inertia)
     about_o = _is_inertia((xx, yy, zz, xy, xz, yz))

@@ -100,7 +100,7 @@ class BagWriter:
     """Writes messages; once a second all of them go to the file.
 
     A recording gets its index when it is closed. If that does not happen (kill -9, a full disk, a
-    power cut) the messages that were flushed are in its .mcap file, and `recovery.recover` makes a
+    power cut) the messages that were flushed are in its .mcap file, and `recover` makes a
     whole recording of them.
 
     Args:

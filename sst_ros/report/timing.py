@@ -247,7 +247,7 @@ def _digest(torque: Array, limit: float | None) -> Integers:
 def _pairs(
     asked: Integers, earliest_ns: Integers, applied: Integers, applied_ns: Integers
 ) -> tuple[Integers, Integers]:
-    """Find for each command the first tick of its values from `earliest` on."""
+    """Find for each command the first tick of its values from `earliest_ns` on."""
     _, kinds = np.unique(np.concatenate([asked, applied]), return_inverse=True)
     asked_kind, applied_kind = kinds[: len(asked)], kinds[len(asked) :]
     order = np.lexsort((applied_ns, applied_kind))

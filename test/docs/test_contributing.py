@@ -28,9 +28,3 @@ def test_there_are_three_paths_and_every_room_is_in_the_tree():
     rooms = {path.parent.name for path in (ROOT / "sst_ros").glob("*/__init__.py")}
     tree = TEXT[TEXT.index("sst_ros/\n") : TEXT.index("## Data paths")]
     assert rooms <= set(re.findall(r"^  (\w+)/", tree, re.MULTILINE))
-
-
-def test_files_that_a_newcomer_is_sent_to_exist():
-    section = TEXT[TEXT.index("## Where to add") :]
-    for path in re.findall(r"`((?:\w+/)+\w+\.py)`", section):
-        assert (ROOT / path).exists() or (ROOT / "sst_ros" / path).exists(), path

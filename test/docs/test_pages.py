@@ -93,10 +93,16 @@ def _choices(of):
     return next((a.choices for a in of._actions if hasattr(a, "_choices_actions")), None)
 
 
-def test_the_readme_is_short_and_begins_with_the_mechanism():
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) < 120
-    assert any("docs/mechanism.png" in line for line in lines[:20])
+def test_the_readme_is_short_and_begins_with_the_mechanism_and_the_two_commands_that_do_all():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 120
+    before, picture, after = text.partition("docs/mechanism.png")
+    assert picture and len(before.splitlines()) < 20
+    assert [line.split("  #")[0] for line in after.split("```")[1].split("\n")[1:3]] == [
+        "make demo",
+        "make test",
+    ]
+    assert "```" not in before and "\n#" not in after[: after.index("make test")]
 
 
 def test_every_page_is_in_the_site():
