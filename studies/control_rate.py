@@ -10,11 +10,10 @@ states are compared with the reference of the continuous motion.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -288,18 +287,13 @@ of simulator, player and recorder in lockstep; their time is the mean wall time 
 """
 
 
-def report(
-    names: Sequence[str],
-    out: Path,
-    *,
-    record: Callable[[str, Path, int, str], object] | None = None,
-) -> list[ControlStudy]:
+def report(names: Sequence[str], out: Path, *, nodes: bool = False) -> bool:
     """Study scenes; print each, and write control_rate.csv, .json, .md and figures into `out`.
 
     Args:
         names: scenes with torques.
         out: folder of the files.
-        record: records a run of the nodes: scene, bag, rate [Hz], hold; None for no nodes.
+        nodes: record runs of the nodes, too.
 
     Raises:
         SstError: a scene is refused or a run failed, or `out` cannot be written.
@@ -307,27 +301,22 @@ def report(
     """
     studies = []
     for name in names:
-        nodes = None
-        if record is not None:
-
-            def nodes(rate: int, hold: str, name: str = name) -> ControlRun:
-                bag = out / "bags" / f"{name}_{rate}_{hold}"
-                record(name, bag, rate, hold)
-                return recorded_run(bag, rate, hold)
-
-        studies.append(control_study(scenes.load(name), recorded=nodes, shown=True))
-        print("\n".join(lines(studies[-1])), flush=True)
+        recorded = partial(record_run, name, out / "bags") if nodes else None
+        studies.append(control_study(scenes.load(name), recorded=recorded, shown=True))
+        print(section(studies[-1]), flush=True)
         whole = table(row for study in studies for row in records(study.rows))
         write(
             out, "control_rate", csv=whole,
             document={"rows": records(whole), "advice": {s.scene: advice(s) for s in studies}},
             page=page(studies), figures={f"control_rate_{s.scene}": figure(s) for s in studies},
         )  # fmt: skip
-    return studies
+    return True
 
 
-def recorded_run(bag: Path, rate: int, hold: str) -> ControlRun:
-    """Read a run of the nodes."""
+def record_run(name: str, folder: Path, rate: int, hold: str) -> ControlRun:
+    """Record a run of the nodes, and read it."""
+    bag = demo.empty_bag(folder, f"{name}_{rate}_{hold}")
+    demo.record(name, bag, rate=rate, hold=hold)
     run = recording.read(bag)
     reported = run.diagnostics
     return ControlRun(
@@ -335,12 +324,6 @@ def recorded_run(bag: Path, rate: int, hold: str) -> ControlRun:
         of_samples(Geometry.of(run.scene), run, slice(None))[:, :7],
         float(reported.get("error_estimate", "nan")), 1e-6 * float(reported["step_mean_us"]),
     )  # fmt: skip
-
-
-def title(study: ControlStudy) -> str:
-    """Return scene, time span and advice in two or three lines."""
-    found, _, why = advice(study).partition(": ")
-    return f"{study.scene} over {study.seconds:g} s: {found}\n{textwrap.fill(why, 125)}"
 
 
 def grid(study: ControlStudy) -> DataFrame:
@@ -363,14 +346,6 @@ def grid(study: ControlStudy) -> DataFrame:
     return table(rows)
 
 
-def lines(study: ControlStudy) -> Iterator[str]:
-    """Yield the study for the terminal line by line."""
-    yield grid(study).to_string(index=False)
-    yield ""
-    yield from findings(study)
-    yield ""
-
-
 def findings(study: ControlStudy) -> Iterator[str]:
     """Yield orders and advice, a sentence each."""
     for hold, power in ORDERS.items():
@@ -382,77 +357,23 @@ def findings(study: ControlStudy) -> Iterator[str]:
     yield f"Reference: {study.reference.how}; its own error: {own:.0e} rad."
 
 
-def figure(study: ControlStudy) -> Figure:
-    """Draw the study."""
-    orders = {hold: study.order(hold) for hold in (START, MIDDLE)}
-    return draw_control_rates(study.rows, orders, title(study), provenance())
-
-
-def page(studies: Sequence[ControlStudy]) -> str:
-    """Write studies as one Markdown page."""
-    parts = [INTRODUCTION]
-    for study in studies:
-        parts += [f"## {study.scene}", "",
-                  f"![error against control period](control_rate_{study.scene}.png)", "",
-                  *(f"- {line}" for line in findings(study)), "", markdown(grid(study)),
-                  ""]  # fmt: skip
-    return "\n".join([*parts, provenance(), ""])
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Study scenes from the command line."""
-    arguments = parser("control_rate", "Error against control rate, method and hold.", DOCS)
-    arguments.add_argument(
-        "--scene", nargs="+", default=SCENES, help="scenes with torques: names, or .yaml files"
-    )
-    arguments.add_argument("--nodes", action="store_true", help="run the real nodes, too")
-
-    def record(name: str, bag: Path, rate: int, hold: str) -> None:
-        demo.record(name, demo.empty_bag(bag.parent, bag.name), rate=rate, hold=hold)
-
-    def study(options: argparse.Namespace) -> bool:
-        report(options.scene, options.out, record=record if options.nodes else None)
-        return True
-
-    return run(study, arguments, words)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
-
-
-HOLD_COLOURS = {"start": VERMILION, "middle": BLUE, "exact": GREEN}
-
-
 HOLD_NAMES = {
-    "start": "torque at the start of the hold",
-    "middle": "torque at the middle of the hold",
-    "exact": "exact profile, nothing held",
+    START: (VERMILION, "torque at the start of the hold"),
+    MIDDLE: (BLUE, "torque at the middle of the hold"),
+    EXACT: (GREEN, "exact profile, nothing held"),
 }
 
 
-NODES = "nodes"
-
-
 @styled
-def draw_control_rates(
-    rows: DataFrame, orders: Mapping[str, float], title: str, footnote: str
-) -> Figure:
-    """Draw the largest error over the control period and over the share of a core.
-
-    Args:
-        rows: rate_Hz, method, hold, largest_rad, core_share, by.
-        orders: power of the period by hold, as found.
-        title: two lines.
-        footnote: small print.
-
-    """
+def figure(study: ControlStudy) -> Figure:
+    """Draw the largest error over the control period and over the share of a core."""
     figure = free_figure(12.0, 6.6)
     left, right = figure.subplots(1, 2, sharey=True)
     figure.subplots_adjust(left=0.075, right=0.985, top=0.87, bottom=0.235, wspace=0.06)
+    rows = study.rows
     loop, nodes = rows[rows.by != NODES], rows[rows.by == NODES]
     for (hold, method), group in loop.groupby(["hold", "method"], sort=False):
-        marker, colour = MARKERS[method][1], HOLD_COLOURS[hold]
+        marker, colour = MARKERS[method][1], HOLD_NAMES[hold][0]
         group = group.sort_values("rate_Hz")
         error = np.maximum(group.largest_rad.to_numpy(), 1e-17)
         given = {"color": colour, "marker": marker, "markerfacecolor": "none", "linewidth": 1.0}
@@ -460,23 +381,23 @@ def draw_control_rates(
                   **{**given, "linewidth": 0.0 if hold != "exact" else 1.0})  # fmt: skip
         right.plot(100.0 * group.core_share, error, markersize=7, **given)
     left.plot(1e3 / nodes.rate_Hz, nodes.largest_rad, "*", color=INK, markersize=9)
-    for hold, power in (("start", 1), ("middle", 2)):
+    for hold, power in ORDERS.items():
+        colour = HOLD_NAMES[hold][0]
         group = loop[loop.hold == hold].sort_values("rate_Hz")
         period = 1e3 / group.rate_Hz.to_numpy()
         line = group.largest_rad.to_numpy()[0] * (period / period[0]) ** power
-        left.plot(period, line, color=HOLD_COLOURS[hold], linewidth=1.6, zorder=1)
+        left.plot(period, line, color=colour, linewidth=1.6, zorder=1)
         k = len(period) // 2
-        left.annotate(f"slope {power} (found {orders[hold]:.3f})", (period[k], line[k]), (8, -14),
-                      textcoords="offset points", color=HOLD_COLOURS[hold], fontsize=9)  # fmt: skip
+        found = f"slope {power} (found {study.order(hold):.3f})"
+        left.annotate(found, (period[k], line[k]), (8, -14), textcoords="offset points",
+                      color=colour, fontsize=9)  # fmt: skip
     for axes in (left, right):
         axes.set_xscale("log")
         axes.set_yscale("log")
     left.set_xlabel("control period [ms]")
     left.set_ylabel("largest error of the orientation [rad]")
     right.set_xlabel("processor time of the run loop, share of a core [%]")
-    handles = [
-        Line2D([], [], color=HOLD_COLOURS[hold], label=HOLD_NAMES[hold]) for hold in HOLD_COLOURS
-    ]
+    handles = [Line2D([], [], color=colour, label=name) for colour, name in HOLD_NAMES.values()]
     handles += [
         Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="none",
                markerfacecolor="none", label=method) for method in loop.method.unique()
@@ -485,6 +406,34 @@ def draw_control_rates(
         handles.append(Line2D([], [], color=INK, marker="*", linestyle="none", label="ROS nodes"))
     figure.legend(handles=handles, loc="center", bbox_to_anchor=(0.5, 0.12), ncol=4, fontsize=9,
                   frameon=False)  # fmt: skip
+    found, _, why = advice(study).partition(": ")
+    title = f"{study.scene} over {study.seconds:g} s: {found}\n{textwrap.fill(why, 125)}"
     figure.suptitle(title, fontsize=12)
-    note(figure, footnote, 200)
+    note(figure, provenance(), 200)
     return figure
+
+
+def page(studies: Sequence[ControlStudy]) -> str:
+    """Write studies as one Markdown page."""
+    return "\n".join([INTRODUCTION, *map(section, studies), provenance(), ""])
+
+
+def section(study: ControlStudy) -> str:
+    """Write a study as a section of the page."""
+    return "\n".join([
+        f"## {study.scene}", "", f"![error against control period](control_rate_{study.scene}.png)",
+        "", *(f"- {line}" for line in findings(study)), "", markdown(grid(study)), "",
+    ])  # fmt: skip
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Study scenes from the command line."""
+    arguments = parser("control_rate", "Error against control rate, method and hold.", DOCS)
+    what = "scenes with torques: names, or .yaml files"
+    arguments.add_argument("--scene", nargs="+", default=SCENES, help=what)
+    arguments.add_argument("--nodes", action="store_true", help="run the real nodes, too")
+    return run(lambda given: report(given.scene, given.out, nodes=given.nodes), arguments, words)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

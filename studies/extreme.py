@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -77,15 +77,12 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     Returns:
         Whether every case passed, and the coefficients of every method meet their conditions.
 
-    Raises:
-        InputError: `out` cannot be written.
-
     """
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
     cases = run_jobs(_evaluated, jobs[::-1], "extreme cases   ", workers)[::-1]
     cases = with_batches(cases, workers)
     steps = largest_steps(workers=workers, progress="largest steps   ")
-    print("\n".join(lines(cases, steps)))
+    print(page(cases, steps))
     x, y, growth = regions()
     write(
         out, "stability", csv=case_table(cases),
@@ -131,35 +128,6 @@ def _batched(group: tuple[int, ...]) -> list[tuple[str, bool]]:
 def case_table(cases: Sequence[CaseResult]) -> DataFrame:
     """Return a row for each case."""
     return table(asdict(case) | {"passed": case.passed} for case in cases)
-
-
-def lines(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> Iterator[str]:
-    """Yield the report for the terminal line by line."""
-    shown = case_table(cases).assign(passed=["yes" if case.passed else "FAILED" for case in cases])
-    heads = {"name": "case", "passed": "passed", "deviation": "deviation", "bound": "bound",
-             "energy": "energy", "loose_error": "true error", "loose_estimate": "estimate",
-             "wall_s": "interpreted [s]", "compiled_s": "compiled [s]"}  # fmt: skip
-    yield (
-        shown[list(heads)]
-        .rename(columns=heads)
-        .to_string(
-            index=False, na_rep="-", float_format=lambda x: f"{x:.1e}" if x < 0.01 else f"{x:.2f}"
-        )
-    )
-    yield ""
-    for case in cases:
-        yield f"{case.name}: {case.expected}; {case.result}; estimate: {case.check}"
-    yield ""
-    yield summary(cases)
-    for family in ("decay", "oscillation"):
-        yield ""
-        yield f"Largest stable step [ms] of the {family} family (step times largest abs(lambda))"
-        yield step_table(steps, family).to_string(index=False)
-    yield ""
-    yield from limits_of_theory()
-    yield from faults()
-    yield ""
-    yield provenance()
 
 
 def summary(cases: Sequence[CaseResult]) -> str:
