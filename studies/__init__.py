@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sst_ros.errors import SstError
+from sst_ros.host.output import require_free
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -26,10 +27,25 @@ def run(
     study: Callable[[argparse.Namespace], bool],
     arguments: argparse.ArgumentParser,
     words: Sequence[str] | None,
+    *,
+    careful: bool = False,
 ) -> int:
-    """Run a study; return the exit status: 1, too, where its results are not as they should be."""
+    """Run a study; return the exit status: 1, too, where its results are not as they should be.
+
+    Args:
+        study: what to run with its options.
+        arguments: those that it takes.
+        words: given on the command line.
+        careful: refuse to overwrite earlier results without `--force`.
+
+    """
+    if careful:
+        arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
+    options = arguments.parse_args(words)
     try:
-        return 0 if study(arguments.parse_args(words)) else 1
+        if careful:
+            require_free(options.out, arguments.prog, force=options.force)
+        return 0 if study(options) else 1
     except SstError as error:
         print(f"{arguments.prog}: {error}", file=sys.stderr)
         return 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -18,21 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.controller import Controller, ControllerSettings, ControlStopped, Measurement
-from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.scene.yaml_document import from_values, values_of
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.state import Vector3
 from studies.sampled_data import largest_stable, stability_limit
-
-WIDTHS = (1, 3, 3, 3, 3, 3, 3, 3)
-
-EXACT_TOLERANCE = 1e-13
-"""Local error of the simulation whose torques are a function of time."""
 
 OFFSET = 1e-8
 """Error at the start [rad] of a search for a limit: so small that the plant is linear around it."""
@@ -40,7 +34,6 @@ OFFSET = 1e-8
 SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
 
-_SAMPLES = 20
 _TICKS, _TICKS_OF_DELAY = 600, 200
 _FIRST, _FACTOR, _ACCURACY = 0.5, 1.15, 2e-3
 _GONE, _LOST = 1e-3, 1e2 * OFFSET
@@ -66,14 +59,7 @@ class Channel:
 
 
 class ChannelState:
-    """The memory of a channel during a run.
-
-    Args:
-        channel: its properties.
-        period_s: time between samples [s].
-        seed: of the noise.
-
-    """
+    """The memory of a channel during a run with `period_s` between samples [s]."""
 
     def __init__(self, channel: Channel, period_s: float, seed: int) -> None:
         self._channel, self._period = channel, period_s
@@ -86,13 +72,9 @@ class ChannelState:
         if self._channel.counts:
             step = 2.0 * math.pi / self._channel.counts
             if self._before is None:
-                a, b, c = (
-                    _counted(angle - self._period * rate, step)
-                    for angle, rate in zip(gamma, gamma_dot, strict=True)
-                )
-                self._before = (a, b, c)
-            a, b, c = (_counted(angle, step) for angle in gamma)
-            gamma, before = (a, b, c), self._before
+                earlier = np.subtract(gamma, np.multiply(self._period, gamma_dot)).tolist()
+                self._before = _count(earlier, step)
+            before, gamma = self._before, _count(gamma, step)
             self._before = gamma
             a, b, c = ((x - y) / self._period for x, y in zip(gamma, before, strict=True))
             gamma_dot = (a, b, c)
@@ -113,8 +95,9 @@ class ChannelState:
         return (values[0] + a, values[1] + b, values[2] + c)
 
 
-def _counted(angle: float, step: float) -> float:
-    return step * round(angle / step)
+def _count(angles: Sequence[float], step: float) -> Vector3:
+    a, b, c = (step * round(angle / step) for angle in angles)
+    return (a, b, c)
 
 
 @dataclass(frozen=True)
@@ -207,9 +190,8 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
 
     """
     period = loop.period_ns / NANOSECONDS
-    simulation = Simulation(
-        at_start(loop.plant, loop.motion, loop.offset), compiled=numba_version() is not None
-    )
+    plant = at_start(loop.plant, loop.motion, loop.offset)
+    simulation = Simulation(plant, compiled=numba_version() is not None)
     controller = Controller(loop.model, loop.motion, loop.settings, period)
     channel = ChannelState(loop.channel, period, loop.seed)
     rows, limited, failure = [], [], ""
@@ -225,8 +207,8 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
             torque = channel.delayed(command.torque)
             desired = command.desired
             rows.append(
-                (time, *desired.gamma, *desired.gamma_dot, *joints.gamma, *joints.gamma_dot,
-                 *command.feedforward, *command.feedback, *torque)
+                ((time,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
+                 command.feedforward, command.feedback, torque)
             )  # fmt: skip
             limited.append(command.saturated)
             if math.dist(desired.gamma, joints.gamma) > loop.lost:
@@ -234,8 +216,8 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
         except (RunStopped, ControlStopped) as error:
             failure = str(error)
             break
-    columns = np.split(np.array(rows).reshape(len(rows), -1), np.cumsum(WIDTHS)[:-1], axis=1)
-    time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = columns
+    table = np.array(rows).reshape(len(rows), 8, 3)
+    time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = table.swapaxes(0, 1)
     track = TrackingRecord(
         time_s[:, 0], gamma, gamma_dot, gamma - at, gamma_dot - rate, feedforward, feedback, torques
     )
@@ -248,41 +230,6 @@ def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scen
     a, b, c = (angle + offset for angle in start.gamma)
     initial = Initial(gamma=(a, b, c), gamma_dot=start.gamma_dot, orientation=start.quaternion)
     return replace(plant, initial=initial)
-
-
-def held_error(loop: ControlLoop) -> float:
-    """Return the largest error of gamma [rad] under feedforward alone, held over the periods.
-
-    nan where the loop fails.
-    """
-    settings = replace(loop.settings, mode="feedforward")
-    track, _, failure = run_loop(replace(loop, settings=settings, rest_s=0.0))
-    return math.nan if failure else float(np.abs(track.error).max())
-
-
-def unheld_error(scene: Scene, motion: ReferenceMotion) -> tuple[float, float]:
-    """Give a scene the torques of a motion as a function of time: nothing is held.
-
-    Returns:
-        The largest error of gamma over the motion, and the error estimate at its end [rad].
-
-    """
-    inverse = InverseDynamics(scene)
-
-    def torque(time: float) -> Vector3:
-        now = motion.at(time)
-        return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
-
-    simulation = Simulation(
-        at_start(scene, motion), "dop853", tolerance=EXACT_TOLERANCE,
-        step_budget=WHOLE_MOTION_BUDGET,
-    )  # fmt: skip
-    largest, step = 0.0, round(motion.duration * NANOSECONDS / _SAMPLES)
-    for _ in range(_SAMPLES):
-        state = simulation.step(torque, step)
-        desired = motion.at(state.time_ns / NANOSECONDS).gamma
-        largest = max(largest, float(np.abs(np.subtract(desired, state.joints.gamma)).max()))
-    return largest, simulation.error_estimate
 
 
 class RestMotion(ReferenceMotion):

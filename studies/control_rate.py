@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error against processor time of the run loop: control rate, method, and how torques are held.
 
-Torques that a controller holds over a period are not those of the continuous motion: the error of
-the motion is of order 1 in the period where the torque is that of the start of the hold, of order 2
-where it is that of its middle (`sampled_data` derives both). Each point is a real run of the run
-loop of the simulator node, without ROS, as fast as possible, with a sample at every tick; its
-states are compared with the reference of the continuous motion.
+Each point is a run of the tick loop of the simulator node, compared with the reference of the
+continuous motion; `sampled_data` derives the orders of the hold.
 """
 
 from __future__ import annotations
@@ -17,17 +14,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 from sst_ros import demo
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.methods import MARKERS
 from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, styled
 from sst_ros.recording import recording
@@ -48,7 +46,6 @@ from studies.sampled_data import ORDERS, slope
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
 
 RATES = (100, 200, 500, 1000, 2000, 5000, 10_000)
 """Control rates [Hz]."""
@@ -74,42 +71,22 @@ COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "es
            "tick_us", "core_share", "by")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ControlRun:
-    """One point of the grid.
+class ControlRun(NamedTuple):
+    """One point of the grid, with a sample at every tick."""
 
-    Attributes:
-        rate: control rate [Hz], that of the samples too.
-        method: of integration.
-        hold: START, MIDDLE or EXACT.
-        times_ns: times of the samples [ns], shape (n,).
-        states: quaternions and body rates of the samples, shape (n, 7).
-        estimate: error estimate of the integrator at the end [rad].
-        tick_s: processor time of the thread of the run per tick, median [s].
-
-    """
-
-    rate: int
+    rate: int  # [Hz]
     method: str
     hold: str
-    times_ns: np.ndarray[Any, np.dtype[np.int64]]
-    states: np.ndarray[Any, np.dtype[np.float64]]
-    estimate: float
-    tick_s: float
+    times_ns: NDArray[np.int64]  # of the samples (n,)
+    states: Array  # quaternions and body rates (n, 7)
+    estimate: float  # error estimate of the integrator at the end [rad]
+    tick_s: float  # median processor time of a tick [s]
 
 
 def run_controlled(
     scene: Scene, rate: int, method: str, hold: str, seconds: float, *, compiled: bool = True
 ) -> ControlRun:
-    """Run the run loop over a time span, a sample at every tick.
-
-    Args:
-        scene: a scene with torques.
-        rate: control rate [Hz], a divisor of 1e9.
-        method: of integration, or auto.
-        hold: START, MIDDLE or EXACT.
-        seconds: time span [s].
-        compiled: under numba, where it is installed.
+    """Run a scene with torques at a control rate [Hz], a divisor of 1e9, over a time span [s].
 
     Raises:
         RunStopped: the run stopped early.
@@ -198,7 +175,7 @@ def control_study(
         rates: control rates [Hz].
         methods: of integration.
         compiled: under numba, where it is installed.
-        recorded: runs the nodes at a rate with a hold; for NODE_RATES.
+        recorded: runs the nodes at one of NODE_RATES with a hold.
         shown: draw a progress bar on the terminal.
 
     Raises:
@@ -241,8 +218,8 @@ def row_of(
 
 def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
-    late = "; ".join(f"{name}, below {rate:g} Hz,"
-                     for name, rate in study.least_rates.items() if rate > min(RATES))  # fmt: skip
+    least_rates = study.least_rates.items()
+    late = "; ".join(f"{name}, below {rate:g} Hz," for name, rate in least_rates if rate > RATES[0])
     largest = max(map(study.spread, (START, MIDDLE)))
     if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
         return (
@@ -288,17 +265,7 @@ of simulator, player and recorder in lockstep; their time is the mean wall time 
 
 
 def report(names: Sequence[str], out: Path, *, nodes: bool = False) -> bool:
-    """Study scenes; print each, and write control_rate.csv, .json, .md and figures into `out`.
-
-    Args:
-        names: scenes with torques.
-        out: folder of the files.
-        nodes: record runs of the nodes, too.
-
-    Raises:
-        SstError: a scene is refused or a run failed, or `out` cannot be written.
-
-    """
+    """Study scenes; print each, and write control_rate.csv, .json, .md and figures into `out`."""
     studies = []
     for name in names:
         recorded = partial(record_run, name, out / "bags") if nodes else None

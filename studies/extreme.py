@@ -26,7 +26,6 @@ from studies.extreme_runs import (
     run_batch,
 )
 from studies.stability_limits import (
-    LONGEST_S,
     LargestStep,
     draw_largest_steps,
     faults,
@@ -92,7 +91,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
         },
         page=page(cases, steps),
         figures={
-            "stability": draw_largest_steps(table(map(asdict, steps)), LONGEST_S, provenance()),
+            "stability": draw_largest_steps(table(map(asdict, steps)), provenance()),
             "stability_regions": draw_regions(x, y, growth, scene_points(), provenance()),
         },
     )  # fmt: skip

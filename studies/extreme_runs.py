@@ -17,10 +17,9 @@ within a step of the same time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,16 +75,8 @@ class CaseRun:
         return same and str(self.error) == str(other.error)
 
 
-@dataclass(frozen=True)
-class EstimateCheck:
-    """Error estimate against the true error.
-
-    Attributes:
-        true, estimate: at a loose tolerance [rad]; None where there is no such run.
-        verdict: what was found, in words.
-        holds: whether the estimate is as it should be.
-
-    """
+class EstimateCheck(NamedTuple):
+    """True error and estimate at a loose tolerance [rad], None without such a run; a verdict."""
 
     true: float | None
     estimate: float | None
@@ -147,12 +138,9 @@ def run(case: Case, *, compiled: bool = False, tolerance: float | None = None) -
     simulation = None
     try:
         simulation = Simulation(
-            case.scene(),
-            case.integrator,
-            tolerance=tolerance or 1e-10,
-            compiled=compiled,
+            case.scene(), case.integrator, tolerance=tolerance or 1e-10, compiled=compiled,
             step_budget=WHOLE_MOTION_BUDGET,
-        )
+        )  # fmt: skip
         if not callable(case.torque) and tolerance is not None:
             simulation.step(case.torque, case.steps * case.period_ns)
         elif not callable(case.torque) and compiled:
@@ -178,7 +166,9 @@ def run_through_loop(case: Case) -> CaseRun:
 def evaluate_case(case: Case, *, compiled: bool = True) -> CaseResult:
     """Run a case, compare it with the truth, with the tick loop, and with its compiled run."""
     jit = numba_version() is not None and (compiled or case.compiled_only)
-    first, first_s = _timed(partial(run, case, compiled=case.compiled_only and jit))
+    began = time.perf_counter()
+    first = run(case, compiled=case.compiled_only and jit)
+    first_s = time.perf_counter() - began
     check = estimate_check(case, first)
     found = CaseResult(
         case.name, case.group, case.difficulty, case.expected, case.bound, "finished",
@@ -192,15 +182,13 @@ def evaluate_case(case: Case, *, compiled: bool = True) -> CaseResult:
         found = replace(found, run_loop=first.same_as(run_through_loop(case)))
         remarks += [] if found.run_loop else ["the run loop differs"]
         if jit:
-            second, compiled_s = _timed(partial(run, case, compiled=True))
-            found = replace(found, compiled_s=compiled_s, same_bits=first.same_as(second))
+            began = time.perf_counter()
+            same = first.same_as(run(case, compiled=True))
+            found = replace(found, compiled_s=time.perf_counter() - began, same_bits=same)
             remarks += [] if found.same_bits else ["the compiled run differs"]
     remarks += [] if check.holds else [f"error estimate: {check.verdict}"]
-    return replace(
-        found,
-        result="; ".join([found.result, *remarks]),
-        correct=found.correct and check.holds,
-    )
+    result = "; ".join([found.result, *remarks])
+    return replace(found, result=result, correct=found.correct and check.holds)
 
 
 def _judge(found: CaseResult, case: Case, done: CaseRun) -> CaseResult:
@@ -228,13 +216,7 @@ def _judge(found: CaseResult, case: Case, done: CaseRun) -> CaseResult:
 
 
 def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
-    """Compare the error estimate with the true error.
-
-    Args:
-        case: the case.
-        accurate: its run at the default tolerance.
-
-    """
+    """Compare the error estimate with the true error, by the run at the default tolerance."""
     if accurate.error is not None or accurate.simulation is None:
         held = "its time is held to theory" if case.stop_time else "there is no motion"
         return EstimateCheck(None, None, f"none: the run is refused, {held}")
@@ -259,12 +241,6 @@ def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
         unresolved = unresolved or EstimateCheck(true, estimate, words, holds)
     none = EstimateCheck(None, None, "there is no run at a loose tolerance", holds=False)
     return unresolved or none
-
-
-def _timed(call: Callable[[], CaseRun]) -> tuple[CaseRun, float]:
-    began = time.perf_counter()
-    done = call()
-    return done, time.perf_counter() - began
 
 
 def _stored(simulation: Simulation, y: Sequence[float]) -> float:

@@ -21,9 +21,9 @@ of `sampled_data.stability_limit`.
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from operator import methodcaller
 from pathlib import Path
@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.controller import INSTANTS, MODES, ControllerSettings
+from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate
@@ -40,7 +41,8 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import Vector3
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies.control_loop import (
@@ -48,19 +50,17 @@ from studies.control_loop import (
     Channel,
     ControlLoop,
     ModelError,
+    at_start,
     bandwidth_in_theory,
     bandwidth_limit,
-    held_error,
     ideal_plant,
     model_errors,
     run_loop,
-    unheld_error,
 )
-from studies.feedforward_figure import draw_feedforward
+from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, slope
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 
@@ -150,6 +150,11 @@ class FeedforwardStudy:
         exact = self.rms("nominal", "feedforward_pd", bandwidth)
         return None if not pd or exact is None else 1.0 / (SHARE + exact / pd)
 
+    @property
+    def failed(self) -> DataFrame:
+        """The loops that failed, in the order of their footnotes."""
+        return self.loops[self.loops.failure != ""]
+
     def orders(self) -> dict[str, float]:
         """Power of the period with which the error of a hold falls, by instant."""
         found = {}
@@ -178,21 +183,21 @@ def feedforward_study(
         partial(_limit, scene, basic, plan.period_ns, delay) for delay in plan.delays
     ]
     schemes = [
-        dataclasses.replace(basic, mode=mode, bandwidth=bandwidth)
+        replace(basic, mode=mode, bandwidth=bandwidth)
         for mode in MODES
         for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
     ]
     jobs += [partial(_tracked, plan, error, settings) for error in errors for settings in schemes]
+    holds = [replace(basic, mode=OPEN_LOOP, feedforward_at=at) for at in INSTANTS]
     jobs += [
-        partial(_held, scene, dataclasses.replace(basic, feedforward_at=at), plan.period_ns * n)
-        for at in INSTANTS for n in plan.multiples
-    ]  # fmt: skip
+        partial(_held, scene, each, plan.period_ns * n) for each in holds for n in plan.multiples
+    ]
     jobs.append(partial(_unheld, scene))
     found = run_jobs(methodcaller("__call__"), jobs, f"{scene.name:<16}" if shown else "", workers)
-    limits, holds = len(plan.delays), len(INSTANTS) * len(plan.multiples)
+    limits, count = len(plan.delays), len(holds) * len(plan.multiples)
     return FeedforwardStudy(
-        plan, motion.duration, left_out, table(found[limits : -holds - 1], COLUMNS),
-        table(found[-holds - 1 : -1]), found[-1],
+        plan, motion.duration, left_out, table(found[limits : -count - 1], COLUMNS),
+        table(found[-count - 1 : -1]), found[-1],
         table(found[:limits], ("delay", "theory", "ideal", "real")),
     )  # fmt: skip
 
@@ -253,12 +258,35 @@ def _limit(
 
 
 def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[str, Any]:
-    error = held_error(ControlLoop(plant, plant, _motion(plant), settings, period_ns))
+    """Find the largest error of gamma under feedforward alone; nan where the loop fails."""
+    track, _, failure = run_loop(ControlLoop(plant, plant, _motion(plant), settings, period_ns))
+    error = math.nan if failure else float(np.abs(track.error).max())
     return {"at": settings.feedforward_at, "period_s": period_ns / NANOSECONDS, "error": error}
 
 
 def _unheld(plant: Scene) -> tuple[float, float]:
-    return unheld_error(plant, _motion(plant))
+    """Give the plant the torques of its motion as a function of time: nothing is held.
+
+    Returns:
+        The largest error of gamma over the motion, and the error estimate at its end [rad].
+
+    """
+    inverse, motion = InverseDynamics(plant), _motion(plant)
+
+    def torque(time: float) -> Vector3:
+        now = motion.at(time)
+        return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
+
+    simulation = Simulation(
+        at_start(plant, motion), "dop853", tolerance=1e-13,
+        step_budget=WHOLE_MOTION_BUDGET,
+    )  # fmt: skip
+    largest, step = 0.0, round(motion.duration * NANOSECONDS / 20)
+    for _ in range(20):
+        state = simulation.step(torque, step)
+        desired = motion.at(state.time_ns / NANOSECONDS).gamma
+        largest = max(largest, float(np.abs(np.subtract(desired, state.joints.gamma)).max()))
+    return largest, simulation.error_estimate
 
 
 @lru_cache(maxsize=4)
@@ -296,7 +324,7 @@ def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> F
     study = feedforward_study(plan, workers=workers, shown=True)
     print(page(study), flush=True)
     write(out, "feedforward", csv=study.loops, document=document(study), page=page(study),
-          figures={"feedforward": figure(study)})  # fmt: skip
+          figures={"feedforward": draw_study(study, title(study))})  # fmt: skip
     return study
 
 
@@ -304,7 +332,7 @@ def rms_table(study: FeedforwardStudy) -> DataFrame:
     """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
     footnotes = {
         (row.error, row.mode, None if row.mode == OPEN_LOOP else row.bandwidth_rad_per_s): number
-        for number, row in enumerate(failed(study).itertuples(), start=1)
+        for number, row in enumerate(study.failed.itertuples(), start=1)
     }
     rows = []
     for error in study.loops.error.unique():
@@ -319,11 +347,6 @@ def rms_table(study: FeedforwardStudy) -> DataFrame:
             benefit = study.benefit(error, bandwidth)
             rows.append({**row, "pd / feedforward_pd": f"{benefit:.3g}" if benefit else "-"})
     return table(rows)
-
-
-def failed(study: FeedforwardStudy) -> DataFrame:
-    """Return the loops that failed, in the order of their footnotes."""
-    return study.loops[study.loops.failure != ""]
 
 
 def title(study: FeedforwardStudy) -> str:
@@ -367,7 +390,7 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
 
 def notes(study: FeedforwardStudy) -> Iterator[str]:
     """Yield what failed and what was left out, line by line."""
-    for number, row in enumerate(failed(study).itertuples(), start=1):
+    for number, row in enumerate(study.failed.itertuples(), start=1):
         at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
         yield f"[{number}] {row.error}, {row.mode}{at}: {row.failure}"
     for name in study.left_out:
@@ -400,29 +423,6 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
         "exact_holds": dict(zip(("error", "estimate"), study.unheld, strict=True)),
         "limits": records(study.limits),
     }  # fmt: skip
-
-
-def figure(study: FeedforwardStudy) -> Figure:
-    """Draw the study."""
-    reasons: dict[str, int] = {}
-    for failure in failed(study).failure:
-        first, _, last = failure.partition(": ")
-        reason = last if "stopped at" in first else first
-        reasons[reason] = reasons.get(reason, 0) + 1
-    lines = [provenance()]
-    if reasons:
-        listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:4])
-        lines.insert(0, f"Failed: {listed}. The table and the CSV have the reason of each.")
-    return draw_feedforward(
-        study.loops,
-        study.holds,
-        study.limits,
-        bandwidths=study.plan.bandwidths,
-        orders={at: (order, ORDERS[at]) for at, order in study.orders().items()},
-        unheld=study.unheld[0],
-        title=title(study),
-        footnote="\n".join(lines),
-    )
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +13,13 @@ from matplotlib.lines import Line2D
 
 from sst_ros.control.controller import MODES
 from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, free_figure, note, styled
+from sst_ros.report.results import provenance
+from studies.sampled_data import ORDERS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+    from studies.feedforward import FeedforwardStudy
 
 _LOOKS = ((GREY, "D"), (BLUE, "o"), (GREEN, "^"), (VERMILION, "s"), (ORANGE, "v"))
 MARKERS = dict(zip(MODES, _LOOKS, strict=True))
@@ -25,30 +29,9 @@ _FAILED, _SPREAD = 12.0, 0.13
 
 
 @styled
-def draw_feedforward(
-    loops: DataFrame,
-    holds: DataFrame,
-    limits: DataFrame,
-    *,
-    bandwidths: Sequence[float],
-    orders: Mapping[str, tuple[float, int]],
-    unheld: float,
-    title: str,
-    footnote: str,
-) -> Figure:
-    """Draw a study of feedforward.
-
-    Args:
-        loops: error, mode, bandwidth_rad_per_s, rms_rad, failure of each loop.
-        holds: at, period_s, error [rad] of feedforward alone.
-        limits: delay, theory, ideal, real: bandwidths [rad/s].
-        bandwidths: a panel each [rad/s].
-        orders: measured order and that of the theory, by instant of the hold.
-        unheld: error where nothing is held [rad].
-        title: of the figure.
-        footnote: small print.
-
-    """
+def draw_study(study: FeedforwardStudy, title: str) -> Figure:
+    """Draw a study: a panel of errors for each bandwidth, orders of the hold, and limits."""
+    loops, bandwidths = study.loops, study.plan.bandwidths
     figure = free_figure(12.5, 10.6)
     upper = figure.add_gridspec(1, len(bandwidths), left=0.13, right=0.985, top=0.895,
                                 bottom=0.475, wspace=0.05)  # fmt: skip
@@ -58,14 +41,25 @@ def draw_feedforward(
         axes = figure.add_subplot(upper[0, column], sharey=first, sharex=first)
         _errors(axes, loops, bandwidth, labelled=first is None)
         first = first or axes
-    _holds(figure.add_subplot(lower[0, 0]), holds, orders, unheld)
-    _limits(figure.add_subplot(lower[0, 1]), limits)
-    failed = int((loops.failure != "").sum())
-    figure.legend(handles=_legend(failed), loc="center", bbox_to_anchor=(0.5, 0.945), ncol=7,
-                  fontsize=9, frameon=False)  # fmt: skip
+    _holds(figure.add_subplot(lower[0, 0]), study)
+    _limits(figure.add_subplot(lower[0, 1]), study.limits)
+    figure.legend(handles=_legend(len(study.failed)), loc="center", bbox_to_anchor=(0.5, 0.945),
+                  ncol=7, fontsize=9, frameon=False)  # fmt: skip
     figure.suptitle(title, fontsize=12, y=0.985)
-    note(figure, footnote, 200)
+    note(figure, "\n".join([*_reasons(study.failed.failure), provenance()]), 200)
     return figure
+
+
+def _reasons(failures: Iterable[str]) -> Iterator[str]:
+    """Yield the most frequent reasons of failures in a line, if there are any."""
+    reasons: dict[str, int] = {}
+    for failure in failures:
+        first, _, last = failure.partition(": ")
+        reason = last if "stopped at" in first else first
+        reasons[reason] = reasons.get(reason, 0) + 1
+    if reasons:
+        listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:4])
+        yield f"Failed: {listed}. The table and the CSV have the reason of each."
 
 
 def _errors(axes: Axes, loops: DataFrame, bandwidth: float, *, labelled: bool) -> None:
@@ -95,15 +89,14 @@ def _errors(axes: Axes, loops: DataFrame, bandwidth: float, *, labelled: bool) -
     axes.set_xlabel("RMS error of γ [rad]")
 
 
-def _holds(
-    axes: Axes, holds: DataFrame, orders: Mapping[str, tuple[float, int]], unheld: float
-) -> None:
+def _holds(axes: Axes, study: FeedforwardStudy) -> None:
     """Error over period, each with the line of its theory through the shortest period."""
+    holds, unheld, orders = study.holds, study.unheld[0], study.orders()
     for (at, group), colour, marker in zip(
         holds.groupby("at", sort=False), (BLUE, VERMILION), ("o", "s"), strict=False
     ):
         x, y = 1e3 * group.period_s.to_numpy(), group.error.to_numpy()
-        order, theory = orders[at]
+        order, theory = orders[at], ORDERS[at]
         axes.plot(x, y[0] * (x / x[0]) ** theory, color=colour, linewidth=1.0)
         axes.plot(x, y, marker, color=colour, markersize=7,
                   label=f"torque at the {at} of the hold: order {order:.3f} "

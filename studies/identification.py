@@ -8,7 +8,6 @@ motion with either model.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -18,13 +17,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.tracking import TrackingMetrics
+from sst_ros.control.tracking import TrackingRecord
 from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
-from sst_ros.host.output import require_free
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA, value_of
-from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
@@ -47,7 +44,7 @@ MODE = "feedforward_pd"
 PICTURE, TABLE = "identification.png", "identification.txt"
 
 
-def identification(out: Path, name: str = FOLLOWED) -> int:
+def identification(out: Path, name: str = FOLLOWED) -> bool:
     """Identify a plant with wrong inertias and friction, and follow a motion before and after.
 
     Results lie in `out`: the scenes plant, model, exciting and identified, three bags, the table
@@ -66,16 +63,16 @@ def identification(out: Path, name: str = FOLLOWED) -> int:
     for key, scene in scenes.items():
         (out / f"{key}.yaml").write_text(dump(scene), encoding="utf-8")
     print(f"{name}: bodies of the plant differ by {SHARE:.0%}, friction is not known", flush=True)
-    _follow(out, "exciting", "exciting")
+    _follow(out, "exciting")
     found = identify(measured(out / "exciting" / "bag"), model, UNKNOWN)
     identified = dataclasses.replace(found.scene, name=f"{name}_identified")
     (out / "identified.yaml").write_text(dump(identified), encoding="utf-8")
     print(found.table(), flush=True)
     for key in ("model", "identified"):
-        _follow(out, key, key)
+        _follow(out, key)
     text = compare(out, found.table())
     print(text, flush=True)
-    return 0
+    return True
 
 
 def unknown(scene: Scene, share: float = SHARE) -> Scene:
@@ -104,39 +101,48 @@ def measured(bag: Path, seed: int = 0) -> dict[str, object]:
 
 def compare(out: Path, identified: str) -> str:
     """Write the table and the picture of the tracking errors before and after; return the table."""
-    runs = {key: tracking.read(out / key / "bag") for key in ("model", "identified")}
-    found = {key: tracking.metrics(run) for key, run in runs.items()}
-    before, after = (_rms(found[key]) for key in runs)
-    lines = [f"{'tracking error of gamma [rad]':32}{'RMS':>12}{'largest':>12}"]
-    for key, label in (
-        ("model", "with the wrong model"),
-        ("identified", "with the identified one"),
-    ):
-        lines.append(f"{label:32}{_rms(found[key]):12.3e}{found[key].largest.max():12.3e}")
-    lines.append(f"{'ratio':32}{before / after:12.1f}")
+    folders = {"with the wrong model": "model", "with the identified model": "identified"}
+    runs = {label: tracking.read(out / folder / "bag") for label, folder in folders.items()}
+    lines, rms = [f"{'tracking error of gamma [rad]':32}{'RMS':>12}{'largest':>12}"], []
+    for label, followed in runs.items():
+        found = tracking.metrics(followed)
+        rms.append(float(np.sqrt(np.mean(found.rms**2))))
+        lines.append(f"{label:32}{rms[-1]:12.3e}{found.largest.max():12.3e}")
+    lines.append(f"{'ratio':32}{rms[0] / rms[1]:12.1f}")
     text = "\n".join(lines)
     (out / TABLE).write_text(f"{identified}\n{text}\n", encoding="utf-8")
-    figure = draw_tracking_errors(
-        {"with the wrong model": (runs["model"].track.time, runs["model"].track.error),
-         "with the identified model": (runs["identified"].track.time,
-                                       runs["identified"].track.error)},
-        f"Tracking error, {MODE.replace('_', ' + ')}: RMS {before:.1e} to {after:.1e} rad",
-    )  # fmt: skip
-    save_figure(figure, out / PICTURE)
+    tracks = {label: followed.track for label, followed in runs.items()}
+    title = f"Tracking error, {MODE.replace('_', ' + ')}: RMS {rms[0]:.1e} to {rms[1]:.1e} rad"
+    save_figure(draw_tracking_errors(tracks, title), out / PICTURE)
     return text
 
 
-def _rms(found: TrackingMetrics) -> float:
-    return float(np.sqrt(np.mean(found.rms**2)))
+@styled
+def draw_tracking_errors(tracks: Mapping[str, TrackingRecord], title: str) -> Figure:
+    """Draw the largest tracking error of the three joints over time, a curve for each run."""
+    figure = Figure(figsize=(7.0, 3.6))
+    axes = figure.subplots()
+    errors = {label: np.abs(track.error).max(axis=1) for label, track in tracks.items()}
+    for (label, error), colour in zip(errors.items(), (VERMILION, BLUE), strict=True):
+        shown = np.maximum(error, SMALLEST_SHOWN)
+        axes.semilogy(tracks[label].time, shown, color=colour, linewidth=1.6, label=label)
+    axes.set_ylim(min(float(np.quantile(error, 0.05)) for error in errors.values()) / 3.0,
+                  max(float(error.max()) for error in errors.values()) * 2.0)  # fmt: skip
+    axes.set_xlabel("time t [s]")
+    axes.set_ylabel("largest error of γ [rad]")
+    axes.set_title(title, pad=22)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=2, frameon=False, fontsize=9,
+                borderaxespad=0.1)  # fmt: skip
+    return figure
 
 
-def _follow(out: Path, model: str, folder: str) -> None:
-    """Follow the motion of a model's scene on the plant, and record it in a folder."""
+def _follow(out: Path, model: str) -> None:
+    """Follow the motion of a model's scene on the plant, and record it in a folder of its name."""
     path = out / f"{model}.yaml"
     seconds = reference_motion(load(path)).duration + HOLD_S
     seconds = math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE
-    bag = empty_bag(out / folder)
-    print(f"{folder}: following for {seconds:g} s", flush=True)
+    bag = empty_bag(out / model)
+    print(f"{model}: following for {seconds:g} s", flush=True)
     follow(str(out / "plant.yaml"), bag, MODE, seconds, model=str(path))
 
 
@@ -144,42 +150,8 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run the demo from the command line."""
     what = "A model identified from a recorded motion, and the tracking error before and after."
     arguments = parser("identification", what, Path("demo_out/identify"))
-    arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
-
-    def study(options: argparse.Namespace) -> bool:
-        out = require_free(options.out, "identification", force=options.force)
-        return identification(out) == 0
-
-    return run(study, arguments, words)
+    return run(lambda given: identification(given.out), arguments, words, careful=True)
 
 
 if __name__ == "__main__":
     raise SystemExit(main())
-
-
-COLOURS = (VERMILION, BLUE)
-
-
-@styled
-def draw_tracking_errors(runs: Mapping[str, tuple[Array, Array]], title: str) -> Figure:
-    """Draw the largest tracking error of the three joints over time, a curve for each run.
-
-    Args:
-        runs: times [s], shape (n,), and errors of gamma [rad], shape (n, 3), by label.
-        title: of the figure.
-
-    """
-    figure = Figure(figsize=(7.0, 3.6))
-    axes = figure.subplots()
-    for (label, (time, error)), colour in zip(runs.items(), COLOURS, strict=False):
-        worst = np.maximum(np.abs(error).max(axis=1), SMALLEST_SHOWN)
-        axes.semilogy(time, worst, color=colour, linewidth=1.6, label=label)
-    drawn = [np.abs(error).max(axis=1) for _, error in runs.values()]
-    axes.set_ylim(min(float(np.quantile(one, 0.05)) for one in drawn) / 3.0,
-                  max(float(one.max()) for one in drawn) * 2.0)  # fmt: skip
-    axes.set_xlabel("time t [s]")
-    axes.set_ylabel("largest error of γ [rad]")
-    axes.set_title(title, pad=22)
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=2, frameon=False, fontsize=9,
-                borderaxespad=0.1)  # fmt: skip
-    return figure

@@ -17,7 +17,7 @@ from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
 from sst_ros.extras import MissingDependency, require
-from sst_ros.host.output import require_free, write_into
+from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array
@@ -248,13 +248,11 @@ def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
 def main(words: Sequence[str] | None = None) -> int:
     """Draw the figures from the command line."""
     arguments = parser("paper", "Figs. 8 to 14 of the paper.", Path("paper_out"))
-    arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
 
-    def study(options: argparse.Namespace) -> bool:
-        out = require_free(options.out, "paper", force=options.force)
-        return all(each.within for each in paper(out))
+    def study(given: argparse.Namespace) -> bool:
+        return all(each.within for each in paper(given.out))
 
-    return run(study, arguments, words)
+    return run(study, arguments, words, careful=True)
 
 
 if __name__ == "__main__":

@@ -37,12 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-VISCOSITIES = tuple(10.0**n for n in range(6))
-"""Viscous coefficients of the damped family [N m s/rad]."""
-
-STIFFNESSES = tuple(10.0**n for n in range(1, 9))
-"""Stiffnesses of the springs of the oscillating family [N m/rad]."""
-
 LONGEST_S = 1.0
 """Longer steps are not tried [s]."""
 
@@ -87,9 +81,9 @@ def method_faults(method: Method) -> Iterator[str]:
     ):  # fmt: skip
         for k in range(count):
             moment = math.fsum(w * c**k for w, c in zip(weights, method.c, strict=True))
-            wanted = 1.0 / (k + 1) if what == "weights" else 0.0
-            if abs(moment - wanted) > CONDITION:
-                yield f"{what}: moment {k} is off by {abs(moment - wanted):.0e}"
+            expected = 1.0 / (k + 1) if what == "weights" else 0.0
+            if abs(moment - expected) > CONDITION:
+                yield f"{what}: moment {k} is off by {abs(moment - expected):.0e}"
     if off > CONDITION:
         yield f"a row is off its node by {off:.0e}"
 
@@ -163,10 +157,11 @@ def oscillating(stiffness: float) -> Scene:
     return changed({**FREE, **start(POSE), "springs": springs, "torque": None})
 
 
-FAMILIES: dict[str, tuple[Callable[[float], Scene], tuple[float, ...]]] = {
-    "decay": (damped, VISCOSITIES),
-    "oscillation": (oscillating, STIFFNESSES),
+FAMILIES: dict[str, tuple[Callable[[float], Scene], range]] = {
+    "decay": (damped, range(6)),
+    "oscillation": (oscillating, range(1, 9)),
 }
+"""Scene by a coefficient, and the powers of ten of the coefficients."""
 
 
 def largest_step(family: str, method: Method, coefficient: float) -> LargestStep:
@@ -200,8 +195,8 @@ def largest_steps(*, workers: int | None = None, progress: str = "") -> list[Lar
     """Find the largest stable step of every method in both families."""
     jobs = [
         (family, method, coefficient)
-        for family, (_, coefficients) in FAMILIES.items()
-        for coefficient in coefficients
+        for family, (_, powers) in FAMILIES.items()
+        for coefficient in [10.0**power for power in powers]
         for method in METHODS.values()
     ]
     return run_jobs(_largest_step, jobs, progress, workers)
@@ -239,15 +234,8 @@ TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: spri
 
 
 @styled
-def draw_largest_steps(steps: DataFrame, longest: float, footnote: str) -> Figure:
-    """Draw the largest stable step over the fastest rate, a panel for each family.
-
-    Args:
-        steps: family, method, rate [1/s] and step [s].
-        longest: the longest step that was tried [s].
-        footnote: small print.
-
-    """
+def draw_largest_steps(steps: DataFrame, footnote: str) -> Figure:
+    """Draw the largest stable step over the fastest rate, a panel for each family."""
     families = list(steps.family.unique())
     figure = free_figure(6.2 * len(families) + 0.6, 6.0)
     panels = figure.subplots(1, len(families), squeeze=False)[0]
@@ -259,16 +247,16 @@ def draw_largest_steps(steps: DataFrame, longest: float, footnote: str) -> Figur
         for name, rows in own.groupby("method", sort=False):
             colour, marker = MARKERS[name]
             x, y = rows.rate.to_numpy(), rows.step.to_numpy()
-            reached = f"every step tried, up to {longest:g} s"
-            if not (y >= longest).all():
+            reached = f"every step tried, up to {LONGEST_S:g} s"
+            if not (y >= LONGEST_S).all():
                 reached = f"step × rate ≤ {x[-1] * y[-1]:.2f}"
                 axes.fill_between(x, 1e-12, y, color=colour, alpha=0.10, linewidth=0.0)
             axes.plot(x, y, color=colour, marker=marker, linewidth=2.0, markersize=7,
                       clip_on=False, zorder=4, label=f"{name}: {reached}")  # fmt: skip
-        axes.set_ylim(0.3 * own.step.min(), 2.0 * longest)
+        axes.set_ylim(0.3 * own.step.min(), 2.0 * LONGEST_S)
         axes.set_xlim(own.rate.min(), own.rate.max())
         axes.set_xlabel("largest |λ| of the family [1/s]")
-        axes.set_title(TITLES.get(family, family))
+        axes.set_title(TITLES[family])
         axes.legend(loc="lower left", fontsize=9)
     panels[0].set_ylabel("step [s]; a method is stable below its line")
     note(figure, footnote, 60 + 80 * len(families))

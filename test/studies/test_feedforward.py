@@ -34,9 +34,10 @@ from studies.feedforward import (
     FeedforwardPlan,
     document,
     feedforward_study,
-    figure,
     page,
+    title,
 )
+from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, stability_limit
 
 REACH = load("reach")
@@ -168,7 +169,7 @@ def test_failures_stay_with_their_reason(small):
 
 def test_what_it_writes_can_be_read(small, tmp_path):
     write(tmp_path, "feedforward", csv=small.loops, document=document(small), page=page(small),
-          figures={"picture": figure(small)})  # fmt: skip
+          figures={"picture": draw_study(small, title(small))})  # fmt: skip
     rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
     assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
     written = json.loads((tmp_path / "feedforward.json").read_text())

@@ -127,7 +127,7 @@ def test_the_figures_show_every_method(tmp_path):
         for family in ("decay", "oscillation") for method in METHODS for c in (1e1, 1e3, 1e5)
     ]  # fmt: skip
     drawn = {
-        "steps": draw_largest_steps(table(steps), LONGEST_S, "made today"),
+        "steps": draw_largest_steps(table(steps), "made today"),
         "regions": draw_regions(*regions(points=81), {"a": np.array([-1 + 1j])}, "made today"),
     }
     for name, figure in drawn.items():
