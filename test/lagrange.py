@@ -136,12 +136,6 @@ class Lagrange:
         spins = [spin(*frames, INNER) for frames in zip(before, after, middle, strict=True)]
         return [times(columns(*frame), omega) for frame, omega in zip(middle, spins, strict=True)]
 
-    def energy(self, gamma, gamma_dot):
-        """T = sum of omega . I omega / 2 over the seven links."""
-        spins = self.spins(gamma, gamma_dot)
-        pairs = zip(self.inertias, spins, strict=True)
-        return sum(dot(omega, times(inertia, omega)) for inertia, omega in pairs) / 2
-
     def inertia_matrix(self, gamma):
         """Second derivatives of T by the rates; T is a quadratic form of them."""
         units = [[mpf(i == j) for j in range(3)] for i in range(3)]

@@ -146,6 +146,13 @@ def seeded_samples(seed: int, count: int, isotropic: bool = False) -> list[Sampl
     return found
 
 
+def agree(ours, truth, scale=None):
+    """Agree to 1e-12 of the largest part of the truth, or of a scale."""
+    truth = np.array(truth, dtype=float)
+    scale = np.abs(truth).max() if scale is None else scale
+    assert np.abs(np.asarray(ours) - truth).max() <= 1e-12 * scale
+
+
 @st.composite
 def samples(draw) -> Sample:
     """Regular admissible states of general and isotropic manipulators."""

@@ -55,7 +55,11 @@ values = (
     | st.none()
     | st.booleans()
     | st.text(max_size=5)
-    | st.lists(numbers, max_size=3)
+    | st.recursive(
+        st.none() | numbers | st.text(max_size=8),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=6,
+    )
     | st.sampled_from([{}, [], [[]], {"xx": 1}, [{}], "gamma_1", "impact", "elastic"])
 )
 

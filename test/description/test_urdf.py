@@ -53,16 +53,12 @@ def angles_of(gamma, mu, beta):
     return {f"{kind}_{k + 1}": float(x[k]) for kind, x in kinds.items() for k in range(3)}
 
 
-def passive(geometry, gamma, rotation):
-    return assembly_of(geometry, gamma, rotation)
-
-
 @pytest.mark.parametrize("isotropic", [False, True])
 def test_poses_of_all_links(isotropic):
     for sample in seeded_samples(11, 8, isotropic):
         read = Read(sample.scene)
         at = sample.posture
-        assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+        assembly = assembly_of(sample.geometry, sample.gamma, sample.rotation)
         angles = angles_of(sample.gamma, assembly.mu, assembly.beta)
         expected = dict.fromkeys(STARS, sample.rotation)
         for k, leg in enumerate(LEGS):
@@ -76,7 +72,7 @@ def test_poses_of_all_links(isotropic):
 def test_a_wrong_angle_opens_the_loops():
     sample = seeded_samples(11, 1)[0]
     read = Read(sample.scene)
-    assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+    assembly = assembly_of(sample.geometry, sample.gamma, sample.rotation)
     angles = angles_of(sample.gamma, -assembly.mu, assembly.beta)
     first, second, _ = (read.rotation(angles, star) for star in STARS)
     assert np.abs(first - second).max() > 0.1
@@ -180,7 +176,7 @@ def test_motion_of_random_mechanisms():
             sample.mechanism, sample.posture, sample.gamma_dot, sample.torque, np.zeros(3)
         )
         motion = rates.of_actuators(sample.posture, sample.gamma_dot, answer)
-        assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+        assembly = assembly_of(sample.geometry, sample.gamma, sample.rotation)
         rate_of = angles_of(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
         angles = angles_of(sample.gamma, assembly.mu, assembly.beta)
         found = acceleration(sample.scene, angles, rate_of, sample.torque)
@@ -195,7 +191,7 @@ def test_motion_under_gravity_with_payload_and_rotors():
     at = virtual_work.posture(geometry, gamma)
     gamma_dot, torque = np.array([1.0, -2.0, 0.5]), np.array([0.3, -1.0, 2.0])
     motion = rates.of_actuators(at, gamma_dot)
-    assembly = passive(geometry, gamma, at.rotation)
+    assembly = assembly_of(geometry, gamma, at.rotation)
     angles = angles_of(gamma, assembly.mu, assembly.beta)
     for spring in scene.springs:  # URDF has none
         torque[LEGS.index(int(spring.joint[-1]))] -= spring.stiffness * (
@@ -216,7 +212,7 @@ def test_mujoco_reads_it():
     text = urdf(sample.scene).replace("</robot>", f"{asked}</robot>")
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    assembly = passive(sample.geometry, sample.gamma, sample.rotation)
+    assembly = assembly_of(sample.geometry, sample.gamma, sample.rotation)
     for name, angle in angles_of(sample.gamma, assembly.mu, assembly.beta).items():
         data.qpos[model.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)

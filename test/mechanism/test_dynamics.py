@@ -2,12 +2,11 @@
 """M, h, energy, momentum and power hold together for full inertia tensors of all links."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanism.closed_chains import random_geometry, random_mechanism, random_pose
 
-from sst_ros.mechanism import continuation, rates, virtual_work
+from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.virtual_work import EquationOfMotion
 
 
@@ -40,26 +39,3 @@ def test_energy_momentum_and_both_dynamics_agree(seed):
     assert np.linalg.norm(acceleration - other) <= 1e-11 * size
     scale = np.linalg.norm(found.m) * size + np.linalg.norm(found.h) + np.linalg.norm(torque)
     assert np.linalg.norm(found.torque(acceleration, moment) - torque) <= 1e-12 * scale
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_power_is_the_rate_of_kinetic_energy(seed):
-    """M' gamma_dot along the motion, by differences along the followed branch."""
-    rng = np.random.default_rng(seed)
-    geometry = random_geometry(rng)
-    mechanism = random_mechanism(rng, geometry)
-    gamma, rotation = random_pose(rng, geometry, least=0.3)
-    rate, torque, moment = rng.normal(size=(3, 3))
-    at = virtual_work.posture(geometry, gamma, rotation)
-    here = EquationOfMotion.of(mechanism, at, rate)
-    acceleration = here.acceleration(torque, moment)
-
-    def energy(h):
-        point = gamma + h * rate + h * h / 2 * acceleration
-        moved = continuation.advance(geometry, rotation, gamma, point)
-        posture = virtual_work.posture(geometry, point, moved)
-        return EquationOfMotion.of(mechanism, posture, rate + h * acceleration).kinetic_energy
-
-    h = 1e-4  # fourth order: truncation below 1e-8 for rates of some 100 /s
-    slope = (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
-    np.testing.assert_allclose(here.power(torque, moment), slope, rtol=1e-6, atol=1e-6)

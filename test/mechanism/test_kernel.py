@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lagrange import OUTER, Lagrange, columns, times
-from models import FAST, inertia_of, samples, seeded_samples
+from models import FAST, agree, inertia_of, samples, seeded_samples
 from mpmath import mp, mpf
 
 from sst_ros.dynamics import kernel
@@ -23,17 +23,10 @@ from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.scene.scene import Link
 
-TOLERANCE = 1e-12
 TINY = 1e-30
 SAMPLES = [pytest.param(s, id=f"isotropic{i}") for i, s in enumerate(seeded_samples(3, 4, True))]
 SAMPLES += [pytest.param(s, id=f"general{i}") for i, s in enumerate(seeded_samples(4, 6))]
 every_sample = pytest.mark.parametrize("sample", SAMPLES)
-
-
-def agree(ours, truth, scale=None):
-    truth = np.array(truth, dtype=float)
-    scale = np.abs(truth).max() if scale is None else scale
-    assert np.abs(np.asarray(ours) - truth).max() <= TOLERANCE * scale
 
 
 def accelerate(sample, torque, moment=None):
@@ -60,13 +53,6 @@ def test_acceleration_is_lagranges(sample):
     expected = times(columns(*truth.rotation(path(mpf(0)))), omega_dot)
     moment = tuple(sample.moment.tolist())
     agree(accelerate(sample, tuple(sample.torque), moment=moment), expected)
-
-
-@every_sample
-def test_gamma_ddot_is_lagranges(sample):
-    truth = Lagrange(sample.scene, sample.rotation)
-    expected = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque)
-    agree(gamma_ddot_of(sample, accelerate(sample, tuple(sample.torque))), expected)
 
 
 def worst_term(sample):

@@ -138,6 +138,7 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample):
     at = virtual_work.posture(geometry, gamma, rotation)
     from_star = rates.of_star(geometry, rotation, star[0], star[1], gamma)
     from_actuators = rates.of_actuators(at, joints[1][0], joints[2][0])
+    assert not from_actuators.omega.flags.writeable
     for motion in (from_star, from_actuators):
         pairs = [
             (motion.omega, star[0]),
@@ -162,28 +163,15 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample):
         (at.j @ rate, star[0]),
         (at.a @ rate, joints[1][1]),
         (at.b @ rate, joints[1][2]),
+        (bias.omega, star[0]),
         (at.j @ acceleration + bias.omega_dot, star[1]),
         (at.a @ acceleration + bias.mu_ddot, joints[2][1]),
         (at.b @ acceleration + bias.beta_ddot, joints[2][2]),
+        (at.u @ acceleration + bias.beta_ddot, joints[2][2]),
         (ja @ rate, links[1, 3]),
         (jipl @ rate, links[1, 4]),
     ]
     assert max(relative(f.ravel(), e.ravel()) for f, e in pairs) <= RELATIVE
-
-
-def test_both_directions_are_inverse_to_each_other():
-    rng = np.random.default_rng(3)
-    for _ in range(50):
-        geometry = random_geometry(rng)
-        gamma, rotation = random_pose(rng, geometry)
-        rate, acceleration = rng.normal(size=(2, 3))
-        at = virtual_work.posture(geometry, gamma, rotation)
-        there = rates.of_actuators(at, rate, acceleration)
-        back = rates.of_star(geometry, rotation, there.omega, there.omega_dot)
-        assert np.linalg.norm(back.gamma_dot - rate) <= 1e-12 * np.linalg.norm(rate)
-        size = np.linalg.norm(acceleration) + np.linalg.norm(there.omega_dot)
-        assert np.linalg.norm(back.gamma_ddot - acceleration) <= 1e-12 * size
-        assert not there.omega.flags.writeable
 
 
 def test_a_serial_singularity_is_refused():
@@ -192,13 +180,3 @@ def test_a_serial_singularity_is_refused():
     rotation = np.stack([np.cross(axis, s), axis, s], axis=1)
     with pytest.raises(SingularConfiguration, match="serial"):
         rates.of_star(ISOTROPIC, rotation, [1.0, 0.0, 0.0])
-
-
-def test_the_acceleration_of_the_sliders_is_that_of_eqs_47_to_49():
-    rng = np.random.default_rng(47)
-    geometry = random_geometry(rng)
-    at = virtual_work.posture(geometry, *random_pose(rng, geometry))
-    rate, acceleration = rng.normal(size=(2, 3))
-    expected = rates.of_actuators(at, rate, acceleration).beta_ddot
-    bias = virtual_work.bias(at, rate).beta_ddot
-    assert at.u @ acceleration + bias == pytest.approx(expected, rel=1e-12, abs=1e-12)
