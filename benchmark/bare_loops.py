@@ -33,8 +33,8 @@ import rclpy
 from benchmark.nodes import Process, Watch, markdown, until
 from sst_ros.host import scheduling
 from sst_ros.nodes import process, topics
-from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
+from sst_ros.nodes.topics import Reader
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation

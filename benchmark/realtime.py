@@ -33,7 +33,7 @@ from std_msgs.msg import Float64MultiArray
 from benchmark import bare_loops, machine
 from benchmark.bare_loops import Beside
 from benchmark.nodes import Process, Watch, markdown
-from sst_ros.nodes.polling import NeverSpun
+from sst_ros.nodes.topics import NeverSpun
 
 MISSED, RATIO = "missed ticks [%]", "missed ticks, times those of the loop"
 BLOCKS = 20

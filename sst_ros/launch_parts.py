@@ -173,8 +173,8 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
         controllers: file of parameters; config/controllers.yaml where empty.
 
     """
-    require("robot_state_publisher", "controller_manager", "joint_state_broadcaster",
-            "joint_state_topic_hardware_interface")  # fmt: skip
+    hardware = "joint_state_topic_hardware_interface"
+    require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
     space = ("/" + given["namespace"].strip("/")).rstrip("/")
     names = f"{space}/sst_simulator/commands_stamped", f"{space}/joint_states"
     document = urdf_with_ros2_control(scene.load(given["scene"]), *names)

@@ -31,9 +31,8 @@ from rosbags.interfaces import (
 
 from sst_ros.errors import SstError
 from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.polling import NeverSpun, take
 from sst_ros.nodes.process import every
-from sst_ros.nodes.topics import Endpoint
+from sst_ros.nodes.topics import Endpoint, NeverSpun
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
 
@@ -92,10 +91,10 @@ class Recorder:
         self.node = Node("sst_recorder")
         self.done = threading.Event()
         given = parameters.declare(self.node, RecorderParameters)
-        self._wanted = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
-        self._foreign = {topic for topic in self._wanted if _last(topic) not in _DECLARED}
+        self._requested = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
+        self._foreign = {topic for topic in self._requested if _last(topic) not in _DECLARED}
         sampled = set(map(_last, topics.SAMPLED))
-        self._required = {topic for topic in self._wanted if _last(topic) in sampled}
+        self._required = {topic for topic in self._requested if _last(topic) in sampled}
         self._recorded: dict[str, RecordedTopic] = {}
         self._unknown: set[str] = set()
         self._ready = False
@@ -136,7 +135,7 @@ class Recorder:
         return (self._required | self._foreign) - heard
 
     def _look(self) -> None:
-        """Subscribe to wanted topics as they appear; print once that all of them are recorded.
+        """Subscribe to requested topics as they appear; print once that all of them are recorded.
 
         Discovery finds the topics of a node one after the other: none may be new in the last look.
         Commands come last: a player may wait for their subscribers, and then expects that the run
@@ -144,7 +143,7 @@ class Recorder:
         """
         silent, new = self._missing() & self._required, False
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self._wanted and topic not in self._recorded.keys() | self._unknown:
+            if topic in self._requested and topic not in self._recorded.keys() | self._unknown:
                 new = True
                 own = _DECLARED.get(_last(topic))
                 own = own if own and own.type_name in types else None
@@ -156,7 +155,7 @@ class Recorder:
                 self._ready = True
                 print(f"ready: {len(self._recorded)} topics", flush=True)
             else:
-                self._wait_for(waiting or self._wanted)
+                self._wait_for(waiting or self._requested)
 
     def _wait_for(self, names: set[str]) -> None:
         text, log = f"waiting for {_join(names)}", self.node.get_logger()
@@ -193,7 +192,7 @@ class Recorder:
     def _take(self) -> None:
         try:
             for topic in self._recorded.values():
-                while (taken := take(topic.subscription, raw=True)) is not None:
+                while (taken := topics.take(topic.subscription)) is not None:
                     data, info = taken
                     self._bag.write(topic.connection, info["received_timestamp"], data)
                     topic.count(info)

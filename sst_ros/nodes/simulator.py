@@ -24,9 +24,9 @@ from sst_ros.host import scheduling
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import code_cache, codegen
 from sst_ros.nodes import parameters, simulation_interfaces, topics
-from sst_ros.nodes.polling import Reader
 from sst_ros.nodes.process import every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
+from sst_ros.nodes.topics import Reader
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop

@@ -53,4 +53,4 @@ def test_bare_loops():
 def test_soak():
     pytest.importorskip("viser", reason="what is soaked has a viewer")
     said = printed("soak", "--minutes", "0.3")
-    assert "missing 0;" in said and "WRONG" not in said
+    assert "missing 0\n" in said and "WRONG" not in said

@@ -9,7 +9,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray
 
-from sst_ros.nodes import polling, topics
+from sst_ros.nodes import topics
 
 MS = 1_000_000
 
@@ -24,13 +24,13 @@ def node(domain):
 
 @pytest.fixture
 def looks(monkeypatch):
-    made, original = [], polling.take
+    made, original = [], topics.take
 
-    def take(subscription, *, raw):
+    def take(subscription):
         made.append(subscription)
-        return original(subscription, raw=raw)
+        return original(subscription)
 
-    monkeypatch.setattr(polling, "take", take)
+    monkeypatch.setattr(topics, "take", take)
     return made
 
 
@@ -47,14 +47,14 @@ def publish(node, *torque):
 
 
 def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(node, looks):
-    reader = polling.Reader(node, topics.SIMULATOR["commands"])
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
     for tick in range(100):
         assert not reader.read(tick * MS)
     assert len(looks) == 5
 
 
 def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks):
-    reader = polling.Reader(node, topics.SIMULATOR["commands"])
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
     assert not reader.read(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
@@ -71,7 +71,7 @@ def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks)
 
 
 def test_without_a_time_every_command_is_taken_at_once(node):
-    reader = polling.Reader(node, topics.SIMULATOR["commands"])
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
     assert not reader.read(time.monotonic_ns())
     publish(node, 1.0, 2.0, 3.0)
     assert len(reader.read(math.inf)) == 1
@@ -79,7 +79,7 @@ def test_without_a_time_every_command_is_taken_at_once(node):
 
 def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
     """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
-    reader = polling.Reader(node, topics.SIMULATOR["commands"])
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     publish(node, 1.0, 2.0, 3.0)
