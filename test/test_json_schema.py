@@ -12,7 +12,6 @@ import yaml
 from sst_ros import __main__ as cli
 from sst_ros.scene.scene import Scene, names
 from sst_ros.scene.schema import json_schema
-from tools.scene_keys import keys
 
 jsonschema = pytest.importorskip("jsonschema")
 
@@ -83,13 +82,8 @@ def test_every_key_is_described_with_its_unit():
     assert list(bare(SCHEMA)) == []
 
 
-def test_the_reference_of_keys_in_docs_is_up_to_date():
-    said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
-    assert said == keys(), "run python -m tools.scene_keys"
-
-
 def test_the_reference_names_every_key():
-    said = keys()
+    said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
 
     def all_keys(schema):
         for name, entry in schema.get("properties", {}).items():

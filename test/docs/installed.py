@@ -13,7 +13,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
 from sst_ros.scene.schema import specs
-from tools.node_tables import NODES
+from tools.reference_pages import NODES
 
 STANDARD = {"use_sim_time"}
 SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")

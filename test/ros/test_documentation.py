@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docs and SROS2 policies against the declarations, and these against running nodes."""
+"""SROS2 policies against the declarations, and these against running nodes."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -7,8 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from sst_ros.runtime import diagnostics
-from tools import node_tables
-from tools.node_tables import NODES, SIMULATION_INTERFACES, policy
+from tools.reference_pages import NODES, SIMULATION_INTERFACES, policy
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
@@ -19,11 +18,6 @@ WITHOUT_REASON = {
     "/sst_simulator/commands_stamped",
 }
 """Topics that exist under conditions only: a parameter, or the scene."""
-
-
-def test_the_docs_are_those_of_the_declarations():
-    page = (ROOT / "docs" / "nodes.md").read_text(encoding="utf-8")
-    assert node_tables.filled(page) == page, "run python -m tools.node_tables"
 
 
 @pytest.mark.parametrize("node", NODES, ids=IDS)
