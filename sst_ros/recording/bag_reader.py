@@ -92,7 +92,7 @@ class Bag:
 
     def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
         if not path.exists():
-            raise refused(path, "bag", str(path), "does not exist")
+            raise refusal(path, "bag", str(path), "does not exist")
         self.path = path
         self.topics: dict[str, str] = {}
         self.damage: tuple[str, ...] = ()
@@ -126,7 +126,7 @@ class Bag:
                 raise self._not_whole(_one_line(error), f" in {topic.key}") from None
             yield topic.key, received_ns, content
         if not count:
-            raise refused(self.path, "messages", 0, "the recording is empty")
+            raise refusal(self.path, "messages", 0, "the recording is empty")
 
     def absence(self, topic: Topic) -> Problem:
         """Describe that a topic is missing."""
@@ -190,7 +190,7 @@ class Bag:
             names = sorted({self.topics.setdefault(topic.key, name), name})
             if len(names) > 1:
                 allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
-                raise refused(self.path, topic.key, ", ".join(names), allowed)
+                raise refusal(self.path, topic.key, ", ".join(names), allowed)
         return topic
 
     def _not_whole(self, reason: str, where: str = "", *, advice: bool = False) -> InputError:
@@ -199,7 +199,7 @@ class Bag:
         allowed += "python -m sst_ros recover BAG makes a whole one of what is intact"
         if advice:
             allowed += ", --damaged reads it here"
-        return refused(self.path, "bag", self.path.name, allowed)
+        return refusal(self.path, "bag", self.path.name, allowed)
 
 
 @dataclass
@@ -421,7 +421,7 @@ def message_types() -> Any:
     return get_typestore(Stores.ROS2_KILTED)
 
 
-def refused(path: Path, key: str, value: object, allowed: str) -> InputError:
+def refusal(path: Path, key: str, value: object, allowed: str) -> InputError:
     """Make the error about one fault of a recording."""
     return InputError(str(path), [Problem(key, value, allowed)])
 

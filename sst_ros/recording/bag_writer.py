@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.enums import CompressionMode
 
 from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.recording.bag_reader import McapFile, message_types, refused
+from sst_ros.recording.bag_reader import McapFile, message_types, refusal
 
 VERSION: Final = 9
 FLUSH_PERIOD_S = 1.0
@@ -210,18 +210,18 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:
-        raise refused(path, "bag", len(files), "must hold one .mcap file")
+        raise refusal(path, "bag", len(files), "must hold one .mcap file")
     try:
         with files[0].open("rb") as opened:
             begin = opened.read(len(MCAP0_MAGIC))
     except OSError as problem:
-        raise refused(path, "bag", str(files[0]), f"must be readable ({problem})") from None
+        raise refusal(path, "bag", str(files[0]), f"must be readable ({problem})") from None
     if sum(one != right for one, right in zip(begin, MCAP0_MAGIC, strict=False)) > 1 or not begin:
-        raise refused(path, "bag", files[0].name, "must be an MCAP file")
+        raise refusal(path, "bag", files[0].name, "must be an MCAP file")
     file = McapFile(files[0])
     target = out or path.with_name(f"{path.stem}_recovered")
     if target.exists():
-        raise refused(target, "bag", str(target), "must be a new folder")
+        raise refusal(target, "bag", str(target), "must be a new folder")
     writer: BagWriter | None = None
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
@@ -234,10 +234,10 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             connections[topic, kind] = writer.connect(topic, kind)
         writer.write(connections[topic, kind], received_ns, data)
     if writer is None:
-        raise refused(path, "bag", 0, "holds no message that was saved")
+        raise refusal(path, "bag", 0, "holds no message that was saved")
     try:
         writer.close()
     except WriterError as problem:
-        raise refused(target, "bag", str(target), f"cannot be written ({problem})") from None
+        raise refusal(target, "bag", str(target), f"cannot be written ({problem})") from None
     damage = [*file.describe(), *([f"{unknown} messages of unknown types"] if unknown else [])]
     return Recovered(target, writer.messages, file.lost + unknown, file.cut, tuple(damage))

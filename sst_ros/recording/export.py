@@ -10,14 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.host.output import require_free, write_into
 from sst_ros.recording import signals
-from sst_ros.recording.signals import Signals
-from sst_ros.recording.topic_tables import TIMES, Column
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,29 +36,7 @@ def frame(bag: str | Path, table: str = "samples") -> pd.DataFrame:
         MissingDependency: pandas is not installed.
 
     """
-    return table_of(signals.read(Path(bag)), table)
-
-
-def table_of(run: Signals, table: str = "samples") -> pd.DataFrame:
-    """Return a table of a recording that was read, as `frame` does.
-
-    Raises:
-        InputError: it has no such table.
-        MissingDependency: pandas is not installed.
-
-    """
-    pandas = require("pandas")
-    if table not in run.tables:
-        allowed = "must be one of those in the bag: " + ", ".join(run.tables)
-        raise InputError(str(run.path), [Problem("table", table, allowed)])
-    series = run.tables[table]
-    times = (run.time_ns(table), series.stamp_ns, series.received_ns)
-    data = {column.name: values for column, values in zip(TIMES, times, strict=True)}
-    for column, values in zip(series.columns, series.values.T, strict=True):
-        data[column.name] = values.astype(np.int64) if column.unit == "ns" else values
-    result: pd.DataFrame = pandas.DataFrame(data).set_index(TIMES[0].name)
-    result.attrs = {column.name: column.text for column in _columns(run, table)}
-    return result
+    return signals.read(Path(bag)).table(table)
 
 
 def export(bag: Path, out: Path, form: str = FORMATS[0], *, force: bool = False) -> list[Path]:
@@ -86,26 +59,18 @@ def export(bag: Path, out: Path, form: str = FORMATS[0], *, force: bool = False)
         paths = []
         for name in run.tables:
             paths.append(out / f"{name}.{form}")
-            table = table_of(run, name)
+            table = run.table(name)
             if form == "csv":
                 # pandas writes the fewest digits that read back as the same bits.
                 table.to_csv(paths[-1], lineterminator="\n")
-            else:
-                _write_parquet(paths[-1], table, _columns(run, name))
+                continue
+            pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
+            arrow = pyarrow.Table.from_pandas(table.reset_index(), preserve_index=False)
+            fields = [
+                arrow.schema.field(column.name).with_metadata(
+                    {"unit": column.unit, "description": column.text}
+                )
+                for column in run.columns(name)
+            ]
+            parquet.write_table(arrow.cast(pyarrow.schema(fields)), paths[-1])
     return paths
-
-
-def _columns(run: Signals, table: str) -> tuple[Column, ...]:
-    return (*TIMES, *run.tables[table].columns)
-
-
-def _write_parquet(path: Path, table: pd.DataFrame, columns: tuple[Column, ...]) -> None:
-    pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
-    arrow = pyarrow.Table.from_pandas(table.reset_index(), preserve_index=False)
-    fields = [
-        arrow.schema.field(column.name).with_metadata(
-            {"unit": column.unit, "description": column.text}
-        )
-        for column in columns
-    ]
-    parquet.write_table(arrow.cast(pyarrow.schema(fields)), path)

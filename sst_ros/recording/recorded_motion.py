@@ -20,14 +20,13 @@ def samples(bag: str | Path) -> MotionSamples:
     """
     from sst_ros.recording.recording import read  # needs rosbags, which other motions do not
 
-    recording = read(Path(bag))
-    whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
+    run = read(bag)
+    whole = np.flatnonzero(np.isfinite(run.quaternion).all(axis=1))
     if len(whole) < 2:
         problem = Problem("orientation", len(whole), "two samples or more must have one")
         raise InputError(str(bag), [problem])
     first = whole[0]
-    x, y, z, w = recording.quaternion[first].tolist()
+    x, y, z, w = run.quaternion[first].tolist()
     return MotionSamples(
-        recording.seconds[first:], recording.gamma[first:], recording.gamma_dot[first:],
-        (x, y, z, w),
-    )  # fmt: skip
+        run.seconds[first:], run.gamma[first:], run.gamma_dot[first:], (x, y, z, w)
+    )

@@ -14,8 +14,7 @@ from sst_ros.errors import InputError
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import signals
-from sst_ros.recording.bag_reader import refused
-from sst_ros.recording.export import table_of
+from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.signals import Integers, Series, Signals, places
 from sst_ros.recording.topic_tables import (
     COMMANDS,
@@ -200,7 +199,7 @@ class Recording:
             MissingDependency: pandas is not installed.
 
         """
-        return table_of(self.signals, name)
+        return self.signals.table(name)
 
 
 def read(path: str | Path, *, damaged: bool = False) -> Recording:
@@ -220,7 +219,7 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
     if absent:
         raise InputError(str(path), absent)
     if found.scene is None:
-        raise refused(path, SCENE.key, 0, "the recording must hold one scene")
+        raise refusal(path, SCENE.key, 0, "the recording must hold one scene")
     reports = tuple(
         (one.received_ns, one.values)
         for one in found.statuses
@@ -234,16 +233,16 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
         allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
         if reports and (fault := reports[-1][1].get("fault")):
             allowed += f"; the simulator reports: {fault}"
-        raise refused(path, "joint_states", len(stamps), allowed)
+        raise refusal(path, "joint_states", len(stamps), allowed)
     if not len(ticks.stamp_ns):
-        raise refused(path, "applied_torques", 0, "the run has no recorded torque")
+        raise refusal(path, "applied_torques", 0, "the run has no recorded torque")
     start_ns = min(int(stamps[0]), int(ticks.stamp_ns[0]))
     quaternion = _rows_at(stamps, orientation)
     with np.errstate(over="ignore"):  # too long is refused just below
         length = np.sqrt(np.einsum("ij,ij->i", quaternion, quaternion))
     if np.any(np.abs(length - 1.0) > 1e-6):  # nan compares False: lost is not wrong
         wrong = float(length[np.abs(length - 1.0) > 1e-6][0])
-        raise refused(path, "orientation", wrong, "quaternions must have length 1")
+        raise refusal(path, "orientation", wrong, "quaternions must have length 1")
     gamma, mu, beta, gamma_dot, mu_dot, beta_dot, effort = np.split(joints.values, 7, axis=1)
     return Recording(
         path=path,
@@ -279,7 +278,7 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
     bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refused(found.path, key, row, f"is not finite at stamp {stamp} ns")
+        raise refusal(found.path, key, row, f"is not finite at stamp {stamp} ns")
     return series
 
 
@@ -301,7 +300,7 @@ def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
     if overlap.any():
         at = int(starts[1:][overlap][0])
         allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refused(path, "applied_torques", at, allowed)
+        raise refusal(path, "applied_torques", at, allowed)
     torque, moment = series.values[:, 1:4], series.values[:, 4:]
     known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
     return Ticks(starts - start_ns, ends - start_ns, torque, moment if known else None)

@@ -12,14 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
+from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording.bag_reader import Bag, refused
+from sst_ros.recording.bag_reader import Bag, refusal
 from sst_ros.recording.topic_tables import (
     DIAGNOSTICS,
     EULER,
@@ -28,6 +29,7 @@ from sst_ros.recording.topic_tables import (
     SCENE,
     TABLES,
     TICKS,
+    TIMES,
     TOPIC_TABLES,
     Column,
     InvalidMessage,
@@ -36,6 +38,9 @@ from sst_ros.recording.topic_tables import (
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Integers: TypeAlias = NDArray[np.int64]
 
@@ -148,6 +153,31 @@ class Signals:
         at = [place for name in names for place in self._places(name, table)]
         return np.asarray(self.tables[table].values[:, at])
 
+    def columns(self, table: str) -> tuple[Column, ...]:
+        """Columns of a table as pandas has it: times first."""
+        return (*TIMES, *self.tables[table].columns)
+
+    def table(self, name: str = "samples") -> pd.DataFrame:
+        """Return a table as pandas, indexed by time; `attrs` describes each column.
+
+        Raises:
+            InputError: the recording has no such table.
+            MissingDependency: pandas is not installed.
+
+        """
+        pandas = require("pandas")
+        if name not in self.tables:
+            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
+            raise refusal(self.path, "table", name, allowed)
+        series = self.tables[name]
+        times = (self.time_ns(name), series.stamp_ns, series.received_ns)
+        data = {column.name: values for column, values in zip(TIMES, times, strict=True)}
+        for column, values in zip(series.columns, series.values.T, strict=True):
+            data[column.name] = values.astype(np.int64) if column.unit == "ns" else values
+        result: pd.DataFrame = pandas.DataFrame(data).set_index(TIMES[0].name)
+        result.attrs = {column.name: column.text for column in self.columns(name)}
+        return result
+
     def _places(self, name: str, table: str) -> list[int]:
         series = self.tables.get(table)
         found = enumerate(series.columns if series else ())
@@ -181,15 +211,15 @@ def read(path: Path, *, damaged: bool = False) -> Signals:
             try:
                 collected[key].add(received_ns, content)
             except InvalidMessage as error:
-                raise refused(path, key, error.value, str(error)) from None
+                raise refusal(path, key, error.value, str(error)) from None
     idle = collected[JOINT_STATES.topic.key].skipped
     series = {key: collected.pop(key).series(path) for key in list(collected)}
     found = {key: one for key, one in series.items() if len(one.stamp_ns)}
     if not found:
         allowed = "must have at least one of " + ", ".join(t.topic.ending for t in TOPIC_TABLES)
-        raise refused(path, "topics", None, allowed)
+        raise refusal(path, "topics", None, allowed)
     if len(scenes) > 1:
-        raise refused(path, "scene", len(scenes), "the recording must hold one scene")
+        raise refusal(path, "scene", len(scenes), "the recording must hold one scene")
     stamped = [table.topic.key for table in (*TABLES["samples"], TICKS)]
     starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
     origin = f"{path}: {bag.topics.get(SCENE.key)}"
@@ -239,7 +269,7 @@ class _Rows:
                 again = again[~(values[again] == values[again + 1]).all(axis=1)]
             if len(again):
                 allowed = f"stamp {stamps[again[0]]} ns comes twice; record one simulator a bag"
-                raise refused(path, self._table.topic.key, len(again), allowed)
+                raise refusal(path, self._table.topic.key, len(again), allowed)
             stays = np.append(True, stamps[1:] != stamps[:-1])[: len(stamps)]
             if not stays.all():
                 stamps, received, values = stamps[stays], received[stays], values[stays]

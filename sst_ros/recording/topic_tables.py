@@ -66,10 +66,10 @@ class TopicTable(NamedTuple):
 
 
 class _JointRows:
-    """Reads positions, velocities and efforts of some joints from JointState messages."""
+    """Reads positions, velocities and the efforts of actuators from JointState messages."""
 
-    def __init__(self, joints: Sequence[str], efforts: Sequence[str]) -> None:
-        self._joints, self._efforts = joints, efforts
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = joints
         self._names: list[str] = []
         self._at: list[int] = []
 
@@ -78,37 +78,32 @@ class _JointRows:
         if is_idle(stamp, message.header.frame_id):
             return []
         if message.name != self._names:
-            self._at, self._names = places_of(self._joints, message.name), list(message.name)
+            self._at, self._names = _places(self._joints, message.name), list(message.name)
         parts = message.position, message.velocity, message.effort
         sizes = {len(self._names), *map(len, parts)}
         if len(sizes) > 1:
             allowed = "name, position, velocity and effort must be equally long"
             raise InvalidMessage(sorted(sizes), allowed)
         position, velocity, effort = (part[self._at].tolist() for part in parts)
-        return [(stamp, position + velocity + effort[: len(self._efforts)])]
+        return [(stamp, position + velocity + effort[: len(ACTUATED)])]
 
 
-def _quaternion(message: Any) -> Rows:
-    q = message.quaternion
-    return _stamped(message, (q.x, q.y, q.z, q.w))
+def _read_quaternion(message: Any) -> Rows:
+    stamp, q = nanoseconds(message.header.stamp), message.quaternion
+    return [(stamp, (q.x, q.y, q.z, q.w))] if stamp else []
 
 
-def _vector(message: Any) -> Rows:
-    v = message.vector
-    return _stamped(message, (v.x, v.y, v.z))
+def _read_vector(message: Any) -> Rows:
+    stamp, v = nanoseconds(message.header.stamp), message.vector
+    return [(stamp, (v.x, v.y, v.z))] if stamp else []
 
 
-def _moment(message: Any) -> Rows:
+def _read_moment(message: Any) -> Rows:
     m = message.wrench.torque
     return [(nanoseconds(message.header.stamp), (m.x, m.y, m.z))]
 
 
-def _stamped(message: Any, values: Sequence[float]) -> Rows:
-    stamp = nanoseconds(message.header.stamp)
-    return [(stamp, values)] if stamp else []
-
-
-def _ticks(message: Any) -> Rows:
+def _read_ticks(message: Any) -> Rows:
     """Read the length of each tick [ns], exact in a double, its torques, and moments or nan."""
     start = nanoseconds(message.header.stamp)
     if not start:
@@ -116,8 +111,8 @@ def _ticks(message: Any) -> Rows:
     names = message.joint_names
     at, moments = [0, 1, 2], []
     if names:
-        at = places_of(ACTUATED, names)
-        moments = places_of(MOMENTS, names) if set(MOMENTS) <= set(names) else []
+        at = _places(ACTUATED, names)
+        moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
     rows: Rows = []
     end = start
     for point in message.points:
@@ -134,92 +129,102 @@ def _ticks(message: Any) -> Rows:
     return rows
 
 
-def _commands(message: Any) -> Rows:
+def _read_commands(message: Any) -> Rows:
     # Others are dropped by the simulator too.
     return [(0, message.data.tolist())] if len(message.data) == 3 else []
 
 
-def _stamped_commands(message: Any) -> Rows:
+def _read_stamped_commands(message: Any) -> Rows:
     if sorted(message.name) != sorted(ACTUATED) or len(message.effort) != 3:
         return []
-    at = places_of(ACTUATED, message.name)
+    at = _places(ACTUATED, message.name)
     return [(nanoseconds(message.header.stamp), message.effort[at].tolist())]
 
 
-def places_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Find where wanted names stand among others.
-
-    Raises:
-        InvalidMessage: some are missing.
-
-    """
-    absent = [name for name in wanted if name not in names]
+def _places(requested: Sequence[str], names: Sequence[str]) -> list[int]:
+    absent = [name for name in requested if name not in names]
     if absent:
         raise InvalidMessage(list(names), "joints are missing: " + ", ".join(absent))
-    return [list(names).index(name) for name in wanted]
-
-
-def _table(
-    topic: Topic, rows: Callable[[Any], Rows], *parts: tuple[Sequence[str], str, str],
-    stamped: bool = True,
-) -> TopicTable:  # fmt: skip
-    columns = [Column(name, unit, what, topic.key) for names, unit, what in parts for name in names]
-    return TopicTable(topic, tuple(columns), rows, stamped)
+    return [list(names).index(name) for name in requested]
 
 
 def _legs(name: str) -> list[str]:
     return [f"{name}_{leg}" for leg in (1, 2, 3)]
 
 
+def _table(
+    key: str,
+    message_type: str,
+    rows: Callable[[Any], Rows],
+    *parts: tuple[Sequence[str], str, str],
+    stamped: bool = True,
+) -> TopicTable:
+    """Make the table of the topic that ends in its key; a part is columns, their unit and what."""
+    columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
+    return TopicTable(Topic(key, f"/{key}", message_type), tuple(columns), rows, stamped)
+
+
 _JOINT_STATE = "sensor_msgs/msg/JointState"
+_COMMANDED = (_legs("tau"), "N m", "commanded torque")
+_MOMENT = "external moment on the star in {B}"
 
 JOINT_STATES = _table(
-    Topic("joint_states", "/joint_states", _JOINT_STATE), _JointRows(JOINTS, ACTUATED),
+    "joint_states",
+    _JOINT_STATE,
+    _JointRows(JOINTS),
     *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
     *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
-)  # fmt: skip
+)
 ORIENTATION = _table(
-    Topic("orientation", "/orientation", "geometry_msgs/msg/QuaternionStamped"), _quaternion,
+    "orientation",
+    "geometry_msgs/msg/QuaternionStamped",
+    _read_quaternion,
     (("q_x", "q_y", "q_z", "q_w"), "1", "quaternion of {E} in {B}"),
-)  # fmt: skip
+)
 EULER = _table(
-    Topic("euler_zyz", "/euler_zyz", "geometry_msgs/msg/Vector3Stamped"), _vector,
+    "euler_zyz",
+    "geometry_msgs/msg/Vector3Stamped",
+    _read_vector,
     (("theta", "phi", "psi"), "rad", "ZYZ angle of {E} in {B}"),
-)  # fmt: skip
+)
 REFERENCE = _table(
-    Topic("reference", "/reference", _JOINT_STATE), _JointRows(ACTUATED, ACTUATED),
+    "reference",
+    _JOINT_STATE,
+    _JointRows(ACTUATED),
     (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
     (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
     (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
-)  # fmt: skip
+)
 TRACKING_ERROR = _table(
-    Topic("tracking_error", "/tracking_error", _JOINT_STATE), _JointRows(ACTUATED, ACTUATED),
+    "tracking_error",
+    _JOINT_STATE,
+    _JointRows(ACTUATED),
     (_legs("gamma_error"), "rad", "desired less measured angle"),
     (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
     (_legs("tau_feedback"), "N m", "torque of the feedback"),
-)  # fmt: skip
+)
 TICKS = _table(
-    Topic("applied_torques", "/applied_torques", "trajectory_msgs/msg/JointTrajectory"), _ticks,
+    "applied_torques",
+    "trajectory_msgs/msg/JointTrajectory",
+    _read_ticks,
     (("length",), "ns", "length of the tick, which begins at the stamp"),
     (_legs("tau"), "N m", "torque held over the tick"),
-    (MOMENTS, "N m", "external moment on the star in {B} over the tick"),
-)  # fmt: skip
+    (MOMENTS, "N m", f"{_MOMENT} over the tick"),
+)
 COMMANDS = _table(
-    Topic("commands", "/commands", "std_msgs/msg/Float64MultiArray"), _commands,
-    (_legs("tau"), "N m", "commanded torque"),
-    stamped=False,
-)  # fmt: skip
+    "commands", "std_msgs/msg/Float64MultiArray", _read_commands, _COMMANDED, stamped=False
+)
 STAMPED_COMMANDS = _table(
-    Topic("commands_stamped", "/commands_stamped", _JOINT_STATE), _stamped_commands,
-    (_legs("tau"), "N m", "commanded torque"),
-    stamped=False,
-)  # fmt: skip
+    "commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED, stamped=False
+)
 MOMENT = _table(
-    Topic("external_moment", "/external_moment", "geometry_msgs/msg/WrenchStamped"), _moment,
-    (MOMENTS, "N m", "external moment on the star in {B}"),
+    "external_moment",
+    "geometry_msgs/msg/WrenchStamped",
+    _read_moment,
+    (MOMENTS, "N m", _MOMENT),
     stamped=False,
-)  # fmt: skip
+)
 
 SCENE = Topic("scene", "/scene", "std_msgs/msg/String")
 DIAGNOSTICS = Topic("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", False)

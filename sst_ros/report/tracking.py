@@ -17,7 +17,7 @@ from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matr
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
-from sst_ros.recording.bag_reader import refused
+from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.signals import Integers, places
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR
@@ -63,7 +63,7 @@ def read(path: Path) -> TrackedRun:
     found = of(run)
     if found is None:
         allowed = "two samples or more must have a reference"
-        raise refused(path, KEYS[0], 0, allowed)
+        raise refusal(path, KEYS[0], 0, allowed)
     return found
 
 

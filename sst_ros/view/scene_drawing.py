@@ -140,9 +140,12 @@ class SceneDrawing:
         places[f"{STAR}/E"] = ("E", self._scene.star.radius * np.array([0.0, 0.0, 1.36]))
         for name, (text, position) in places.items():
             self._server.scene.add_label(
-                f"{_ROOT}/{name}", text, position=position, anchor="center-center",
+                f"{_ROOT}/{name}",
+                text,
+                position=position,
+                anchor="center-center",
                 font_screen_scale=2.0,
-            )  # fmt: skip
+            )
 
 
 def add_shape(server: ViserServer, name: str, shape: Shape) -> None:

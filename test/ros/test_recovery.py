@@ -7,7 +7,6 @@ import signal
 import numpy as np
 import pytest
 from mcap.writer import MCAP0_MAGIC
-from rosbags.rosbag2 import Reader
 from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import InputError
@@ -67,28 +66,6 @@ def test_a_full_disk_ends_the_recorder_in_words(nodes, observer, tmp_path):
     run = recording.read(bag_writer.recover(tmp_path / "bag").bag)
     assert len(run.time_ns) > 100
     assert np.array_equal(run.time_ns, np.arange(len(run.time_ns)) * 2_000_000)
-
-
-@pytest.mark.slow
-def test_every_cut_gives_what_lies_before_it(nodes, observer, tmp_path):
-    recorder, simulator = recorded(nodes, observer, tmp_path / "bag", duration=0.3)
-    assert simulator.wait(timeout=20) == 0
-    assert nodes.stop(recorder)[0] == 0
-    (file,) = (tmp_path / "bag").glob("*.mcap")
-    whole = file.read_bytes()
-    with Reader(tmp_path / "bag") as bag:
-        expected = [(c.topic, t, bytes(raw)) for c, t, raw in bag.messages()]
-    counts = []
-    for part in (0.2, 0.5, 0.9, 1.0):
-        cut = tmp_path / f"cut_{part}.mcap"
-        cut.write_bytes(whole[: int(part * len(whole))])
-        result = bag_writer.recover(cut)
-        with Reader(result.bag) as bag:
-            found = [(c.topic, t, bytes(raw)) for c, t, raw in bag.messages()]
-        assert set(found) <= set(expected) and len(found) == result.messages
-        assert result.cut == (part < 1.0)
-        counts.append(len(found))
-    assert counts == sorted(counts) and counts[-1] == len(expected) and counts[0] > 0
 
 
 def test_what_cannot_be_recovered_is_refused(tmp_path):

@@ -16,6 +16,7 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from sst_ros.__main__ import main
 from sst_ros.errors import InputError
 from sst_ros.view.server import LOCAL, PageServer
 
@@ -137,3 +138,16 @@ def test_a_port_that_is_none_ends_the_command_with_one_line(bag):
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert ended.returncode != 0
     assert "Traceback" not in ended.stderr and "from 1024 to 65535" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["no_such_bag"], "does not exist"),
+        (["--scene", "no_such_scene"], "must be a readable .yaml file"),
+        (["some_bag", "--scene", "swing"], "a bag or a scene, not both"),
+    ],
+)
+def test_what_cannot_be_shown(words, said, capsys):
+    assert main(["view", *words]) == 1
+    assert said in capsys.readouterr().err
