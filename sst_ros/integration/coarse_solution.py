@@ -18,8 +18,6 @@ _SHARP, _SLIDING = 10.0, 5.0
 """A step loses its order where a rate changes by 10 times the smoothing of a Coulomb torque, at
 rates below 5 times; RK4 resolves less sharp ones within the accuracy of the estimate."""
 
-Vector = Sequence[float]
-
 
 class Point(NamedTuple):
     """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
@@ -88,7 +86,7 @@ def coulomb_joints(scene: Scene) -> Iterator[tuple[int, float]]:
                 yield from ((3 * kind + k, friction.smoothing) for k in range(3))
 
 
-def rescaled(y: Vector, coarse: Vector, order: int, new: int) -> list[float]:
+def rescaled(y: Sequence[float], coarse: Sequence[float], order: int, new: int) -> list[float]:
     """Move the coarse solution so that with a method of order `new` it means the same error."""
     if order == new:
         return coarse if isinstance(coarse, list) else list(coarse)

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.bodies import Base, Star
+from sst_ros.scene.loads import Workspace
 from sst_ros.state import Array
 
 __all__ = ["Array", "Geometry", "frozen"]
@@ -20,6 +21,17 @@ def frozen(*arrays: Any) -> tuple[Any, ...]:
     for array in arrays:
         array.setflags(write=False)
     return arrays
+
+
+class HasGeometry(Protocol):
+    """What of a scene has a part in its geometry."""
+
+    @property
+    def base(self) -> Base: ...
+    @property
+    def star(self) -> Star: ...
+    @property
+    def workspace(self) -> Workspace: ...
 
 
 @dataclass(frozen=True)
@@ -46,7 +58,7 @@ class Geometry:
     beta_max: Any
 
     @classmethod
-    def of(cls, scene: Scene) -> Geometry:
+    def of(cls, scene: HasGeometry) -> Geometry:
         """Derive the geometry of a scene."""
         return cls.build(
             scene.base.v, np.radians(scene.star.alpha_deg), np.radians(scene.workspace.beta_max_deg)

@@ -24,7 +24,6 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.signals import Integers, places
 from sst_ros.report import states
-from sst_ros.report.states import Vector
 from sst_ros.state import NANOSECONDS
 
 COMPILED_FROM = 10_000
@@ -150,7 +149,7 @@ class _Reference:
         self._tick_ns = recording.ticks.period_ns
         self._error, self._own = (Deviation.none(len(recording.time_ns)) for _ in range(2))
 
-    def compare(self, start: Vector | None, *, restart: bool) -> Comparison:
+    def compare(self, start: tuple[float, ...] | None, *, restart: bool) -> Comparison:
         """Integrate and compare.
 
         Args:
@@ -196,7 +195,7 @@ class _Reference:
             total, int(PLAIN_TICKS * self._tick_ns // np.median(ticks.end_ns - ticks.start_ns))
         )
 
-    def _restart(self, first: int, stop: int) -> tuple[int, Vector] | None:
+    def _restart(self, first: int, stop: int) -> tuple[int, tuple[float, ...]] | None:
         """Find the next tick that begins at a sample, and the state of that sample."""
         recording = self._recording
         at = places(recording.time_ns, self._ticks.start_ns[first:stop])
@@ -208,7 +207,7 @@ class _Reference:
         state = states.of_samples(geometry, recording, [int(at[tick])])[0]
         return first + tick, tuple(state.tolist())
 
-    def _integrate(self, start: Vector, first: int, stop: int) -> int:
+    def _integrate(self, start: tuple[float, ...], first: int, stop: int) -> int:
         """Integrate ticks without gaps between them; return the first that was not reached."""
         state = np.array(start)
         for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):

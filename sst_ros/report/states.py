@@ -25,7 +25,6 @@ from sst_ros.recording.recording import Recording
 from sst_ros.recording.signals import Integers
 from sst_ros.scene.scene import Scene
 
-Vector = tuple[float, ...]
 Places: TypeAlias = "slice | list[int] | Integers"
 
 _TOGETHER = 8192
@@ -35,7 +34,7 @@ SAME_START = 1e-9
 where samples are lost and the first one may belong to a later time."""
 
 
-def initial(scene: Scene) -> Vector:
+def initial(scene: Scene) -> tuple[float, ...]:
     """State at t = 0, seven numbers (quaternion, W in {E} [rad/s]), by the paper's kinematics.
 
     Actuators that lag add three: they give no torque yet.
