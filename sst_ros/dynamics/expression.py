@@ -10,12 +10,15 @@ the source of one flat Python function, for the interpreter or for a compiler.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import add, mul, sub, truediv
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-Value = Any  # an Expression or a float
+Value = Any  # an Expression, a Number or a float
 
 _TEMPLATES = {
     "add": "{} + {}",
@@ -32,6 +35,7 @@ _TEMPLATES = {
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
 }
+_OPERATORS = {"add": add, "sub": sub, "mul": mul, "div": truediv}
 
 
 class Graph:
@@ -43,7 +47,9 @@ class Graph:
 
     def node(self, op: str, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
-        keys = tuple(("n", a.index) if isinstance(a, Expression) else ("c", a) for a in args)
+        keys = tuple(
+            ("n", a.index) if isinstance(a, Expression) else ("c", _origin(a)) for a in args
+        )
         key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
         if key not in self._known:
             self._known[key] = Expression(self, len(self.nodes))
@@ -85,11 +91,10 @@ class Expression:
         return -self if _is(other, 0.0) else self.graph.node("sub", other, self)
 
     def __mul__(self, other: Value) -> Value:
-        if _is_constant(other):
-            if other == 0.0:
-                return 0.0
-            if abs(other) == 1.0:
-                return self if other > 0.0 else -self
+        if _is(other, 0.0):
+            return 0.0
+        if _is(other, 1.0) or _is(other, -1.0):
+            return self if other > 0.0 else -self
         mine, theirs = _drop_minus(self), _drop_minus(other)
         if mine is not None and theirs is not None:
             return mine * theirs
@@ -100,7 +105,7 @@ class Expression:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Value) -> Value:
-        if _is_constant(other):
+        if _is_constant(other) and not isinstance(other, Number):
             if abs(other) == 1.0:
                 return self * other
             if math.frexp(other)[0] in (0.5, -0.5):
@@ -123,6 +128,71 @@ class Expression:
     def apply(self, op: str, *args: Value) -> Value:
         """Note a function of this expression, or of `args`."""
         return self.graph.node(op, *(args or (self,)))
+
+
+class Number(float):
+    """A constant that another scene of the same structure may have another value of.
+
+    Arithmetic folds it as any float, but it never counts as 0 or 1, and it is the same as another
+    one only if both come from the same numbers in the same way: so what is traced depends on no
+    value. `origin` says where it comes from.
+    """
+
+    origin: Any
+
+    def __new__(cls, value: float, origin: Any) -> Number:
+        """Make a number of a value."""
+        number = super().__new__(cls, value)
+        number.origin = origin
+        return number
+
+    def apply(self, op: str, *args: Value) -> Value:
+        """Return a function of this number, or of `args`."""
+        args = args or (self,)
+        for entry in args:
+            if isinstance(entry, Expression):
+                return entry.apply(op, *args)
+        values = tuple(map(float, args))
+        if op in _OPERATORS:
+            value = _OPERATORS[op](*values)
+        else:
+            value = max(*values, 0.0) if op == "positive" else getattr(math, op)(*values)
+        return Number(value, (op, *map(_origin, args)))
+
+    def __add__(self, other: Value) -> Value:
+        return self._fold("add", self, other)
+
+    def __radd__(self, other: Value) -> Value:
+        return self._fold("add", other, self)
+
+    def __sub__(self, other: Value) -> Value:
+        return self._fold("sub", self, other)
+
+    def __rsub__(self, other: Value) -> Value:
+        return self._fold("sub", other, self)
+
+    def __mul__(self, other: Value) -> Value:
+        return self._fold("mul", self, other)
+
+    def __rmul__(self, other: Value) -> Value:
+        return self._fold("mul", other, self)
+
+    def __truediv__(self, other: Value) -> Value:
+        return self._fold("div", self, other)
+
+    def __rtruediv__(self, other: Value) -> Value:
+        return self._fold("div", other, self)
+
+    def __neg__(self) -> Value:
+        op, *args = self.origin if isinstance(self.origin, tuple) else ("",)
+        return Number(-float(self), args[0] if op == "neg" else ("neg", self.origin))
+
+    def _fold(self, op: str, *args: Value) -> Value:
+        if any(isinstance(entry, Expression) for entry in args):
+            return NotImplemented
+        if op == "mul" and 0.0 in args and not all(isinstance(x, Number) for x in args):
+            return 0.0
+        return self.apply(op, *args)
 
 
 @dataclass(frozen=True)
@@ -173,20 +243,59 @@ class Program:
             tuple(map(renumber, self.outputs)),
         )
 
-    def source(self, name: str) -> str:
-        """Source of a flat function of all inputs that returns the tuple of outputs."""
+    def source(self, name: str, slots: Slots | None = None) -> str:
+        """Source of a flat function of all inputs that returns the tuple of outputs.
+
+        With `slots` its last argument is the vector p, which it takes its numbers from.
+        """
+        lines, results = self.body(slots)
+        given = self.inputs
+        if slots is not None:
+            given, lines = (*given, "p"), [*slots.reads([*lines, *results]), *lines]
+        lines = [f"def {name}({', '.join(given)}):", *(f"    {line}" for line in lines)]
+        return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
+
+    def body(self, slots: Slots | None = None) -> tuple[list[str], list[str]]:
+        """Lines v0 = .., v1 = .., one for each step, and the outputs; numbers have their slots."""
         names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
 
         def word(operand: float | Operand) -> str:
             if isinstance(operand, Operand):
                 return names[operand.number]
+            if slots is not None and isinstance(operand, Number):
+                return slots.name(operand)
             return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
-        lines = [f"def {name}({', '.join(self.inputs)}):"]
-        for i, (op, operands) in enumerate(self.steps):
-            lines.append(f"    v{i} = " + _TEMPLATES[op].format(*map(word, operands)))
-        lines.append(f"    return ({', '.join(map(word, self.outputs))},)")
-        return "\n".join(lines) + "\n"
+        lines = [
+            f"v{i} = " + _TEMPLATES[op].format(*map(word, operands))
+            for i, (op, operands) in enumerate(self.steps)
+        ]
+        return lines, [word(output) for output in self.outputs]
+
+
+class Slots:
+    """Where the numbers of some programs are in the vector p that their compiled code takes.
+
+    Attributes:
+        values: the vector, for the scene that the programs were traced for.
+
+    """
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self._slots: dict[Any, int] = {}
+
+    def name(self, number: Number) -> str:
+        """Return the name of a number, which is new if no number of its origin was there."""
+        slot = self._slots.setdefault(number.origin, len(self.values))
+        if slot == len(self.values):
+            self.values.append(float(number))
+        return f"c{slot}"
+
+    def reads(self, lines: Sequence[str], place: str = "p[{}]") -> list[str]:
+        """Lines that read what other lines name."""
+        used = {int(found) for line in lines for found in re.findall(r"\bc(\d+)\b", line)}
+        return [f"c{slot} = {place.format(slot)}" for slot in sorted(used)]
 
 
 class Operand(NamedTuple):
@@ -200,6 +309,24 @@ def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Pr
     graph = Graph()
     symbols = [graph.node("input", name) for name in inputs]
     return program_of(graph, tuple(inputs), tuple(function(*symbols)))
+
+
+def number_constants(value: Any, origin: tuple[str | int, ...] = ()) -> Any:
+    """Return a tree of constants with a Number for each that is neither 0 nor 1 nor -1.
+
+    Its sections become objects that are not checked.
+    """
+    if isinstance(value, float):
+        return value if value in (0.0, 1.0, -1.0) else Number(value, origin)
+    if value is None or isinstance(value, (Expression, str)):
+        return value
+    if isinstance(value, tuple):
+        parts = [number_constants(part, (*origin, i)) for i, part in enumerate(value)]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    fields = vars(value).items()
+    return SimpleNamespace(
+        **{name: number_constants(part, (*origin, name)) for name, part in fields}
+    )
 
 
 def with_jacobian(
@@ -221,7 +348,9 @@ def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) 
     """Return what a graph computes, whose first nodes are the inputs."""
 
     def operand(value: Value) -> float | Operand:
-        return Operand(value.index) if isinstance(value, Expression) else float(value)
+        if isinstance(value, Expression):
+            return Operand(value.index)
+        return value if isinstance(value, Number) else float(value)
 
     steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
     return Program(inputs, steps, tuple(map(operand, outputs))).prune()
@@ -258,7 +387,7 @@ def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -
         "positive": lambda: x.apply("step"),
         "step": lambda: 0.0,
     }
-    return 0.0 if not isinstance(d[0], Expression) and d[0] == 0.0 else inner[op]() * d[0]
+    return 0.0 if _is(d[0], 0.0) else inner[op]() * d[0]
 
 
 def _is_constant(value: Value) -> bool:
@@ -266,7 +395,11 @@ def _is_constant(value: Value) -> bool:
 
 
 def _is(value: Value, number: float) -> bool:
-    return not isinstance(value, Expression) and float(value) == number
+    return not isinstance(value, (Expression, Number)) and float(value) == number
+
+
+def _origin(value: float) -> Any:
+    return value.origin if isinstance(value, Number) else value
 
 
 def _drop_minus(value: Value) -> Value:

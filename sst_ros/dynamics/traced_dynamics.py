@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program, trace, with_jacobian
+from sst_ros.dynamics.expression import Program, number_constants, trace, with_jacobian
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, SineTorque
@@ -34,10 +34,10 @@ class Dynamics:
 
     Args:
         model: its constants, numbers or not.
-        moved: by a moment that comes from a topic.
+        has_moment_topic: a moment that acts comes from a topic.
 
     Attributes:
-        model, moved: as given.
+        model, has_moment_topic: as given.
         state: names of the state's numbers: quaternion, body rate, lagged torques if any.
         drive: names of what acts from outside: torques, and a moment if it comes from a topic.
 
@@ -96,11 +96,17 @@ class Dynamics:
         kinetic, potential, _ = self.energies(*state[: len(self.state)], *(0.0,) * len(self.drive))
         return kinetic + potential
 
+    @cached_property
+    def numbers(self) -> kernel.Model:
+        """The model, in which what is not 0 or 1 may have another value in another scene."""
+        model: kernel.Model = number_constants(self.model, ("model",))
+        return model
+
     def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
-        return kernel.derivative(self.model, *self._split(inputs))
+        return kernel.derivative(self.numbers, *self._split(inputs))
 
     def _joints(self, *state: Any) -> tuple[Any, ...]:
-        return tuple(number for triple in kernel.joints(self.model, state) for number in triple)
+        return tuple(number for triple in kernel.joints(self.numbers, state) for number in triple)
 
     def _inverse(self, *inputs: Any) -> tuple[Any, ...]:
         q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:] or None
@@ -163,12 +169,12 @@ class ODE:
     @cached_property
     def program(self) -> Program:
         """The derivative."""
-        return trace(self.derivative, self._inputs)
+        return trace(self._traced, self._inputs)
 
     @cached_property
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
-        return with_jacobian(self.derivative, self._inputs, ("t", *self.state))
+        return with_jacobian(self._traced, self._inputs, ("t", *self.state))
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
@@ -196,18 +202,30 @@ class ODE:
 
     def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind."""
+        return self._derivative(self._dynamics.model, self._torque, self._limit, time, inputs)
+
+    def _traced(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return the derivative with numbers that may be others in another scene."""
+        torque, limit = (
+            number_constants(self._torque, ("torque",)),
+            number_constants(self._limit, ("limit",)),
+        )
+        return self._derivative(self._dynamics.numbers, torque, limit, time, inputs)
+
+    def _derivative(
+        self, model: Any, sine: Any, limit: Any, time: Any, inputs: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
         size = len(self._dynamics.state)
         state, drive = inputs[:size], inputs[len(self.state) :]
         torque, rest = drive[:3], drive[3:]
-        if self._torque is not None:
-            phase = torque if self._phases else self._torque.phase
-            rows = zip(self._torque.amplitude, self._torque.frequency, phase, strict=True)
+        if sine is not None:
+            phase = torque if self._phases else sine.phase
+            rows = zip(sine.amplitude, sine.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
-            if self._limit is not None:
-                torque = tuple(_clamp(tau, self._limit) for tau in torque)
+            if limit is not None:
+                torque = tuple(_clamp(tau, limit) for tau in torque)
             rest = rest if self._phases else drive
         moment = (rest[0], rest[1], rest[2]) if rest else None
-        model = self._dynamics.model
         slope = kernel.derivative(model, state, torque, moment)
         if not self._work:
             return slope

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Machine code of a scene before it is needed: is it there, and make it.
 
-Code is made once for each scene and method, which takes from seconds to half a minute, and kept in
-`cache_folder()`; to load it takes tenths of a second.
+Code is made once for each method and each structure of a scene - its terms, and which numbers are 0
+or 1 - which takes seconds, and kept in `cache_folder()`; to load it takes tenths of a second.
 """
 
 from __future__ import annotations

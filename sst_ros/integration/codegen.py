@@ -67,7 +67,7 @@ def numba_version() -> str | None:
     return str(numba.__version__)
 
 
-def explicit_step(tableau: Tableau, size: int, drive: int) -> str:
+def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
     """Source of `step(t, h, y0, .., d0, ..)` of an explicit Runge-Kutta method, for scalars.
 
     It calls `rhs(t, y0, .., d0, ..)` of the state y and of the drive d, which is constant over the
@@ -78,9 +78,10 @@ def explicit_step(tableau: Tableau, size: int, drive: int) -> str:
         tableau: coefficients of the method.
         size: numbers in the state.
         drive: numbers in the drive.
+        more: further arguments, which `rhs` has as well.
 
     """
-    y, d = _names("y", size), _names("d", drive)
+    y, d = _names("y", size), [*_names("d", drive), *more]
     lines = [f"def step({', '.join(['t', 'h', *y, *d])}):"]
     for stage, row in enumerate(tableau.a):
         for j in range(size) if stage else ():

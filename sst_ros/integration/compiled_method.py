@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.traced_dynamics import LAG, ODE
 from sst_ros.integration import codegen, step_loops
 from sst_ros.integration.methods import Rosenbrock, Tableau
@@ -78,12 +79,13 @@ class CompiledMethod:
         self.pair_cost = 3 * (len(method.a) + (JACOBIAN_COST if implicit else 0))
         if derivative is not None and (implicit or compiled):
             raise ValueError("a derivative of its own needs an explicit method and plain Python")
-        texts, constants = _source(system, method)
+        texts, constants, numbers = _source(system, method, by_structure=compiled)
         self._module: ModuleType = codegen.load(texts, constants, numba=compiled)
         if derivative is not None:
             self._module.__dict__["rhs"] = derivative
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
+        self._numbers = self._vector(numbers)
         self._error = self._vector([0.0] * len(system.state))
         self.sizes: Any = self._vector([])
         self._at: StepPoint = ([], [], ())
@@ -104,8 +106,9 @@ class CompiledMethod:
         new_y, new_z = self._vector(y), self._vector(z)
         try:
             size = self._module.step_pair(
-                t, h, self._vector(y), self._vector(z), self._vector(d), new_y, new_z, self._error
-            )
+                t, h, self._vector(y), self._vector(z), self._vector(d), self._numbers,
+                new_y, new_z, self._error,
+            )  # fmt: skip
         except (ArithmeticError, ValueError):
             return list(y), list(z), float("inf")
         return self._listed(new_y), self._listed(new_z), float(size)
@@ -138,8 +141,9 @@ class CompiledMethod:
         y, z, joints = self._place
         try:
             done = self._module.step_many(
-                count, h, tolerance, y, z, self._drive[1], self._ranges, joints, self.sizes
-            )
+                count, h, tolerance, y, z, self._drive[1], self._numbers, self._ranges,
+                joints, self.sizes,
+            )  # fmt: skip
         except (ArithmeticError, ValueError):
             done = sum(size >= 0.0 for size in self.sizes)
         self._at = (self._listed(y), self._listed(z), tuple(self._listed(joints)))
@@ -171,8 +175,9 @@ class CompiledMethod:
         lengths, drives, starts = periods
         try:
             done = self._module.step_sequence(
-                first, lengths, drives, tolerance, starts, y, z, self._ranges, joints, reached
-            )
+                first, lengths, drives, self._numbers, tolerance, starts, y, z, self._ranges,
+                joints, reached,
+            )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
             done = next(k for k in range(first, len(lengths)) if math.isnan(reached[k][0][0]))
         return done, (self._listed(y), self._listed(z), tuple(self._listed(joints)))
@@ -185,55 +190,68 @@ class CompiledMethod:
 
         """
         new = self._vector(y)
-        self._module.step_fixed(t, h, count, self._vector(y), self._vector(d), new)
+        drive = self._vector(d)
+        self._module.step_fixed(t, h, count, self._vector(y), drive, self._numbers, new)
         return self._listed(new)
 
 
 def has_code(system: ODE, method: Method) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
-    return codegen.has_code(*_source(system, method), ("step_pair", "step_many"))
+    texts, constants, _ = _source(system, method, by_structure=True)
+    return codegen.has_code(texts, constants, ("step_pair", "step_many"))
 
 
 @lru_cache(maxsize=64)
-def _source(system: ODE, method: Tableau | Rosenbrock) -> tuple[list[str], dict[str, Any]]:
-    """Functions of a module, one text each, in the order of their calls, and its constants."""
-    size = len(system.state)
+def _source(
+    system: ODE, method: Method, *, by_structure: bool
+) -> tuple[list[str], dict[str, Any], list[float]]:
+    """Functions of a module, one text each, in the order of their calls; constants; numbers.
+
+    By structure the text has no number of the scene: they are in a vector p, an argument of all
+    functions. Otherwise they are in the text, and p is empty.
+    """
+    size, slots = len(system.state), Slots() if by_structure else None
     y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(len(system.drive))]
+    p = ["p"] if by_structure else []
     lag = 3 if set(LAG) <= set(system.state) else 0
     constants: dict[str, Any] = {"SIZE": size, "LAG": lag, "SHARE": 0.5**method.error_order}
-    texts = [system.program.source("rhs"), system.joints.source("angles_and_rates"), _joints_of()]
+    inputs = ", ".join(["t", *y, *d, *p])
+    joints = _assign(
+        [f"joints[{i}]" for i in range(18)], f"angles_and_rates({', '.join(y[:7] + p)})"
+    )
+    texts = [
+        system.program.source("rhs", slots),
+        system.joints.source("angles_and_rates", slots),
+        f"def joints_of(y, p, joints):\n{joints}",
+    ]
     if isinstance(method, Tableau):
         new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
-        texts += [codegen.explicit_step(method, size, len(d)), _attempt(y, d, new)]
-        return texts + [inspect.getsource(function) for function in _EXPLICIT], constants
-    # numba wants rows of one length.
-    padded = [
-        tuple((*row, *(0.0,) * (5 - len(row))) for row in table) for table in (method.a, method.c)
-    ]
-    constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
-    constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
-    slope = [f"slope[{i}]" for i in range(size)]
-    outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
-    outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
-    inputs = ", ".join(["t", *y, *d])
+        step = _assign(new, f"step({', '.join(['t', 'h', *y, *d, *p])})")
+        texts.append(codegen.explicit_step(method, size, len(d), *p))
+        texts.append(f"def attempt(t, h, y, near, d, p, new_y, error):\n{step}")
+    else:
+        # numba wants rows of one length.
+        padded = [
+            tuple((*row, *(0.0,) * (5 - len(row))) for row in table)
+            for table in (method.a, method.c)
+        ]
+        constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
+        constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
+        slope = [f"slope[{i}]" for i in range(size)]
+        outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
+        outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
+        texts.append(system.jacobian.source("jacobian", slots))
+        linearise = _assign(outputs, f"jacobian({inputs})")
+        texts.append(f"def linearise(t, y, d, p, slope, by_time, matrix):\n{linearise}")
+        evaluate = _assign(slope, f"rhs({inputs})")
+        texts.append(f"def evaluate(t, y, d, p, slope):\n{evaluate}")
     texts += [
-        system.jacobian.source("jacobian"),
-        f"def linearise(t, y, d, slope, by_time, matrix):\n"
-        f"    ({', '.join(outputs)},) = jacobian({inputs})\n",
-        f"def evaluate(t, y, d, slope):\n    ({', '.join(slope)},) = rhs({inputs})\n",
+        inspect.getsource(function).replace("attempt_linearly_implicit", "attempt")
+        for function in (_EXPLICIT if isinstance(method, Tableau) else _IMPLICIT)
     ]
-    functions = [inspect.getsource(function) for function in _IMPLICIT]
-    return texts + [
-        text.replace("attempt_linearly_implicit", "attempt") for text in functions
-    ], constants
+    return texts, constants, slots.values if slots else []
 
 
-def _joints_of() -> str:
-    outputs = ", ".join(f"joints[{i}]" for i in range(18))
-    inputs = ", ".join(f"y[{i}]" for i in range(7))
-    return f"def joints_of(y, joints):\n    ({outputs},) = angles_and_rates({inputs})\n"
-
-
-def _attempt(y: list[str], d: list[str], new: list[str]) -> str:
-    call = f"step({', '.join(['t', 'h', *y, *d])})"
-    return f"def attempt(t, h, y, near, d, new_y, error):\n    ({', '.join(new)},) = {call}\n"
+def _assign(places: list[str], call: str) -> str:
+    """Body of a function that puts what a call returns into places."""
+    return f"    ({', '.join(places)},) = {call}\n"

@@ -118,10 +118,11 @@ class Collocation:
         _refuse(nodes=nodes)
         self._compiled = compiled and codegen.numba_version() is not None
         self._size, self._inputs = len(ode.state), len(ode.program.inputs)
-        self._at = gauss_source.layout(ode, nodes, limits)
-        self._module = codegen.load(
-            gauss_source.source(ode, nodes, limits), {}, numba=self._compiled, rounding=False
-        )
+        slots = gauss_source.slots_of(ode, limits) if self._compiled else None
+        self._at = gauss_source.layout(ode, nodes, limits, slots)
+        self._numbers = slots.values if slots else []
+        texts = gauss_source.source(ode, nodes, limits, slots)
+        self._module = codegen.load(texts, {}, numba=self._compiled, rounding=False)
 
     def prepare(
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
@@ -144,6 +145,8 @@ class Collocation:
         _refuse(count=count, iterations=iterations)
         at, block = self._at, _aligned(self._at.numbers)
         block[:HEAD] = count, iterations, h
+        first = at.first("numbers")
+        block[first : first + len(self._numbers)] = self._numbers
         states = np.zeros(count * self._size)
         if self._compiled:
             integrate = _machine_code(self._module.integrate)
@@ -158,7 +161,8 @@ class Collocation:
 
 def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> bool:
     """Return whether the machine code of a `Collocation` is there to be loaded."""
-    texts = gauss_source.source(ode, nodes, limits)
+    slots = gauss_source.slots_of(ode, limits)
+    texts = gauss_source.source(ode, nodes, limits, slots)
     known = codegen.numba_version() is not None
     return known and codegen.has_code(texts, {}, ("integrate",), rounding=False)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program, trace
+from sst_ros.dynamics.expression import Program, number_constants, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event
@@ -232,9 +232,10 @@ def _collocation(
 ) -> Collocation:
     program: Program | None = None
     if limits:
-        ends = [(math.cos(limit.end), math.sin(limit.end)) for limit in limits]
+        pairs = tuple((math.cos(limit.end), math.sin(limit.end)) for limit in limits)
+        ends = number_constants(pairs, ("ends",))
         program = trace(
-            lambda *state: limit_distances(limits, ends, dynamics.model, state)[: len(limits)],
+            lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
     ode = ODE(dynamics, sine)

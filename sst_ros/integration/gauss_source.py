@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 import re
 
-from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop, split
 from sst_ros.integration.sine_source import flat_sin
@@ -20,16 +20,25 @@ HEAD = 3
 """Numbers before all: count of steps, count of iterations, length of a step."""
 
 
-def source(system: ODE, nodes: int, limits: Program | None) -> list[str]:
+def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None) -> list[str]:
     """Texts of flat_sin and of `integrate(block, states)`, see `gauss.PreparedMotion`."""
-    return [inspect.getsource(flat_sin), _integrate(system, nodes, limits)]
+    return [inspect.getsource(flat_sin), _integrate(system, nodes, limits, slots)]
 
 
-def layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
+def slots_of(system: ODE, limits: Program | None) -> Slots:
+    """Return the slots of the numbers in what `integrate` evaluates."""
+    slots = Slots()
+    for program in (system.program, *([limits] if limits else [])):
+        program.body(slots)
+    return slots
+
+
+def layout(system: ODE, nodes: int, limits: Program | None, slots: Slots | None) -> Layout:
     """Allocate what `integrate` reads and writes.
 
-    `head` and `begin` (time, state, drive) are set before a run, and from `node` to `known` the
-    tables times the length of a step; `least`, the last group, has the distances from limits.
+    `head`, `begin` (time, state, drive) and `numbers` are set before a run, and from `node` to
+    `known` the tables times the length of a step; `least`, the last group, has the distances from
+    limits.
     """
     size, inputs = len(system.state), len(system.program.inputs)
 
@@ -37,7 +46,8 @@ def layout(system: ODE, nodes: int, limits: Program | None) -> Layout:
         return -(-numbers // nodes)
 
     return Layout(
-        nodes, head=rows(HEAD), begin=rows(inputs), node=1, weight=1, a=nodes,
+        nodes, head=rows(HEAD), begin=rows(inputs), numbers=rows(len(slots.values) if slots else 0),
+        node=1, weight=1, a=nodes,
         known=max(1, len(_known(system))), s=size, f=size, old=size,
         far=len(limits.outputs) if limits else 1, least=len(limits.outputs) if limits else 1,
     )  # fmt: skip
@@ -54,13 +64,14 @@ def _time_only(system: ODE) -> list[bool]:
     return [True, *(False,) * len(system.state), *(True,) * len(system.drive)]
 
 
-def _integrate(system: ODE, nodes: int, limits: Program | None) -> str:
-    at, size, inputs = layout(system, nodes, limits), len(system.state), len(system.program.inputs)
+def _integrate(system: ODE, nodes: int, limits: Program | None, slots: Slots | None) -> str:
+    at = layout(system, nodes, limits, slots)
+    size, inputs = len(system.state), len(system.program.inputs)
     everything, quaternion, rates = range(size), range(4), range(4, size)
-    known = _known(system)
-    _, after, results = split(system.program, _time_only(system))
-    held, moving, _ = split(system.program, [False, *(True,) * (inputs - 1)])
-    _, turn, turned = split(system.program.first(4), _time_only(system))
+    known, count = _known(system), len(slots.values) if slots else 0
+    _, after, results = split(system.program, _time_only(system), slots)
+    held, moving, _ = split(system.program, [False, *(True,) * (inputs - 1)], slots)
+    _, turn, turned = split(system.program.first(4), _time_only(system), slots)
 
     def read(rows: range) -> list[str]:
         return [f"g{j}_{k} = {at.lane('f', j, k)}" for j in rows for k in range(nodes)]
@@ -133,7 +144,7 @@ def _integrate(system: ODE, nodes: int, limits: Program | None) -> str:
     checking = [] if limits is None else [
         *kept(range(2)),
         *kept(range(2, 4)),
-        *evaluated(limits, at.rows("s", 7), at, "far"),
+        *evaluated(limits, at.rows("s", 7), at, "far", slots),
         *loop(at, [nearer(m) for m in distances]),
     ]  # fmt: skip
     lines = [
@@ -141,6 +152,7 @@ def _integrate(system: ODE, nodes: int, limits: Program | None) -> str:
         "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
         *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
         *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
+        *(f"    c{i} = {at.lane('numbers', 0, i)}" for i in range(count)),
         *indented(
             4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in distances] or ["pass"])
         ),

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate
 
-from sst_ros.dynamics.expression import Operand, Program
+from sst_ros.dynamics.expression import Operand, Program, Slots
 
 
 class Layout:
@@ -44,38 +44,42 @@ class Layout:
         return [self.lane(group, row) for row in range(count)]
 
 
-def split(program: Program, early: Sequence[bool]) -> tuple[list[str], list[str], list[str]]:
+def split(
+    program: Program, early: Sequence[bool], slots: Slots | None = None
+) -> tuple[list[str], list[str], list[str]]:
     """Lines of a program that need early inputs only, the other lines, and the results.
 
     Args:
         program: its inputs are called u0, u1, ...; results of its lines v0, v1, ...
         early: for each input whether it is known earlier than others.
+        slots: of numbers that are not in the text.
 
     """
     count = len(program.inputs)
-    named = replace(program, inputs=tuple(f"u{i}" for i in range(count)))
-    text = [line.strip() for line in named.source("body").splitlines()[1:]]
+    lines, results = replace(program, inputs=tuple(f"u{i}" for i in range(count))).body(slots)
     late = {i for i, known in enumerate(early) if not known}
     before, after = [], []
     for number, (line, (_, operands)) in enumerate(
-        zip(text, program.steps, strict=False), start=count
+        zip(lines, program.steps, strict=True), start=count
     ):
         if any(isinstance(x, Operand) and x.number in late for x in operands):
             late.add(number)
             after.append(line)
         else:
             before.append(line)
-    return before, after, text[-1].removeprefix("return (").removesuffix(",)").split(", ")
+    return before, after, results
 
 
-def evaluated(program: Program, given: Sequence[str], at: Layout, out: str) -> list[str]:
+def evaluated(
+    program: Program, given: Sequence[str], at: Layout, out: str, slots: Slots | None = None
+) -> list[str]:
     """Lines of a program over all lanes, its results in the rows of `out`.
 
     What `given` names outside of `block` is the same for all lanes, and what depends on nothing
     else comes before the loop.
     """
     same = [not text.startswith("block[") for text in given]
-    before, after, results = split(program, same)
+    before, after, results = split(program, same, slots)
     loads = [f"u{i} = {text}" for i, text in enumerate(given)]
     head = [line for line, early in zip(loads, same, strict=True) if early]
     inside = [line for line, early in zip(loads, same, strict=True) if not early]

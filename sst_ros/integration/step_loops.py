@@ -10,18 +10,18 @@ from the module that `codegen` writes.
 from __future__ import annotations
 
 
-def step_pair(t, h, y, z, d, new_y, new_z, error):
+def step_pair(t, h, y, z, d, p, new_y, new_z, error):
     """Advance y by two steps of h / 2 and the coarse solution z by one of h (Richardson).
 
     Returns the size of the local error estimate of y, relative to a tolerance of 1.
     """
     middle = vector(SIZE)
     other = vector(SIZE)
-    attempt(t, 0.5 * h, y, y, d, middle, error)
+    attempt(t, 0.5 * h, y, y, d, p, middle, error)
     first = size_of(error, y, middle, h)
-    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, new_y, error)
+    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, p, new_y, error)
     second = size_of(error, middle, new_y, h)
-    attempt(t, h, z, y, d, new_z, other)
+    attempt(t, h, z, y, d, p, new_z, other)
     # In proportion, so that it counts only where the longer step is unstable.
     coarse = size_of(other, z, new_z, h) * SHARE
     normalise(new_y)
@@ -61,17 +61,17 @@ def normalise(y):
         y[i] = y[i] * factor
 
 
-def step_fixed(t, h, count, y, d, new_y):
+def step_fixed(t, h, count, y, d, p, new_y):
     """Advance y by `count` steps of h; the error estimates are not looked at."""
     error = vector(SIZE)
     for i in range(SIZE):
         new_y[i] = y[i]
     for k in range(count):
-        attempt(t + k * h, h, new_y, new_y, d, new_y, error)
+        attempt(t + k * h, h, new_y, new_y, d, p, new_y, error)
         normalise(new_y)
 
 
-def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
+def step_many(count, h, tolerance, y, z, d, p, ranges, joints, sizes):
     """Go on by up to `count` periods of h, a pair of steps each; return how many were done.
 
     Stops before a period that asks for more than that: one whose error is beyond the tolerance, or
@@ -83,10 +83,10 @@ def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
     error = vector(SIZE)
     found = vector(18)
     for k in range(count):
-        size = step_pair(0.0, h, y, z, d, new_y, new_z, error)
+        size = step_pair(0.0, h, y, z, d, p, new_y, new_z, error)
         if not size <= tolerance:
             return k
-        joints_of(new_y, found)
+        joints_of(new_y, p, found)
         if not all_far(ranges, joints, found, h):
             return k
         for i in range(SIZE):
@@ -98,7 +98,7 @@ def step_many(count, h, tolerance, y, z, d, ranges, joints, sizes):
     return count
 
 
-def step_sequence(first, lengths, drives, tolerance, starts, y, z, ranges, joints, reached):
+def step_sequence(first, lengths, drives, p, tolerance, starts, y, z, ranges, joints, reached):
     """Do what `step_many` does for periods of their own lengths and drives, from the first on.
 
     Where starts[k] has numbers and not NaN, period k begins there. reached[k] becomes the solution
@@ -110,8 +110,8 @@ def step_sequence(first, lengths, drives, tolerance, starts, y, z, ranges, joint
             for i in range(SIZE):
                 y[i] = starts[k][i]
                 z[i] = starts[k][i]
-            joints_of(y, joints)
-        if step_many(1, lengths[k], tolerance, y, z, drives[k], ranges, joints, size) == 0:
+            joints_of(y, p, joints)
+        if step_many(1, lengths[k], tolerance, y, z, drives[k], p, ranges, joints, size) == 0:
             return k
         for i in range(SIZE):
             reached[k][0][i] = y[i]
@@ -137,7 +137,7 @@ def all_far(ranges, begin, end, h):
     return True
 
 
-def attempt_linearly_implicit(t, h, y, near, d, new_y, error):
+def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
     """One step of RODAS4 (Hairer & Wanner, Solving ODEs II, section VI.4), exact Jacobian.
 
     Order 4, L-stable, stiffly accurate; the error estimate is of order 3. The Jacobian is that at
@@ -148,7 +148,7 @@ def attempt_linearly_implicit(t, h, y, near, d, new_y, error):
     slope = vector(SIZE)
     by_time = vector(SIZE)
     pivot = vector(SIZE)
-    linearise(t, near, d, slope, by_time, matrix)
+    linearise(t, near, d, p, slope, by_time, matrix)
     for i in range(SIZE):
         for j in range(SIZE):
             matrix[i][j] = -matrix[i][j]
@@ -163,7 +163,7 @@ def attempt_linearly_implicit(t, h, y, near, d, new_y, error):
         for j in range(stage):
             for i in range(SIZE):
                 at[i] += RODAS_A[stage][j] * u[j][i]
-        evaluate(t + RODAS_ALPHA[stage] * h, at, d, slope)
+        evaluate(t + RODAS_ALPHA[stage] * h, at, d, p, slope)
         for i in range(SIZE):
             right[i] = slope[i] + h * RODAS_D[stage] * by_time[i]
             for j in range(stage):

@@ -232,7 +232,7 @@ class Simulation:
         """Have the code of all methods loaded that steps of dt_ns may turn to.
 
         Otherwise the step that changes the method loads it, which takes tenths of a second, or
-        compiles it, which takes up to half a minute. The state does not change.
+        compiles it, which takes seconds. The state does not change.
         """
         moment = (0.0, 0.0, 0.0) if self.dynamics.has_moment_topic else ()
         self._propagator.load(self._now.point, dt_ns / NANOSECONDS, moment)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from sst_ros.integration import code_cache, codegen
-from sst_ros.scene.scene import Initial, load
+from sst_ros.scene.scene import Inertia, Initial, load
 
 pytestmark = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
 EXAMPLE1 = load("example1")
@@ -24,8 +24,11 @@ def test_code_is_made_once_and_found(tmp_path, monkeypatch):
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb[ic]")}
     assert list(code_cache.make(EXAMPLE1, "rk4")) == ["rk4"]
     assert files == {path: path.stat().st_mtime_ns for path in files}
-    elsewhere = replace(EXAMPLE1, initial=Initial(gamma=(0.7, 0.8, 0.9)))
-    assert code_cache.is_there(elsewhere, "rk4")  # where a run starts is not part of its code
+    # Neither where a run starts nor the numbers of its scene are part of its code.
+    heavier = replace(EXAMPLE1.star, inertia=Inertia(xx=0.03, yy=0.04, zz=0.05))
+    for other in ({"initial": Initial(gamma=(0.7, 0.8, 0.9))}, {"star": heavier}):
+        assert code_cache.is_there(replace(EXAMPLE1, **other), "rk4")
+    assert not code_cache.is_there(load("friction"), "rk4")
 
 
 def test_one_process_makes_code_at_a_time(tmp_path, monkeypatch):
