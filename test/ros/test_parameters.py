@@ -134,6 +134,14 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
+        ({"rate": 300}, "rate = 300: must divide 1e9"),
+        ({"publish_rate": 300}, "publish_rate = 300: must divide rate = 1000"),
+        ({"rate": 0}, "rate = 0: must be a whole number from 1 to 100000 [Hz]"),
+        ({"rate": "fast"}, "rate = 'fast': must be a whole number"),
+        ({"duration": ".nan"}, "duration = nan: must be a finite number >= 0"),
+        ({"scene": "nowhere"}, "scene = 'nowhere': must be a readable .yaml file or one of"),
+        ({"scene": 3}, "scene = 3: must be text"),
+        ({"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
         ({"real_time_factor": ".nan"}, "real_time_factor = nan: must be a finite number >= 0"),
         ({"sync": "loose"}, "sync = 'loose': must be one of free, lockstep"),
         ({"realtime_priority": 100}, "must be a whole number from 0 to 99"),

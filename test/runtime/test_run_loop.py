@@ -539,36 +539,31 @@ def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(waits, phase):
 
 def test_simulation_interfaces_are_the_same_machine():
     """The handlers with plain objects for messages: the package is in no wheel."""
-
-    def response():
-        return Box(result=Box(result=None, error_message=""), state=Box(state=None))
-
-    bench = Bench()
+    bench, left = Bench(), threading.Event()
     with bench.running() as loop:
-        left = threading.Event()
         answers = SimulationInterfaces(loop, left.set)
+
+        def call(service, **given):
+            response = Box(result=Box(result=None, error_message=""), state=Box(state=None))
+            return getattr(answers, service)(Box(**given), response)
+
+        def state():
+            return call("get_simulation_state").state.state
+
+        def to(number):
+            return call("set_simulation_state", state=Box(state=number)).result.result
+
+        def reset(scope):
+            return call("reset_simulation", scope=scope).result.result
+
         bench.until(lambda: loop.phase is Phase.RUNNING)
-        assert answers.get_simulation_state(None, response()).state.state == 1
-        assert answers.step_simulation(Box(steps=1), response()).result.result == 4
-        assert answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 1
-        assert (
-            answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 101
-        )
+        assert (state(), call("step_simulation", steps=1).result.result) == (1, 4)
+        assert (to(2), to(2)) == (1, 101)
         before = len(bench.output.samples)
-        assert answers.step_simulation(Box(steps=3), response()).result.result == 1
+        assert call("step_simulation", steps=3).result.result == 1
         assert len(bench.output.samples) == before + 3
-        assert answers.reset_simulation(Box(scope=1), response()).result.result == 0
-        assert answers.reset_simulation(Box(scope=255), response()).result.result == 1
-        assert answers.get_simulation_state(None, response()).state.state == 0
-        assert (
-            answers.set_simulation_state(Box(state=Box(state=2)), response()).result.result == 103
-        )
-        assert answers.set_simulation_state(Box(state=Box(state=1)), response()).result.result == 1
-        assert answers.set_simulation_state(Box(state=Box(state=0)), response()).result.result == 1
-        assert answers.get_simulation_state(None, response()).state.state == 0
-        assert answers.set_simulation_state(Box(state=Box(state=4)), response()).result.result == 0
-        assert answers.reset_simulation(Box(scope=3), response()).result.result == 0
-        assert answers.reset_simulation(Box(scope=6), response()).result.result == 1
+        assert (reset(1), reset(255), state()) == (0, 1, 0)
+        assert (to(2), to(1), to(0), state(), to(4)) == (103, 1, 1, 0, 0)
+        assert (reset(3), reset(6)) == (0, 1)
         assert not left.is_set()
-        assert answers.set_simulation_state(Box(state=Box(state=3)), response()).result.result == 1
-        assert left.is_set()
+        assert to(3) == 1 and left.is_set()
