@@ -82,16 +82,17 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     cases = with_batches(cases, workers)
     steps = largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
+    found = table(step._asdict() for step in steps)
     x, y, growth = regions()
     write(
         out, "stability", csv=case_table(cases),
         document={
             "cases": records(case_table(cases)),
-            "largest_stable_steps": records(table(map(asdict, steps))),
+            "largest_stable_steps": records(found),
         },
         page=page(cases, steps),
         figures={
-            "stability": draw_largest_steps(table(map(asdict, steps)), provenance()),
+            "stability": draw_largest_steps(found, provenance()),
             "stability_regions": draw_regions(x, y, growth, scene_points(), provenance()),
         },
     )  # fmt: skip

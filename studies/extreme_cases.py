@@ -67,50 +67,26 @@ FINER = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case.
-
-    Attributes:
-        name: short name.
-        changes: values by key that its scene has other than `base`, or a function that finds them.
-        torque: torques [N m]: constant, or a function of the number of the control period and the
-            simulation at its start, which only `feedback` reads.
-        steps: number of control periods.
-        period_ns: their length [ns].
-        expected: the truth and its reason, in words.
-        deviation: distance of the end of a run of the case from the truth; None where a refusal is
-            expected.
-        bound: largest deviation that passes.
-        difficulty: why it is hard, in words; empty for what its group says.
-        refusal: name of the error that must end the run; empty where none may.
-        stop_time: when the refusal must come [s]; None where that is not known.
-        group: heading on the page.
-        base: name of the scene that is changed.
-        integrator: method.
-        feedback: the torque depends on the state.
-        compiled_only: too long for plain Python; run by `studies.extreme --long` alone.
-        loose: tolerance at which the error estimate is checked; None where it cannot be.
-        estimate: why `loose` is not LOOSE; empty where it is.
-
-    """
+    """One case: a scene, what acts on it, and what must come out."""
 
     name: str
-    changes: Changes | Callable[[], Changes]
-    torque: Torque
-    steps: int
+    changes: Changes | Callable[[], Changes]  # of `base` by key, or a function that finds them
+    torque: Torque  # [N m]: constant, or a function of period and simulation
+    steps: int  # control periods
     period_ns: int
-    expected: str = ""
-    deviation: Callable[[Case, Simulation], float] | None = None
-    bound: float = 0.0
-    difficulty: str = ""
-    refusal: str = ""
-    stop_time: Callable[[], float] | None = None
-    group: str = ""
+    expected: str = ""  # the truth and its reason, in words
+    deviation: Callable[[Case, Simulation], float] | None = None  # of the end from the truth
+    bound: float = 0.0  # largest deviation that passes
+    difficulty: str = ""  # why it is hard; empty for what its group says
+    refusal: str = ""  # name of the error that must end the run; empty where none may
+    stop_time: Callable[[], float] | None = None  # when it must come [s]; None if not known
+    group: str = ""  # heading on the page
     base: str = "example2_heavy"
     integrator: str = "auto"
-    feedback: bool = False
-    compiled_only: bool = False
-    loose: float | None = LOOSE
-    estimate: str = ""
+    feedback: bool = False  # the torque reads the simulation
+    compiled_only: bool = False  # too long for plain Python; run by `studies.extreme --long` alone
+    loose: float | None = LOOSE  # tolerance of the check of the estimate; None for none
+    estimate: str = ""  # why `loose` is not LOOSE
 
     def scene(self) -> Scene:
         """Make the scene."""

@@ -86,46 +86,27 @@ class EstimateCheck(NamedTuple):
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Result of a case.
-
-    Attributes:
-        name, group, difficulty, expected, bound: of the case.
-        result: what happened, in words.
-        deviation: distance from the truth; None for a refusal.
-        energy: energy residual at the end relative to the energy; None where no run began.
-        closure: largest abs(r_k . t_k) at the end; None where no run began.
-        estimate: error estimate of the orientation at the end [rad]; None where no run began.
-        loose_error, loose_estimate: true error and error estimate [rad] at a loose tolerance; None
-            where there is no such run.
-        check: what the error estimate was found to be, or why it cannot be checked.
-        wall_s, compiled_s: time of the interpreted and of the compiled run, compilation included
-            [s]; None where it was not run.
-        same_bits, run_loop: the compiled run, and that through the loop of the node, ended in the
-            same bits or with the same error; None where it was not run.
-        correct: the result is the truth, and the error estimate holds.
-        batch: what a batch was compared with; empty where it was not run.
-
-    """
+    """Result of a case; None for what was not run or has no value."""
 
     name: str
     group: str
     difficulty: str
     expected: str
     bound: float
-    result: str
-    deviation: float | None = None
-    energy: float | None = None
-    closure: float | None = None
-    estimate: float | None = None
-    loose_error: float | None = None
-    loose_estimate: float | None = None
-    check: str = ""
-    wall_s: float | None = None
-    compiled_s: float | None = None
-    same_bits: bool | None = None
-    run_loop: bool | None = None
-    correct: bool = False
-    batch: str = ""
+    result: str  # what happened, in words
+    deviation: float | None = None  # from the truth
+    energy: float | None = None  # residual at the end relative to the energy
+    closure: float | None = None  # largest abs(r_k . t_k) at the end
+    estimate: float | None = None  # of the error of the orientation at the end [rad]
+    loose_error: float | None = None  # true error at a loose tolerance [rad]
+    loose_estimate: float | None = None  # its estimate [rad]
+    check: str = ""  # what the estimate was found to be, or why it cannot be checked
+    wall_s: float | None = None  # time of the interpreted run [s]
+    compiled_s: float | None = None  # time of the compiled run, compilation included [s]
+    same_bits: bool | None = None  # the compiled run ended in the same bits, or error
+    run_loop: bool | None = None  # so did that through the loop of the node
+    correct: bool = False  # the result is the truth, and the error estimate holds
+    batch: str = ""  # what a batch was compared with; empty where it was not run
 
     @property
     def passed(self) -> bool:

@@ -82,28 +82,16 @@ RESTLESS = "does not come to rest"
 
 @dataclass(frozen=True)
 class FeedforwardPlan:
-    """The grid of a study.
+    """The grid of a study."""
 
-    Attributes:
-        scene: the plant, with its reference motion.
-        period_ns: control period [ns].
-        bandwidths: of the feedback [rad/s].
-        damping_ratio: of the feedback.
-        seed: of all noise; every loop draws the same numbers.
-        errors: model errors.
-        multiples: periods for the order of the hold, in control periods.
-        delays: samples, for the limits of the bandwidth.
-
-    """
-
-    scene: Scene
-    period_ns: int = 1_000_000
-    bandwidths: tuple[float, ...] = (20.0, 60.0, 180.0)
-    damping_ratio: float = 1.0
-    seed: int = 8
+    scene: Scene  # the plant, with its reference motion
+    period_ns: int = 1_000_000  # control period
+    bandwidths: tuple[float, ...] = (20.0, 60.0, 180.0)  # of the feedback [rad/s]
+    damping_ratio: float = 1.0  # of the feedback
+    seed: int = 8  # of all noise; every loop draws the same numbers
     errors: tuple[ModelError, ...] = tuple(model_errors())
-    multiples: tuple[int, ...] = (1, 2, 4, 8)
-    delays: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    multiples: tuple[int, ...] = (1, 2, 4, 8)  # periods for the order of the hold
+    delays: tuple[int, ...] = (0, 1, 2, 3, 4, 5)  # samples, for the limits of the bandwidth
 
 
 @dataclass(frozen=True)
@@ -111,8 +99,7 @@ class FeedforwardStudy:
     """Result of a study.
 
     Attributes:
-        plan: its grid.
-        seconds: length of the motion [s].
+        plan, seconds: its grid, and the length of the motion [s].
         left_out: errors that the plant cannot have.
         loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
         holds: feedforward alone, exact model: instant `at` of the torque that is held, period_s,
@@ -265,12 +252,7 @@ def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[st
 
 
 def _unheld(plant: Scene) -> tuple[float, float]:
-    """Give the plant the torques of its motion as a function of time: nothing is held.
-
-    Returns:
-        The largest error of gamma over the motion, and the error estimate at its end [rad].
-
-    """
+    """Hold nothing: return the largest error of gamma, and the error estimate at the end [rad]."""
     inverse, motion = InverseDynamics(plant), _motion(plant)
 
     def torque(time: float) -> Vector3:
@@ -315,12 +297,7 @@ as one that leaves its stroke or its workspace. `studies/feedforward.py` and
 
 
 def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> FeedforwardStudy:
-    """Run a study; print it, and write feedforward.csv, .json, .md and .png into `out`.
-
-    Raises:
-        SstError: the scene has no motion or cannot start, or `out` cannot be written.
-
-    """
+    """Run a study; print it, and write feedforward.csv, .json, .md and .png into `out`."""
     study = feedforward_study(plan, workers=workers, shown=True)
     print(page(study), flush=True)
     write(out, "feedforward", csv=study.loops, document=document(study), page=page(study),
@@ -443,15 +420,16 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _from_command_line(options: argparse.Namespace) -> bool:
-    problems = []
-    if not 1e-6 <= options.period <= 1.0:
-        problems.append(Problem("--period", options.period, "must be from 1e-6 to 1 s"))
-    if options.seed < 0:
-        problems.append(Problem("--seed", options.seed, "must be >= 0"))
-    if options.workers is not None and options.workers < 1:
-        problems.append(Problem("--workers", options.workers, "must be >= 1"))
-    if problems:
-        raise InputError("feedforward", problems)
+    allowed = {
+        "period": (1e-6 <= options.period <= 1.0, "must be from 1e-6 to 1 s"),
+        "seed": (options.seed >= 0, "must be >= 0"),
+        "workers": (options.workers is None or options.workers >= 1, "must be >= 1"),
+    }
+    if wrong := [
+        Problem(f"--{name}", getattr(options, name), text)
+        for name, (right, text) in allowed.items() if not right
+    ]:  # fmt: skip
+        raise InputError("feedforward", wrong)
     plan = FeedforwardPlan(
         load(options.scene),
         period_ns=round(options.period * 1e9),

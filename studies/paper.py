@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import html
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,10 +71,6 @@ def paper(out: Path) -> list[LargestDifference]:
 
     Returns:
         The largest differences between the solutions; `within` of each is true if all is well.
-
-    Raises:
-        SstError: a node failed; names it.
-        InputError: `out` cannot be written.
 
     """
     found: list[LargestDifference] = []
@@ -172,11 +169,9 @@ def _difference(
 def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
     drawn = {
-        "path_of_E": lambda: path_of_e(scene, solutions),
-        "position_of_E": lambda: position_of_e(scene, solutions),
-        "theta": lambda: angle(solutions, 0),
-        "phi": lambda: angle(solutions, 1),
-        "psi": lambda: angle(solutions, 2),
+        "path_of_E": partial(path_of_e, scene, solutions),
+        "position_of_E": partial(position_of_e, scene, solutions),
+        **{name: partial(angle, solutions, i) for i, name in enumerate(("theta", "phi", "psi"))},
     }
     paths: list[Path] = []
     for name in NUMBERS[scene.name]:

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,24 +122,14 @@ def limits_of_theory() -> Iterator[str]:
         )
 
 
-@dataclass(frozen=True)
-class LargestStep:
-    """Largest stable step of a method; LONGEST_S where every step was stable.
-
-    Attributes:
-        family: decay or oscillation.
-        method: its name.
-        coefficient: viscous coefficient [N m s/rad] or stiffness [N m/rad].
-        rate: largest modulus of the eigenvalues at the start [1/s].
-        step: the step [s]; nan where the shortest was unstable.
-
-    """
+class LargestStep(NamedTuple):
+    """Largest stable step of a method; LONGEST_S where every step was stable."""
 
     family: str
     method: str
-    coefficient: float
-    rate: float
-    step: float
+    coefficient: float  # viscous coefficient [N m s/rad] or stiffness [N m/rad]
+    rate: float  # largest modulus of the eigenvalues at the start [1/s]
+    step: float  # [s]; nan where the shortest was unstable
 
 
 def damped(coefficient: float) -> Scene:
