@@ -102,14 +102,7 @@ def _count(angles: Sequence[float], step: float) -> Vector3:
 
 @dataclass(frozen=True)
 class ModelError:
-    """One error of a controller.
-
-    Attributes:
-        name: its name in tables.
-        model: the controller's model, of the plant's scene.
-        channel: what stands between the plant and the controller.
-
-    """
+    """One error of a controller: its model of the plant's scene, and what stands between them."""
 
     name: str
     model: Callable[[Scene], Scene] = lambda scene: scene
@@ -153,32 +146,18 @@ def model_errors() -> Iterator[ModelError]:
 
 @dataclass(frozen=True)
 class ControlLoop:
-    """A controller and a plant.
+    """A controller and a plant."""
 
-    Attributes:
-        plant: what moves.
-        model: the controller's model of it.
-        motion: reference motion.
-        settings: mode and gains.
-        period_ns: time between samples, over which a torque is held [ns].
-        channel: between plant and controller.
-        seed: of the noise.
-        rest_s: time for which the loop goes on after the motion [s].
-        offset: by how much the plant's gamma is off at the start [rad].
-        lost: error of gamma beyond which the run is aborted [rad].
-
-    """
-
-    plant: Scene
-    model: Scene
+    plant: Scene  # what moves
+    model: Scene  # the controller's model of it
     motion: ReferenceMotion
     settings: ControllerSettings
-    period_ns: int
-    channel: Channel = field(default_factory=Channel)
-    seed: int = 0
-    rest_s: float = 0.0
-    offset: float = 0.0
-    lost: float = math.inf
+    period_ns: int  # between samples, over which a torque is held
+    channel: Channel = field(default_factory=Channel)  # between plant and controller
+    seed: int = 0  # of the noise
+    rest_s: float = 0.0  # time for which the loop goes on after the motion
+    offset: float = 0.0  # of the plant's gamma at the start [rad]
+    lost: float = math.inf  # error of gamma beyond which the run is aborted [rad]
 
 
 def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:

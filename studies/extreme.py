@@ -14,26 +14,11 @@ from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.report.step_advice import regions
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
+from studies import extreme_runs as runs
+from studies import stability_limits as limits
 from studies.extreme_cases import LOOSE, catalogue
-from studies.extreme_runs import (
-    BATCH_TOLERANCE,
-    FACTOR,
-    LOOSER,
-    SAME_ORIENTATION,
-    CaseResult,
-    batch_groups,
-    evaluate_case,
-    run_batch,
-)
-from studies.stability_limits import (
-    LargestStep,
-    draw_largest_steps,
-    faults,
-    largest_steps,
-    limits_of_theory,
-    scene_points,
-    step_table,
-)
+from studies.extreme_runs import BATCH_TOLERANCE, FACTOR, LOOSER, SAME_ORIENTATION, CaseResult
+from studies.stability_limits import LargestStep
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -80,7 +65,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
     cases = run_jobs(_evaluated, jobs[::-1], "extreme cases   ", workers)[::-1]
     cases = with_batches(cases, workers)
-    steps = largest_steps(workers=workers, progress="largest steps   ")
+    steps = limits.largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
     found = table(step._asdict() for step in steps)
     x, y, growth = regions()
@@ -92,22 +77,22 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
         },
         page=page(cases, steps),
         figures={
-            "stability": draw_largest_steps(found, provenance()),
-            "stability_regions": draw_regions(x, y, growth, scene_points(), provenance()),
+            "stability": limits.draw_largest_steps(found, provenance()),
+            "stability_regions": draw_regions(x, y, growth, limits.scene_points(), provenance()),
         },
     )  # fmt: skip
-    return all(case.passed for case in cases) and not list(faults())
+    return all(case.passed for case in cases) and not list(limits.faults())
 
 
 def _evaluated(number: int) -> CaseResult:
-    return evaluate_case(catalogue()[number])
+    return runs.evaluate_case(catalogue()[number])
 
 
 def with_batches(cases: Sequence[CaseResult], workers: int | None) -> list[CaseResult]:
     """Add to results of cases those of the batches that they are scenarios of."""
     if numba_version() is None:
         return list(cases)
-    groups = batch_groups(catalogue())
+    groups = runs.batch_groups(catalogue())
     found = run_jobs(_batched, groups, "batches         ", workers)
     rows = {
         catalogue()[number].name: row
@@ -122,7 +107,7 @@ def with_batches(cases: Sequence[CaseResult], workers: int | None) -> list[CaseR
 
 
 def _batched(group: tuple[int, ...]) -> list[tuple[str, bool]]:
-    return run_batch([catalogue()[number] for number in group])
+    return runs.run_batch([catalogue()[number] for number in group])
 
 
 def case_table(cases: Sequence[CaseResult]) -> DataFrame:
@@ -151,7 +136,7 @@ def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
               "![regions of absolute stability](stability_regions.png)", "",
               "The marks are the eigenvalues of the linearised scenes at their start, times the "
               "step that `scene show` recommends.", "",
-              *(f"- {line}." for line in (*limits_of_theory(), *faults())),
+              *(f"- {line}." for line in (*limits.limits_of_theory(), *limits.faults())),
               "- Coefficients of all methods are checked against their order conditions, to 1e-12.",
               ""]  # fmt: skip
     parts += ["## Largest stable steps", "", "![largest stable steps](stability.png)", "",
@@ -161,7 +146,7 @@ def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
               "counts as stable if rates do not grow tenfold in 400 steps: growth as weak as that "
               "of dopri5 on the imaginary axis beyond 0.997 i is not seen.", ""]  # fmt: skip
     for family in ("decay", "oscillation"):
-        parts += [f"### {family.capitalize()}", "", markdown(step_table(steps, family)), ""]
+        parts += [f"### {family.capitalize()}", "", markdown(limits.step_table(steps, family)), ""]
     parts += ["## Cases", ""]
     for group in dict.fromkeys(case.group for case in cases):
         own = [case for case in cases if case.group == group]

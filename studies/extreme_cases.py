@@ -23,38 +23,8 @@ from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
-from studies.extreme_scenes import (
-    BREAKAWAY,
-    CREEP_PUSH,
-    FREE,
-    MS,
-    OFF_POSE,
-    PUSH,
-    QUARTER,
-    REST,
-    RESTS,
-    RIGHT,
-    Changes,
-    SampledPd,
-    at_edge,
-    at_largest_beta,
-    at_the_pole,
-    bouncing,
-    bouncing_thrice,
-    changed,
-    inertias,
-    massless_links,
-    near_singularity,
-    noise,
-    pushed,
-    rubbing,
-    short_arc,
-    small_triangle,
-    sprung,
-    spun,
-    square_wave,
-    start,
-)
+from studies import extreme_scenes as make
+from studies.extreme_scenes import FREE, MS, PUSH, QUARTER, REST, RIGHT, Changes, changed
 
 Torque = Vector3 | Callable[[int, Any], Vector3]
 
@@ -99,9 +69,9 @@ class Case:
         return self.torque(simulation.time_ns // self.period_ns, simulation)
 
 
-REFERENCE = Case("reference", spun(2.0), PUSH, 20, 10 * MS)
-TURNED = Case("without torque", spun(10.0), REST, 10, 4 * MS)
-STIFFER = Case("stops ten times as stiff", bouncing(1e9), REST, 30, 10 * MS)
+REFERENCE = Case("reference", make.spun(2.0), PUSH, 20, 10 * MS)
+TURNED = Case("without torque", make.spun(10.0), REST, 10, 4 * MS)
+STIFFER = Case("stops ten times as stiff", make.bouncing(1e9), REST, 30, 10 * MS)
 
 
 @cache
@@ -172,13 +142,13 @@ def from_start(_: Case, simulation: Simulation) -> float:
 
 def from_set_point(_: Case, simulation: Simulation) -> float:
     """Distance from RESTS [rad]."""
-    return math.dist(simulation.state.joints.gamma, RESTS)
+    return math.dist(simulation.state.joints.gamma, make.RESTS)
 
 
 def from_decay(_: Case, simulation: Simulation) -> float:
     """Distance from angles that decay towards RESTS by exp(-k t / c) [rad]."""
     decay = math.exp(-500.0 / 1e5)
-    path = [rest + (QUARTER - rest) * decay for rest in RESTS]
+    path = [rest + (QUARTER - rest) * decay for rest in make.RESTS]
     return math.dist(simulation.state.joints.gamma, path)
 
 
@@ -187,7 +157,7 @@ def from_creep(_: Case, simulation: Simulation) -> float:
     t, friction = simulation.time_ns * 1e-9, simulation.scene.friction
     assert friction is not None and friction.gamma is not None
     v = friction.gamma.smoothing
-    path = [QUARTER + v * math.atanh(tau / BREAKAWAY) * t for tau in CREEP_PUSH]
+    path = [QUARTER + v * math.atanh(tau / make.BREAKAWAY) * t for tau in make.CREEP_PUSH]
     return math.dist(simulation.state.joints.gamma, path) / (v * t)
 
 
@@ -201,7 +171,7 @@ def asymmetry(case: Case, simulation: Simulation) -> float:
 def from_unturned(case: Case, simulation: Simulation) -> float:
     """Distance from the angles with the base as it is [rad]."""
     initial = simulation.scene.initial
-    unturned = {**FREE, **start(initial.gamma, initial.gamma_dot)}
+    unturned = {**FREE, **make.start(initial.gamma, initial.gamma_dot)}
     other = tight_end(replace(case, changes=unturned))
     return math.dist(simulation.state.joints.gamma, other.state.joints.gamma)
 
@@ -253,17 +223,17 @@ def catalogue() -> tuple[Case, ...]:
 def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
     """Yield heading, difficulty where a case names none, and the cases."""
     yield "Time scales", "rates over twelve decades", [
-        Case(f"time x {s:g}", spun(2.0 / s), pushed(s**-2), 20, round(10 * MS * s),
+        Case(f"time x {s:g}", make.spun(2.0 / s), make.pushed(s**-2), 20, round(10 * MS * s),
              "the end of the same motion at its own speed, by the scaling law",
              from_reference, 1e-9)
         for s in (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4)
     ]
     yield "Inertia scales", "numbers far from 1, or from each other", [
-        *(Case(f"inertia x {a:g}", {**spun(2.0), **inertias(a, a)}, pushed(a), 20, 10 * MS,
-               "the same motion, under torques scaled alike", from_reference, 1e-12)
+        *(Case(f"inertia x {a:g}", {**make.spun(2.0), **make.inertias(a, a)}, make.pushed(a),
+               20, 10 * MS, "the same motion, under torques scaled alike", from_reference, 1e-12)
           for a in (1e-12, 1e-6, 1e6, 1e9)),
         *(Case(f"star's inertia x {a:g} beside the same links",
-               {**spun(2.0), **inertias(a, 1.0)}, REST, 10, 10 * MS,
+               {**make.spun(2.0), **make.inertias(a, 1.0)}, REST, 10, 10 * MS,
                "energy is kept", energy_drift, 1e-9)
           for a in (1e-9, 1e9)),
     ]
@@ -274,135 +244,135 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
           for where, changes, refusal in (
               ("against an end of the stroke", {}, "StrokeExceeded"),
               ("into a serial singularity", FREE, "SingularityReached"))),
-        *(Case(f"spin of {rate:g} rad/s", spun(rate), REST, 10, round(0.4e8 / rate),
+        *(Case(f"spin of {rate:g} rad/s", make.spun(rate), REST, 10, round(0.4e8 / rate),
                "without torque the path does not depend on the rate", from_turned, 1e-7)
           for rate in (1e4, 1e6)),
     ]
     yield "Starts at limits", "a joint at its limit, where a sign decides", [
         *(Case("start at a corner of the strokes, {:.3g} {:.3g} {:.3g}".format(*gamma),
-               start(gamma), REST, 10, MS, "rest stays rest", from_start, 1e-12)
+               make.start(gamma), REST, 10, MS, "rest stays rest", from_start, 1e-12)
           for gamma in (REST, (0.0, 0.5, 0.5), (RIGHT, RIGHT, RIGHT), (0.7, 0.7, 0.0))),
-        Case("pushed outwards at an end of the stroke", start((0.0, 0.5, 0.5)), (-1.0, 0.0, 0.0),
-             1, MS, "the run ends where it starts", refusal="StrokeExceeded",
+        Case("pushed outwards at an end of the stroke", make.start((0.0, 0.5, 0.5)),
+             (-1.0, 0.0, 0.0), 1, MS, "the run ends where it starts", refusal="StrokeExceeded",
              stop_time=lambda: 0.0),
-        Case("start at a corner that cannot be assembled", start((0.0, RIGHT, 0.7)), REST, 1, MS,
-             "refused by name", refusal="NoAdmissibleAssembly"),
+        Case("start at a corner that cannot be assembled", make.start((0.0, RIGHT, 0.7)), REST,
+             1, MS, "refused by name", refusal="NoAdmissibleAssembly"),
     ]
     yield "Stiff loads", "decay rates far above those of the motion", [
-        Case("viscous friction of 1e5 N m s/rad", sprung(500.0, 1e5), REST, 10, 100 * MS,
+        Case("viscous friction of 1e5 N m s/rad", make.sprung(500.0, 1e5), REST, 10, 100 * MS,
              "springs creep: angles decay by exp(-k t / c), inertia counts by M k / c^2 = 1e-8 of "
              "it", from_decay, 1e-8),
-        *(Case(f"PD gains of 1e6 N m/rad and {damping:g} N m s/rad", sprung(1e6, damping), REST,
-               3, 100 * MS, "at its set point after more than 25 time constants",
+        *(Case(f"PD gains of 1e6 N m/rad and {damping:g} N m s/rad", make.sprung(1e6, damping),
+               REST, 3, 100 * MS, "at its set point after more than 25 time constants",
                from_set_point, 1e-10)
           for damping in (1e3, 1e4)),
-        Case("elastic stops of 1e8 N m/rad", bouncing(1e8), REST, 30, 10 * MS,
+        Case("elastic stops of 1e8 N m/rad", make.bouncing(1e8), REST, 30, 10 * MS,
              "as at 1e9 N m/rad, but for the contact of pi sqrt(m / k) = 2e-4 s; energy kept",
              from_stiffer_bounce, 1e-6),
     ]
     yield "Parallel singularities", "", [
         *(Case(f"crossed at {spin:g} rad/s",
-               partial(near_singularity, math.copysign(0.08, -spin), spin), REST,
+               partial(make.near_singularity, math.copysign(0.08, -spin), spin), REST,
                80, round(2e6 / abs(spin)), "det J2 changes its sign and the energy stays",
                crossing, 1e-10,
                "J is infinite at the crossing; gamma alone does not determine the motion")
           for spin in (0.5, -0.5, 2.0, -2.0, 20.0, -20.0)),
-        Case("rest 0.1 rad beside one", partial(near_singularity, 1e-1, 0.0), REST, 10, MS,
+        Case("rest 0.1 rad beside one", partial(make.near_singularity, 1e-1, 0.0), REST, 10, MS,
              *RESTING, 1e-12, "a second assembly mode lies close by"),
-        Case("rest 0.01 rad beside one", partial(near_singularity, 1e-2, 0.0), REST, 1, MS,
+        Case("rest 0.01 rad beside one", partial(make.near_singularity, 1e-2, 0.0), REST, 1, MS,
              "refused by name: gamma has two admissible assemblies there",
              difficulty="two assembly modes meet at a parallel singularity",
              refusal="AmbiguousAssembly"),
     ]
     yield "Edges of the workspace", "", [
         *(case for beta in (1e-3, 1e-6, 1e-9) for case in (
-            Case(f"start at beta_1 = {beta:g} rad, inside", partial(at_edge, beta), REST, 5, MS,
-                 "rest stays rest, at that beta_1", partial(from_beta, beta), 1e-5,
+            Case(f"start at beta_1 = {beta:g} rad, inside", partial(make.at_edge, beta), REST,
+                 5, MS, "rest stays rest, at that beta_1", partial(from_beta, beta), 1e-5,
                  "det J1 tends to 0 with beta"),
-            Case(f"start at beta_1 = {-beta:g} rad, outside", partial(at_edge, -beta), REST, 1, MS,
-                 "refused by name", difficulty="the same pose as inside, to nine digits",
+            Case(f"start at beta_1 = {-beta:g} rad, outside", partial(make.at_edge, -beta), REST,
+                 1, MS, "refused by name", difficulty="the same pose as inside, to nine digits",
                  refusal="NoAdmissibleAssembly"))),
-        Case("start 1e-09 rad inside the largest beta", partial(at_largest_beta, 1e-9), REST,
+        Case("start 1e-09 rad inside the largest beta", partial(make.at_largest_beta, 1e-9), REST,
              5, MS, *RESTING, 1e-12, "rounding must not decide on which side a pose lies"),
-        Case("start 1e-09 rad outside the largest beta", partial(at_largest_beta, -1e-9), REST,
+        Case("start 1e-09 rad outside the largest beta", partial(make.at_largest_beta, -1e-9), REST,
              5, MS, "refused by name", refusal="NoAdmissibleAssembly",
              difficulty="rounding must not decide on which side a pose lies"),
     ]
     yield "Poles and unusual shapes", "", [
-        *(Case(f"{how} the Euler pole phi = 0", at_the_pole(rate), REST, 20, 10 * MS,
+        *(Case(f"{how} the Euler pole phi = 0", make.at_the_pole(rate), REST, 20, 10 * MS,
                "gamma as with the base in another orientation: without gravity it does not matter",
                from_unturned, 1e-9,
                "ZYZ angles are not unique there; the state is a quaternion")
           for how, rate in (
               ("turning at", (1.0, 1.0, 1.0)), ("moving through", (1.0, -0.5, 0.25)))),
-        *(Case(f"base triangle of {spread:g} rad", small_triangle(spread), REST, 20, 10 * MS,
+        *(Case(f"base triangle of {spread:g} rad", make.small_triangle(spread), REST, 20, 10 * MS,
                *ENERGY, 1e-9, "the axes of the actuators are nearly parallel planes")
           for spread in (1e-1, 1e-2, 1e-3)),
-        Case("base triangle of 1e-06 rad", partial(small_triangle, 1e-6), REST, 1, MS,
+        Case("base triangle of 1e-06 rad", partial(make.small_triangle, 1e-6), REST, 1, MS,
              "refused: triangle too small", refusal="InputError",
              difficulty="rounding of the corners is a part in 1e10 of it"),
-        Case("three arcs of which one is 1 deg", short_arc(1.0), REST, 20, 10 * MS,
+        Case("three arcs of which one is 1 deg", make.short_arc(1.0), REST, 20, 10 * MS,
              *ENERGY, 1e-9, "two actuators nearly share an axis"),
         *(Case(f"needle star, inertia ({thin:g}, 1, 1)",
-               {**spun(2.0), "star.inertia": {"xx": thin, "yy": 1.0, "zz": 1.0}}, REST,
+               {**make.spun(2.0), "star.inertia": {"xx": thin, "yy": 1.0, "zz": 1.0}}, REST,
                20, 10 * MS, *ENERGY, 1e-9, "one principal inertia is next to nothing")
           for thin in (1e-3, 1e-6, 1e-9)),
     ]
     yield "Friction and actuators", "", [
         *(Case(f"Stribeck friction, smoothing {v:g} rad/s",
-               rubbing(coulomb=1.0, static=BREAKAWAY, smoothing=v, stribeck=0.1), CREEP_PUSH,
-               20, MS,
+               make.rubbing(coulomb=1.0, static=make.BREAKAWAY, smoothing=v, stribeck=0.1),
+               make.CREEP_PUSH, 20, MS,
                "each joint creeps at smoothing artanh(tau / static), a part in 100 of that path",
                from_creep, 1e-2,
                f"the friction torque changes sign within {v:g} rad/s: rates decay at some "
                f"{5.0 / v:.0e} 1/s")
           for v in (1e-4, 1e-6, 1e-8)),
         *(Case(f"actuator lag of {lag:g} s",
-               {**spun(2.0), "actuators": {"time_constant": lag}}, PUSH, 20, 10 * MS,
+               {**make.spun(2.0), "actuators": {"time_constant": lag}}, PUSH, 20, 10 * MS,
                "the motion without lag, its torque late by the lag", from_reference,
                max(lag, 1e-8), f"a decay of {1.0 / lag:.0e} 1/s in the state")
           for lag in (1e-3, 1e-6, 1e-9)),
     ]
     yield "Elastic stops", "", [
-        *(Case(f"stops of {stiffness:g} N m/rad", bouncing(stiffness), REST, 30, 10 * MS,
+        *(Case(f"stops of {stiffness:g} N m/rad", make.bouncing(stiffness), REST, 30, 10 * MS,
                *ENERGY, 1e-8, "the torque has a kink; contact takes pi sqrt(m / k)",
                loose=loose, estimate=why)
           for stiffness, loose, why in (
               (1e3, LOOSE, ""), (1e5, LOOSE, ""), (1e9, FINER, SHORT_CONTACT))),
-        Case("three simultaneous contacts", bouncing_thrice(1e5, 1.0), REST, 100, 10 * MS,
+        Case("three simultaneous contacts", make.bouncing_thrice(1e5, 1.0), REST, 100, 10 * MS,
              "all legs stay alike, energy is constant", asymmetry, 1e-8,
              "rounding must not decide the order of contacts"),
-        Case("forty contacts in a second", bouncing_thrice(1e4, 20.0), REST, 10, 100 * MS,
+        Case("forty contacts in a second", make.bouncing_thrice(1e4, 20.0), REST, 10, 100 * MS,
              *ENERGY, 1e-9, "each contact is located; their errors add up",
              loose=None, estimate=UNSTABLE),
         Case("sharp Coulomb friction and three contacts",
-             {**bouncing_thrice(1e5, 3.0), **rubbing(coulomb=2.0, smoothing=0.01)}, REST,
+             {**make.bouncing_thrice(1e5, 3.0), **make.rubbing(coulomb=2.0, smoothing=0.01)}, REST,
              30, 10 * MS, *TIGHT, 1e-8,
              "friction of 2 N m changes its sign within 0.01 rad/s, at each contact",
              loose=FINER, estimate=SHARP_FRICTION),
     ]
     yield "Torques that jump", "", [
-        Case("noise of 1 N m at 10 kHz", spun(0.5), noise, 1000, 100_000,
+        Case("noise of 1 N m at 10 kHz", make.spun(0.5), make.noise, 1000, 100_000,
              *TIGHT, 1e-9, "a jump of the torque at every step"),
-        Case("square wave of 2 N m", spun(0.5), square_wave, 60, 5 * MS,
+        Case("square wave of 2 N m", make.spun(0.5), make.square_wave, 60, 5 * MS,
              *TIGHT, 1e-9, "jumps of twice the amplitude"),
         *(Case(f"sampled PD control at {product:g} of the limit of its bandwidth",
-               OFF_POSE, control, 120, control.period_ns,
+               make.OFF_POSE, control, 120, control.period_ns,
                f"errors grow by {control.pole:.4f} a period, the pole of the sampled loop",
                control.from_pole, 1e-3,
                "a step more of delay or a gain 1 % higher turns decay into growth", feedback=True)
-          for product in (0.98, 1.02) for control in [SampledPd(product)]),
-        *(Case(f"control period of {period_ns} ns", spun(0.5), lambda *_: PUSH, 37, period_ns,
+          for product in (0.98, 1.02) for control in [make.SampledPd(product)]),
+        *(Case(f"control period of {period_ns} ns", make.spun(0.5), lambda *_: PUSH, 37, period_ns,
                *TIGHT, 1e-9, "a period that no step size divides; time is whole nanoseconds")
           for period_ns in (333_333, 7_919_317)),
     ]
     yield "Extreme ratios of inertia", "", [
         *(Case(f"star x {star:g} with links x {links:g}",
-               {**spun(2.0), **inertias(star, links)}, REST, 10, 10 * MS,
+               {**make.spun(2.0), **make.inertias(star, links)}, REST, 10, 10 * MS,
                *ENERGY, 1e-8, "inertias 1e18 apart in one mass matrix")
           for star, links in ((1e9, 1e-9), (1e-9, 1e9))),
-        *(Case(f"star x {a:g} beside massless links", {**spun(2.0), **massless_links(a)}, REST,
-               20, 10 * MS, *ENERGY, 1e-9, "the star is all that has inertia")
+        *(Case(f"star x {a:g} beside massless links", {**make.spun(2.0), **make.massless_links(a)},
+               REST, 20, 10 * MS, *ENERGY, 1e-9, "the star is all that has inertia")
           for a in (1.0, 1e-12)),
     ]
     yield "Long runs", "", [
@@ -414,7 +384,7 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
                "ten million steps: rounding adds up, truncation of RK4 drifts", base="swing",
                integrator=method, compiled_only=True, loose=None, estimate=ONE_RUN)
           for method, bound in (("dop853", 1e-10), ("rk4", 1e-3))),
-        Case("a thousand contacts", bouncing_thrice(1e4, 20.0), REST, 250, 100 * MS,
+        Case("a thousand contacts", make.bouncing_thrice(1e4, 20.0), REST, 250, 100 * MS,
              *ENERGY, 1e-7, "each contact is located; their errors add up",
              compiled_only=True, loose=None, estimate=UNSTABLE),
     ]

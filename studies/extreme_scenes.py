@@ -120,9 +120,9 @@ def about_e(angle: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def posed(rotation: Array, spin: float) -> Changes:
-    """Start SINGULAR at an orientation with an angular velocity about OE [rad/s]."""
-    scene = changed(SINGULAR)
+def near_singularity(angle: float, spin: float) -> Changes:
+    """Start `angle` [rad] about OE from a singular pose, with that spin about OE [rad/s]."""
+    scene, rotation = changed(SINGULAR), singular_pose() @ about_e(angle)
     gamma, _, _ = kinematics.inverse(Geometry.of(scene), rotation)
     quaternion = quaternion_of(rotation)
     x, y, z, w = quaternion.tolist()
@@ -130,11 +130,6 @@ def posed(rotation: Array, spin: float) -> Changes:
     a, b, c = gamma.tolist()
     p, q, r = (float(rate) for rate in rates)
     return {**SINGULAR, **start((a, b, c), (p, q, r), quaternion)}
-
-
-def near_singularity(angle: float, spin: float) -> Changes:
-    """Start `angle` [rad] about OE from a singular pose, with that spin about OE [rad/s]."""
-    return posed(singular_pose() @ about_e(angle), spin)
 
 
 def at_edge(beta: float) -> Changes:
@@ -168,12 +163,11 @@ def at_the_pole(rate: Vector3) -> Changes:
     return {**FREE, **start((QUARTER, QUARTER, QUARTER), rate), "base.v": turn.T}
 
 
-def in_triangle(v: ArrayLike, share: Vector3) -> Changes:
-    """Take a base triangle, and go from the middle of its arcs at a share of them each second."""
+def in_triangle(v: ArrayLike) -> Changes:
+    """Take a base triangle, and go from the middle of its arcs, at rates in proportion to them."""
     geometry = Geometry.of(changed({"base.v": v}))
     a, b, c = (0.5 * float(arc) for arc in geometry.arc)
-    rate = (share[0] * a, share[1] * b, share[2] * c)
-    return {**FREE, "base.v": v, **start((a, b, c), rate)}
+    return {**FREE, "base.v": v, **start((a, b, c), (0.1 * a, 0.2 * b, -0.1 * c))}
 
 
 def small_triangle(spread: float) -> Changes:
@@ -182,14 +176,14 @@ def small_triangle(spread: float) -> Changes:
     for corner in np.eye(3):
         away = corner - centre * (centre @ corner)
         v.append(centre * math.cos(spread) + away / np.linalg.norm(away) * math.sin(spread))
-    return in_triangle(v, (0.1, 0.2, -0.1))
+    return in_triangle(v)
 
 
 def short_arc(degrees: float) -> Changes:
     """Return a base of whose three arcs one is that short; the others are a right angle."""
     angle = math.radians(degrees)
     v = ((1.0, 0.0, 0.0), (math.cos(angle), math.sin(angle), 0.0), (0.0, 0.0, 1.0))
-    return in_triangle(v, (0.1, 0.2, -0.1))
+    return in_triangle(v)
 
 
 def pushed(scale: float) -> Vector3:
@@ -236,8 +230,8 @@ class SampledPd:
         if k == 0:
             self._sizes.clear()
         self._sizes.append(math.hypot(*off, *(rate / PD_RATE)))
-        wanted = -self._inertia @ (PD_RATE**2 * off + 2.0 * PD_RATE * rate)
-        first, second, third = wanted.tolist()
+        torque = -self._inertia @ (PD_RATE**2 * off + 2.0 * PD_RATE * rate)
+        first, second, third = torque.tolist()
         return (first, second, third)
 
     def from_pole(self, *_: Any) -> float:

@@ -123,12 +123,8 @@ def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
     leg 1; a point of the axis t_k on legs 2 and 3 is tied to the star. SciPy's DOP853 integrates
     Pinocchio's accelerations in the angles of the seven joints of the tree.
 
-    Args:
-        scene: shipped scene that has bodies and sine torques only.
-        times: ascending times from 0 on [s], shape (n,).
-
     Returns:
-        Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3).
+        Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at the times [s].
 
     Raises:
         MissingDependency: Pinocchio is not installed.

@@ -31,7 +31,13 @@ from studies.extreme_runs import (
     run_batch,
     run_through_loop,
 )
-from studies.extreme_scenes import about_e, bouncing_thrice, changed, posed, singular_pose
+from studies.extreme_scenes import (
+    about_e,
+    bouncing_thrice,
+    changed,
+    near_singularity,
+    singular_pose,
+)
 
 CASES = [case for case in catalogue() if not case.compiled_only]
 EXAMPLE2 = load("example2_heavy")
@@ -205,7 +211,7 @@ def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
 
 def started(angle, spin):
     """Start about E beside a singular pose, with an angular velocity about E [rad/s]."""
-    return Simulation(changed(posed(singular_pose() @ about_e(angle), spin)))
+    return Simulation(changed(near_singularity(angle, spin)))
 
 
 def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
