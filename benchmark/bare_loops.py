@@ -30,7 +30,8 @@ from typing import Any
 
 import rclpy
 
-from benchmark.nodes import Process, Watch, markdown, until
+from benchmark.measure import format_markdown
+from benchmark.nodes import Process, Watch, start_simulator, wait_for
 from sst_ros.host import scheduling
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
@@ -59,13 +60,13 @@ class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-def python_sleep(until_ns: int) -> None:
+def sleep_in_python(until_ns: int) -> None:
     """Sleep until a monotonic time [ns] by time.sleep."""
     if (left := until_ns - time.monotonic_ns()) > 0:
         time.sleep(left / 1e9)
 
 
-def libc_sleep() -> Callable[[int], None]:
+def make_libc_sleep() -> Callable[[int], None]:
     """Return a function that sleeps until a monotonic time [ns] by clock_nanosleep."""
     sleep, at, absolute = ctypes.CDLL(None).clock_nanosleep, _Timespec(), 1
     given = time.CLOCK_MONOTONIC, absolute, ctypes.byref(at), None
@@ -92,7 +93,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     messages, log = StateMessages(), TorqueLog(LOG_TICKS, TICK_NS)
     numbers = finite(*Simulation("swing").sample)
     states = (messages.joint_states, messages.orientation, messages.euler_zyz)
-    until(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
+    wait_for(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
 
     def publish(stamp_ns: int) -> None:
         for reader in readers:
@@ -114,7 +115,7 @@ def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     latency.request(latency_us)
     ticks, sleeper, number, read = LOOPS[name]
     publish = exchange(number, read) if number else None
-    sleep = python_sleep if sleeper == "python" else libc_sleep()
+    sleep = sleep_in_python if sleeper == "python" else make_libc_sleep()
     time.sleep(1.0)  # until discovery is quiet
     scheduling.schedule(20, threading.get_native_id())
     scheduling.quiet()
@@ -148,7 +149,7 @@ class Beside:
 
     def __enter__(self) -> Beside:
         self._process.start()
-        until(lambda: self._counts[0], "loop beside the node", 60.0)
+        wait_for(lambda: self._counts[0], "loop beside the node", 60.0)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -179,7 +180,7 @@ def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
 
 
 @contextmanager
-def recorder() -> Iterator[None]:
+def record() -> Iterator[None]:
     """Record whatever is published, into a folder that is deleted."""
     folder = Path(tempfile.mkdtemp())
     process = Process("recorder", output=folder / "bag")
@@ -192,7 +193,7 @@ def recorder() -> Iterator[None]:
 
 def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> dict[str, float]:
     """Measure a loop, or the node, in a process of its own, with this cpu_dma_latency."""
-    with recorder():
+    with record():
         if name != NODE:
             command = [sys.executable, "-m", "benchmark.bare_loops", "--loop", name]
             command += ["--seconds", str(seconds), "--cpu-dma-latency", str(latency_us)]
@@ -200,9 +201,9 @@ def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> di
             return dict(json.loads(found.stdout))
         full = "/sst_simulator"
         watch.values.clear()
-        simulator = Process("simulator", scene="swing", compiled="true", cpu_dma_latency=latency_us)
+        simulator = start_simulator(scene="swing", compiled=True, cpu_dma_latency=latency_us)
         try:
-            watch.until(lambda: watch.phase(full) == "running", "run")
+            watch.wait_for(lambda: watch.phase(full) == "running", "run")
             watch.spin(2.5)
             before, used, began = watch.values[full], simulator.processor_s(), time.monotonic()
             watch.spin(seconds)
@@ -215,7 +216,7 @@ def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> di
     return {"processor": 100.0 * used / wall, "missed": 100.0 * missed / max(1, ticks + missed)}
 
 
-def refused(latency_us: int) -> str | None:
+def explain_refusal(latency_us: int) -> str | None:
     """Return why this exit latency cannot be asked for here, None where it can."""
     said = scheduling.CpuDmaLatency().request(latency_us)
     return said if scheduling.NO_LIMIT in said else None
@@ -224,7 +225,7 @@ def refused(latency_us: int) -> str | None:
 def compare(watch: Watch, seconds: float, rounds: int) -> str:
     """Measure all in turn; Markdown, a row for each, a table for each cpu_dma_latency."""
     settings = {-1: "no limit of the exit latency, the default"}
-    if (said := refused(0)) is None:
+    if (said := explain_refusal(0)) is None:
         settings[0] = "`cpu_dma_latency` 0"
     found: dict[tuple[int, str], list[dict[str, float]]] = {
         (latency_us, name): [] for name in (NODE, *LOOPS) for latency_us in settings
@@ -243,7 +244,7 @@ def compare(watch: Watch, seconds: float, rounds: int) -> str:
             ratio = median(a / b for a, b in zip(used, least, strict=True))
             missed = mean(run["missed"] for run in runs)
             rows.append([name, f"{median(used):.1f}", each, f"{ratio:.2f}", f"{missed:.3f}"])
-        tables.append(markdown(rows))
+        tables.append(format_markdown(rows))
     if said is not None:
         tables.append(f"With `cpu_dma_latency` 0: {said}.")
     return "\n\n".join(tables)
@@ -261,7 +262,7 @@ def main() -> None:
     if options.loop:
         print(json.dumps(run_loop(options.loop, options.seconds, options.cpu_dma_latency)))
         return
-    with Watch.started() as watch:
+    with Watch.start() as watch:
         print(compare(watch, options.seconds, options.rounds))
 
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmark import c_batch, c_floor, machine, variants
-from benchmark.timing import interleaved, ratio
+from benchmark import c_batch, c_floor, variants
+from benchmark.measure import describe_machine, divide, join_line, time_in_turn
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.batch import Batch
@@ -62,8 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         print("gcc is missing: NO C FLOOR. Only numba and NumPy are timed.", file=sys.stderr)
     with tempfile.TemporaryDirectory() as folder:
         work = _Work(scene, options.scenarios, Path(folder) if with_c else None)
-        seconds = interleaved(work.calls, options.rounds, shortest=5e-3)
-    host = machine.described("numpy", "numba", "llvmlite")
+        seconds = time_in_turn(work.calls, options.rounds, shortest=5e-3)
+    host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.version()
     rows = _rows(seconds, options.scenarios)
@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
     print("\n".join(work.notes), "\n")
     _print(rows, seconds)
-    print("\n" + machine.line(host))
+    print("\n" + join_line(host))
     if options.json:
         document = {"machine": host, "scene": options.scene, "rows": rows, "notes": work.notes}
         options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
@@ -214,7 +214,7 @@ def _rows(seconds: dict[tuple[str, str], list[float]], number: int) -> list[dict
         count = steps * number * len(METHODS[name].b)
         row = {"method": name, "who": who, "ns": 1e9 * median(seconds[name, who]) / count}
         if (name, FLOOR) in seconds:
-            share = ratio(seconds, (name, who), (name, FLOOR))
+            share = divide(seconds, (name, who), (name, FLOOR))
             row["over_c"] = share * STEPS / steps
         rows.append(row)
     return rows
@@ -229,15 +229,15 @@ def _print(rows: list[dict[str, Any]], seconds: dict[tuple[str, str], list[float
     for name in METHODS:
         for floor in (FLOOR, PLAIN):
             if (name, floor) in seconds:
-                to_c = ratio(seconds, (name, ONE), (name, floor))
+                to_c = divide(seconds, (name, ONE), (name, floor))
                 met = "met" if to_c <= AT_MOST_C else "MISSED"
                 print(f"{name}: numba over {floor}, 1 thread each {to_c:.2f}, "
                       f"target {AT_MOST_C}: {met}")  # fmt: skip
         for who in (variants.STAR, variants.BODIES):
-            print(f"{name}: {who} over fixed {ratio(seconds, (name, who), (name, ONE)):.2f}")
+            print(f"{name}: {who} over fixed {divide(seconds, (name, who), (name, ONE)):.2f}")
         for ours in (ALL, ONE):
             for who in (COLUMNS, TRACED):
-                times = STEPS * ratio(seconds, (name, who), (name, ours))
+                times = STEPS * divide(seconds, (name, who), (name, ours))
                 met = "met" if times >= AT_LEAST_COLUMNS else "MISSED"
                 print(f"{name}: {who} over {ours} {times:.0f}, target {AT_LEAST_COLUMNS}: {met}")
 

@@ -19,8 +19,7 @@ from dataclasses import replace
 from functools import partial
 from statistics import median
 
-from benchmark import machine as described
-from benchmark.timing import interleaved
+from benchmark.measure import describe_machine, join_line, time_in_turn
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RODAS4
@@ -93,7 +92,7 @@ def compare(name: str, scene: Scene, span: float, wanted: float, compiled: bool)
         for k, n in counts.items()
         if n is not None
     }
-    seconds = interleaved(runs, REPEATS, clock=time.process_time)
+    seconds = time_in_turn(runs, REPEATS, clock=time.process_time)
     times = {name: median(taken) for name, taken in seconds.items()}
     how = "numba" if compiled else "plain"
     for key, count in counts.items():
@@ -115,7 +114,7 @@ def main() -> int:
         for name, scene, span in scenes():
             for wanted in (1e-6, 1e-9):
                 compare(name, scene, span, wanted, compiled)
-    print("\n" + described.line(described.described("numpy", "numba")))
+    print("\n" + join_line(describe_machine("numpy", "numba")))
     return 0
 
 

@@ -20,8 +20,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from benchmark import c_floor, machine
-from benchmark.timing import interleaved, ratio
+from benchmark import c_floor
+from benchmark.measure import describe_machine, divide, join_line, time_in_turn
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -62,8 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         print("gcc is missing: NO C FLOOR. Only numba and plain Python are timed.", file=sys.stderr)
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
-        seconds = interleaved(calls, options.rounds, shortest=5e-3)
-    host = machine.described("numpy", "numba", "llvmlite")
+        seconds = time_in_turn(calls, options.rounds, shortest=5e-3)
+    host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.version()
     rows = _rows(seconds)
@@ -141,7 +141,7 @@ def _rows(seconds: dict[tuple[str, str], list[float]]) -> list[dict[str, Any]]:
         row = {"work": work, "who": who, "ns": 1e9 * median(seconds[work, who]) / count}
         floor = (work, "C -O3")
         if floor in seconds and who != PLAIN:
-            row["over_c"] = ratio(seconds, (work, who), floor)
+            row["over_c"] = divide(seconds, (work, who), floor)
         rows.append(row)
     order = list(dict.fromkeys(row["work"] for row in rows))
     return sorted(rows, key=lambda row: (order.index(row["work"]), row["ns"]))
@@ -163,7 +163,7 @@ def _print(rows: list[dict[str, Any]], host: dict[str, str], options: Any, size:
         if row["who"] == PLAIN and row["work"] == "rk4 step":
             met = "met" if row["ns"] <= 1e9 * AT_MOST_PLAIN else "MISSED"
             print(f"plain rk4 step {row['ns'] / 1e3:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
-    print("\n" + machine.line(host))
+    print("\n" + join_line(host))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmark import machine
+from benchmark.measure import describe_machine, join_line
 from sst_ros.host.output import slices
 from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
@@ -236,8 +236,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{name:40} {value:.4g}" if isinstance(value, float) else f"{name:40} {value}")
     good = wall < AT_MOST_S and memory < AT_MOST_GB
     print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
-    host = machine.described("numpy", "numba", "rosbags", "matplotlib")
-    print(machine.line(host))
+    host = describe_machine("numpy", "numba", "rosbags", "matplotlib")
+    print(join_line(host))
     if options.json:
         text = json.dumps({"found": found, "machine": host}, indent=2)
         options.json.write_text(text + "\n", encoding="utf-8")

@@ -16,7 +16,7 @@ from statistics import median
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmark import machine
+from benchmark.measure import describe_machine, join_line
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     _orders()
     _energy(options.seconds)
     _between()
-    print("\n" + machine.line(machine.described("numpy", "scipy", "numba")))
+    print("\n" + join_line(describe_machine("numpy", "scipy", "numba")))
     return 0
 
 

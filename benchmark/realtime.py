@@ -30,23 +30,38 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from benchmark import bare_loops, machine
+from benchmark import bare_loops
 from benchmark.bare_loops import Beside
-from benchmark.nodes import Process, Watch, markdown
+from benchmark.measure import (
+    DOCS,
+    describe_machine,
+    fill_page,
+    format_columns,
+    join_line,
+)
+from benchmark.nodes import Process, Watch, start_simulator
 from sst_ros.nodes.topics import NeverSpun
+
+TITLES = {
+    "kept": "1 kHz, 500 samples a second, recorder attached",
+    "loops": "Processor time beside bare loops",
+    "free": "As fast as possible, 1 kHz control, no recorder",
+    "fleet": "Namespaced simulators side by side",
+}
+"""Parts of the page."""
 
 MISSED, RATIO = "missed ticks [%]", "missed ticks, times those of the loop"
 BLOCKS = 20
 """Of a run: their scatter is the error of the ratio of missed ticks."""
-PAGE = Path(__file__).parents[1] / "docs" / "realtime.md"
+PAGE = DOCS / "realtime.md"
 Figures = dict[str, str]
 
 
 @contextmanager
-def commanded(watch: Watch, topic: str, readers: int) -> Iterator[None]:
+def command(watch: Watch, topic: str, readers: int) -> Iterator[None]:
     """Publish zero torques at 100 Hz to a simulator, and perhaps a recorder."""
     commands = watch.node.create_publisher(Float64MultiArray, topic, 10)
-    watch.until(lambda: commands.get_subscription_count() >= readers, f"readers of {topic}")
+    watch.wait_for(lambda: commands.get_subscription_count() >= readers, f"readers of {topic}")
     stop, message = threading.Event(), Float64MultiArray(data=[0.0, 0.0, 0.0])
 
     def publish() -> None:
@@ -71,7 +86,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
         recorder = Process("recorder", output=folder / "bag")
         stack.callback(recorder.end)
-        simulator = Process("simulator", wait_for_command="true", **given)
+        simulator = start_simulator(wait_for_command=True, **given)
         stack.callback(simulator.end)
         recorder.line()  # it is ready when it has heard all that speak
         memory: list[tuple[float, int]] = []
@@ -81,8 +96,8 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
             said = watch.values[name]
             counts.append((int(said["ticks"]), int(said["ticks_missed"]), *loop.counts))
 
-        with commanded(watch, f"{name}/commands", readers=2):
-            watch.until(lambda: watch.phase(name) == "running", "run")
+        with command(watch, f"{name}/commands", readers=2):
+            watch.wait_for(lambda: watch.phase(name) == "running", "run")
             with Beside(int(given["realtime_priority"])) as loop:
                 watch.spin(3.0)  # until all have begun
                 count()
@@ -100,7 +115,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
             "scheduling": said["scheduling"],
             "cpu_dma_latency": said["cpu_dma_latency"],
             "length [min]": f"{wall / 60.0:.1f}",
-            **_compared(np.diff(counts, axis=0)),
+            **_compare(np.diff(counts, axis=0)),
             "lateness, mean [us]": f"{float(said['late_mean_us']):.0f}",
             "lateness, standard deviation [us]": f"{float(said['late_std_us']):.0f}",
             "lateness, largest [us]": f"{float(said['late_max_us']):.0f}",
@@ -109,7 +124,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
             "mean step [us]": f"{float(said['step_mean_us']):.1f}",
             "memory [MB]": f"{memory[-1][1] / 1024.0:.0f}",
             "its growth after the first minute [MB]": _growth(memory, wall),
-            "recorded": _recorded(folder / "bag"),
+            "recorded": _count_recorded(folder / "bag"),
         }
 
 
@@ -123,9 +138,9 @@ def free_run(
     reader = watch.node.create_subscription(
         JointState, topic, print, qos_profile_sensor_data, callback_group=NeverSpun()
     )
-    simulator = Process("simulator", real_time_factor=0.0, publish_rate=publish_rate, **given)
+    simulator = start_simulator(real_time_factor=0.0, publish_rate=publish_rate, **given)
     try:
-        watch.until(lambda: watch.phase(name) == "running", "run")
+        watch.wait_for(lambda: watch.phase(name) == "running", "run")
         watch.spin(seconds)
         said = watch.values[name]
         return {
@@ -145,24 +160,25 @@ def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str,
     names = [f"/sst_{k}/sst_simulator" for k in range(number)]
     watch.values.clear()
     nodes = [
-        Process("simulator", name.rpartition("/")[0], rate=rate, publish_rate=rate, **given)
+        start_simulator(name.rpartition("/")[0], rate=rate, publish_rate=rate, **given)
         for name in names
     ]
     try:
-        watch.until(lambda: all(watch.phase(name) == "running" for name in names), "fleet", 240.0)
+        watch.wait_for(
+            lambda: all(watch.phase(name) == "running" for name in names), "fleet", 240.0
+        )
         watch.spin(5.0)  # until all have found each other
         before, used = dict(watch.values), sum(node.processor_s() for node in nodes)
         watch.spin(seconds)
         used = sum(node.processor_s() for node in nodes) - used
         since = [_since(before[name], watch.values[name]) for name in names]
-        worst = max(since, key=_missed)
         return {
             "simulators": str(number),
             "rate [Hz]": str(rate),
             "scheduling": watch.values[names[0]]["scheduling"],
             "length [min]": f"{seconds / 60.0:.1f}",
-            "missed ticks, all [%]": f"{_missed_of(since):.3f}",
-            "missed ticks, worst of them [%]": f"{_missed(worst):.3f}",
+            "missed ticks, all [%]": f"{_missed(since):.3f}",
+            "missed ticks, worst of them [%]": f"{max(_missed([one]) for one in since):.3f}",
             "processor, all [% of a core]": f"{100.0 * used / seconds:.0f}",
         }
     finally:
@@ -174,17 +190,13 @@ def _since(before: dict[str, str], now: dict[str, str]) -> dict[str, str]:
     return {key: str(int(now[key]) - int(before[key])) for key in ("ticks", "ticks_missed")}
 
 
-def _missed(said: dict[str, str]) -> float:
-    return _missed_of([said])
-
-
-def _missed_of(all_said: list[dict[str, str]]) -> float:
+def _missed(all_said: list[dict[str, str]]) -> float:
     ticks = sum(int(said["ticks"]) for said in all_said)
     missed = sum(int(said["ticks_missed"]) for said in all_said)
     return 100.0 * missed / max(ticks + missed, 1)
 
 
-def _compared(blocks: np.ndarray) -> Figures:
+def _compare(blocks: np.ndarray) -> Figures:
     """Missed ticks of the node and of the loop beside it, of rows with ticks and missed of both.
 
     The standard error of their ratio is that of the jackknife over the rows.
@@ -208,19 +220,13 @@ def _growth(memory: list[tuple[float, int]], wall: float) -> str:
     return f"{(max(later) - later[0]) / 1024.0:.2f}"
 
 
-def _recorded(bag: Path) -> str:
+def _count_recorded(bag: Path) -> str:
     from sst_ros.recording import recording
 
     run = recording.read(bag)
     # The last sample is where the run was stopped, perhaps before its time.
     expected = -int((run.time_ns[0] - run.time_ns[-1]) // run.period_ns) + 1
     return f"{len(run.time_ns)} of {expected} samples"
-
-
-def table(columns: list[Figures]) -> str:
-    """Markdown: a row for each key, a column for each run."""
-    keys = list(dict.fromkeys(key for column in columns for key in column))
-    return markdown([[key, *(column.get(key, "") for column in columns)] for key in keys])
 
 
 def main() -> None:
@@ -245,17 +251,21 @@ def main() -> None:
     if not options.plain:
         made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
-    with Watch.started() as watch:
-        parts = list(_parts(watch, options, given))
+    with Watch.start() as watch:
+        parts = dict(_measure(watch, options, given))
     if options.write:
-        options.write.write_text("\n\n".join([_HEAD, *parts]) + "\n", encoding="utf-8")
+        none = dict.fromkeys(TITLES, "not measured")
+        fill_page(PAGE, none | parts, options.write)
 
 
-def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> Iterator[str]:
-    def printed(title: str, text: str) -> str:
-        part = f"## {title}\n\n{text}"
-        print(part, end="\n\n", flush=True)
-        return part
+def _measure(
+    watch: Watch, options: argparse.Namespace, given: dict[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Yield the parts of the page by name, and print each."""
+
+    def show(name: str, text: str) -> tuple[str, str]:
+        print(f"## {TITLES[name]}\n\n{text}", end="\n\n", flush=True)
+        return name, text
 
     if not options.fleet:
         if options.minutes:
@@ -268,10 +278,10 @@ def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> 
                     ("neither", usual, {"realtime_priority": 0}),
                 )
             ]
-            yield printed("1 kHz, 500 samples a second, recorder attached", table(kept))
+            yield show("kept", format_columns(kept))
         if options.rounds:
             costs = bare_loops.compare(watch, options.seconds, options.rounds)
-            yield printed("Processor time beside bare loops", f"{_COST}\n\n{costs}")
+            yield show("loops", costs)
         seconds = min(60.0 * options.minutes, 8.0) or 8.0
         runs = [
             {"": f"run {k + 1}", **free_run(watch, seconds, rate, given, read=read)}
@@ -279,42 +289,16 @@ def _parts(watch: Watch, options: argparse.Namespace, given: dict[str, Any]) -> 
                 ((1000, True), (1000, False), (500, True), (500, False), (50, True))
             )
         ]
-        yield printed("As fast as possible, 1 kHz control, no recorder", table(runs))
+        yield show("free", format_columns(runs))
     number = options.fleet or (10 if options.minutes else 0)
     if number:
         seconds = min(60.0 * options.minutes, 60.0) or 20.0
         found = fleet(watch, number, options.rate, seconds, given)
-        yield printed("Namespaced simulators side by side", table([{"": "fleet", **found}]))
+        yield show("fleet", format_columns([{"": "fleet", **found}]))
     packages = ("rclpy", "numba", "numpy", "ros-rclpy", "ros-rmw-fastrtps-cpp")
-    said = f"Scene {options.scene}. {machine.line(machine.described(*packages))}."
+    said = f"Scene {options.scene}. {join_line(describe_machine(*packages))}."
     print(said, flush=True)
-    yield said
-
-
-_COST = """\
-Scene swing, compiled, 1 kHz, 500 samples a second, with a recorder, by
-`python -m benchmark.bare_loops`: each in a process of its own, in turn. The recorder subscribes to
-four topics: the loop that makes and publishes four, and looks for commands on two, is the least
-that a program with the topics of the node costs here by rclpy. What the node adds is two steps in
-one compiled call, the joints of the sample, its log of torques, the executor and the diagnostics.
-
-With `cpu_dma_latency` 0 no core sleeps (the whole machine is asked, so the loops have it too): the
-difference is the cost of leaving an idle state, of waking the recorder on a core that sleeps, and
-of caches that are cold afterwards."""
-
-_HEAD = """\
-# Real-time performance: missed ticks, lateness, processor load
-
-Measured by `python -m benchmark.realtime --minutes 10 --write`; shorter runs say so in their
-tables. Python without a real-time kernel is soft real time. A tick is missed when the one before
-it, or the machine, makes it late by a whole period; simulated time then drops it and the
-diagnostics count it. The compiled simulator wakes once for the two ticks of a sample; a loop that
-only sleeps to the same deadlines, in a process of its own at the same priority, counts in the same
-minutes and by the same rule what the machine alone misses. The error of their ratio is that of the
-jackknife over twenty parts of the run. Lateness is since the start of the node.
-
-As fast as possible, samples that nothing receives are passed over and only the last of several is
-made, which is what makes the runs faster in which joint_states is not read."""
+    yield "machine", said
 
 
 if __name__ == "__main__":

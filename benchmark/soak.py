@@ -13,28 +13,25 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import re
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmark import machine
-from benchmark.campaign.processes import domain
-from benchmark.nodes import Process, until
-from benchmark.realtime import table
+from benchmark.measure import describe_machine, format_columns, join_line
+from benchmark.nodes import Process, own_domain, start_simulator, wait_for
 from sst_ros.recording import recording
 
 SCENE = "reach"
 FLAT_MB = 2.0
 """Largest growth of a process after the first minute, or third, of the run."""
-_SUBSCRIBER = """
+SUBSCRIBER = """
 import rclpy
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from diagnostic_msgs.msg import DiagnosticArray
@@ -54,78 +51,65 @@ try:
 except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
     pass
 """
+"""Reads what robot_state_publisher, which makes /tf from it, and RViz read."""
 
 
-class Subscriber(Process):
-    """Reads what robot_state_publisher, which makes /tf from it, and RViz read."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _SUBSCRIBER], stdout=subprocess.PIPE, text=True
-        )
-
-
-def start(stack: ExitStack, folder: Path, seconds: float, *, control: bool) -> dict[str, Process]:
-    """Start all processes; those that record and control only with `control`."""
-    processes: dict[str, Process] = {}
-
-    def add(name: str, make: Callable[[], Process]) -> None:
-        processes[name] = make()
-        stack.callback(processes[name].end)
-
-    rates: dict[str, Any] = {"scene": SCENE, "rate": 1000, "publish_rate": 1000}
-    waits = {"wait_for_command": "true", "publish_description": "true"}
-    if control:
-        add("recorder", lambda: Process("recorder", output=folder / "bag"))
-    add("simulator", lambda: Process("simulator", **rates, **(waits if control else {})))
-    add("viewer", lambda: Process("viewer"))
-    add("subscriber", Subscriber)
-    if control:
-        processes["recorder"].line()  # it has subscribed to the topics of the simulator
-        given: dict[str, Any] = {"scene": SCENE, "rate": 1000, "mode": "computed_torque"}
-        given |= {"hold": seconds + 60.0, "min_subscribers": 2}
-        add("controller", lambda: Process("inverse_dynamics", **given))
+def start_all(stack: ExitStack, folder: Path, seconds: float) -> dict[str, Process]:
+    """Start all processes; the controller when the recorder listens to the simulator."""
+    rates: dict[str, Any] = {"scene": SCENE, "rate": 1000}
+    waits: dict[str, Any] = {
+        "publish_rate": 1000,
+        "wait_for_command": True,
+        "publish_description": True,
+    }
+    held: dict[str, Any] = {"mode": "computed_torque", "hold": seconds + 60.0, "min_subscribers": 2}
+    processes = {
+        "recorder": Process("recorder", output=folder / "bag"),
+        "simulator": start_simulator(**rates, **waits),
+        "viewer": Process("viewer"),
+        "subscriber": Process(SUBSCRIBER, python=True),
+    }
+    for process in processes.values():
+        stack.callback(process.end)
+    processes["recorder"].line()
+    processes["controller"] = Process("inverse_dynamics", **rates, **held)
+    stack.callback(processes["controller"].end)
     return processes
 
 
-def shared(pids: Iterable[int | str]) -> set[str]:
-    """Names of the files of Fast DDS in /dev/shm that these processes have open or mapped."""
+def list_shared(pids: Iterable[int | str]) -> set[Path]:
+    """Files of Fast DDS in /dev/shm that these processes have open or mapped."""
     names: set[str] = set()
     for pid in pids:
         folder = Path(f"/proc/{pid}")
         with contextlib.suppress(OSError):  # it has ended, or belongs to another user
-            names.update(re.findall(r"/dev/shm/(fast\S+)", (folder / "maps").read_text()))
+            names.update(re.findall(r"/dev/shm/fast\S+", (folder / "maps").read_text()))
             for path in (folder / "fd").iterdir():
                 with contextlib.suppress(OSError):
-                    names.update(re.findall(r"^/dev/shm/(fast\S+)$", str(path.readlink())))
-    return names
+                    names.update(re.findall(r"^/dev/shm/fast\S+$", str(path.readlink())))
+    return {Path(name) for name in names}
 
 
-def existing() -> set[str]:
-    """Names of the files in /dev/shm."""
-    return {path.name for path in Path("/dev/shm").iterdir()}
-
-
-def left(names: set[str], seconds: float = 10.0) -> list[str]:
+def list_left(files: set[Path], seconds: float = 10.0) -> list[str]:
     """Return which of them still exist after at most so long, unless a living process uses them.
 
     Other programs on this machine may use the same ports.
     """
     end = time.monotonic() + seconds
-    while found := names & existing():
-        found -= shared(path.name for path in Path("/proc").glob("[0-9]*"))
+    while found := {file for file in files if file.exists()}:
+        found -= list_shared(path.name for path in Path("/proc").glob("[0-9]*"))
         if not found or time.monotonic() > end:
             break
         time.sleep(0.2)
-    return sorted(found)
+    return sorted(file.name for file in found)
 
 
 def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:
     """Run for so long; return a column for each process, and what is wrong."""
-    wrong, before = [], existing()
+    wrong, before = [], set(Path("/dev/shm").iterdir())
     with ExitStack() as stack:
-        processes = start(stack, folder, seconds, control=True)
-        until(lambda: any((folder / "bag").glob("*.mcap")), "recording")
+        processes = start_all(stack, folder, seconds)
+        wait_for(lambda: any((folder / "bag").glob("*.mcap")), "recording")
         memory: dict[str, list[float]] = {name: [] for name in processes}
         began = time.monotonic()
         used = {name: process.processor_s() for name, process in processes.items()}
@@ -133,29 +117,24 @@ def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]
             time.sleep(min(2.0, seconds / 20.0))
             for name, process in processes.items():
                 memory[name].append(process.memory_kb() / 1024.0)
-        names = shared(process.pid for process in processes.values()) - before
+        files = list_shared(process.pid for process in processes.values()) - before
         columns = []
         for name, process in processes.items():
             later = memory[name][int(len(memory[name]) * min(60.0 / seconds, 1.0 / 3.0)) :]
             growth = max(later) - later[0]
             busy = 100.0 * (process.processor_s() - used[name]) / passed
-            columns.append({
+            column = {
                 "": name,
                 "processor [% of a core]": f"{busy:.1f}",
                 "memory at the end [MB]": f"{later[-1]:.1f}",
                 "growth after the first minute [MB]": f"{growth:.2f}",
-            })  # fmt: skip
+            }
+            columns.append(column)
             if growth > FLAT_MB:
                 wrong.append(f"{name} grows by {growth:.2f} MB")
-    if remaining := left(names):
+    if remaining := list_left(files):
         wrong.append(f"left in /dev/shm: {remaining}")
     return columns, wrong
-
-
-def lost(bag: Path) -> tuple[int, int]:
-    """Samples recorded, and samples missing between the first and the last."""
-    stamps = recording.read(bag).time_ns
-    return len(stamps), int((stamps[-1] - stamps[0]) // 1_000_000) + 1 - len(stamps)
 
 
 def main() -> int:
@@ -166,15 +145,15 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     options = parser.parse_args()
     subprocess.run([sys.executable, "-m", "sst_ros", "compile", SCENE], check=True)
-    with domain(), tempfile.TemporaryDirectory() as folder:
-        del os.environ["SST_ROS_NUMBA"]
+    with own_domain(), tempfile.TemporaryDirectory() as folder:
         columns, wrong = soak(Path(folder), 60.0 * options.minutes)
-        samples, missing = lost(Path(folder) / "bag")
-        if missing:
-            wrong.append(f"{missing} samples are not in the recording")
-    print(table(columns))
-    print(f"\nsamples recorded {samples}, missing {missing}")
-    print(machine.line(machine.described("rclpy", "ros-rmw-fastrtps-cpp", "viser")))
+        stamps = recording.read(Path(folder) / "bag").time_ns
+    missing = int((stamps[-1] - stamps[0]) // 1_000_000) + 1 - len(stamps)
+    if missing:
+        wrong.append(f"{missing} samples are not in the recording")
+    print(format_columns(columns))
+    print(f"\nsamples recorded {len(stamps)}, missing {missing}")
+    print(join_line(describe_machine("rclpy", "ros-rmw-fastrtps-cpp", "viser")))
     for line in wrong:
         print(f"WRONG: {line}")
     return 1 if wrong else 0

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark import machine
+from benchmark.measure import describe_machine, join_line
 from sst_ros import load_scene, simulate, sweep
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_chunk, run_local
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cluster", action="store_true", help="time Dask workers, too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    found: dict[str, Any] = {"machine": machine.described("numpy", "numba", "dask", "pyarrow")}
+    found: dict[str, Any] = {"machine": describe_machine("numpy", "numba", "dask", "pyarrow")}
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
     found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in found.items():
         if name != "machine":
             print(f"{name:>44}: {value:.6g}")
-    print(machine.line(found["machine"]))
+    print(join_line(found["machine"]))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 0

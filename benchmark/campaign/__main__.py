@@ -16,29 +16,27 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from datetime import date
 from multiprocessing import get_context
-from pathlib import Path
 
-from benchmark.campaign.ledger import KINDS, Ledger
-from benchmark.campaign.parts import PARTS, run
+from benchmark.campaign.ledger import KINDS, PARTS, Ledger, run_part
+from benchmark.measure import DOCS, fill_page
 
-PAGE = Path(__file__).parents[2] / "docs" / "robustness.md"
+PAGE = DOCS / "robustness.md"
 
 
-def table(ledgers: list[Ledger]) -> str:
+def format_ledgers(ledgers: list[Ledger]) -> str:
     """Return the table of all parts, Markdown."""
-    titles = ("what was tried", "cases", "hangs", "tracebacks", "silent differences", "lost",
-              "longest [s]")  # fmt: skip
-    rows = [f"| {' | '.join(titles)} |", f"| --- {'| ---: ' * (len(titles) - 1)}|"]
+    titles = "what was tried | cases | hangs | tracebacks | silent differences | lost | longest [s]"
+    rows = [f"| {titles} |", f"| --- {'| ---: ' * titles.count('|')}|"]
     for one in ledgers:
         counts = " | ".join(str(getattr(one, kind)) for kind in KINDS)
         rows.append(f"| {one.what} | {one.tried} | {counts} | {one.longest_s:.2f} |")
     return "\n".join(rows)
 
 
-def in_its_own_process(part: str, share: float, seed: int) -> Ledger:
+def run_apart(part: str, share: float, seed: int) -> Ledger:
     """Run a part in a new process: what it leaves in memory is no other's."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(run, part, share, seed).result()
+        return process.submit(run_part, part, share, seed).result()
 
 
 def main() -> int:
@@ -58,19 +56,17 @@ def main() -> int:
         # The longest first: `bits` compiles 200 scenes, then the nodes.
         long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part] != "nodes"))
         waiting = {
-            pool.submit(in_its_own_process, part, options.share, options.seed): part
-            for part in long_first
+            pool.submit(run_apart, part, options.share, options.seed): part for part in long_first
         }
         for future in as_completed(waiting):
             part = waiting[future]
             found[part] = ledger = future.result()
             mark = "ok" if ledger.sound else "FOUND"
-            print(f"[{len(found)}/{len(parts)}] {part}: {mark}, {ledger.tried} cases, "
-                  f"{ledger.seconds:.0f} s", flush=True)  # fmt: skip
-            for note in ledger.notes[:20]:
-                print(f"    {note}", flush=True)
+            said = f"{part}: {mark}, {ledger.tried} cases, {ledger.seconds:.0f} s"
+            notes = "".join(f"\n    {note}" for note in ledger.notes[:20])
+            print(f"[{len(found)}/{len(parts)}] {said}{notes}", flush=True)
     ledgers = [found[part] for part in parts]
-    text = table(ledgers)
+    text = format_ledgers(ledgers)
     minutes = (time.monotonic() - began) / 60
     print(f"\n{text}\n\nseed {options.seed}, share {options.share:g}, {minutes:.1f} minutes")
     if options.write:
@@ -78,8 +74,7 @@ def main() -> int:
             f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f} minutes, "
             f"{platform.machine()}, Python {platform.python_version()}, {date.today()}."
         )
-        head = PAGE.read_text(encoding="utf-8").split("<!-- results -->")[0]
-        PAGE.write_text(f"{head}<!-- results -->\n\n{text}\n\n{made}\n", encoding="utf-8")
+        fill_page(PAGE, {"results": f"{text}\n\n{made}"})
     return 0 if all(ledger.sound for ledger in ledgers) else 1
 
 

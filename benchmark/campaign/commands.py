@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchmark.campaign.ledger import Budget, Ledger
-from benchmark.campaign.processes import domain
+from benchmark.nodes import own_domain
 
 COMMAND_BOUND_S = 30.0
 """A refusal takes a second; a command that does its work takes longer beside other work."""
@@ -107,7 +107,7 @@ WRONG = (
 def command_lines(budget: Budget, seed: int) -> Ledger:
     """Give wrong words to every verb: one line and a status other than 0, or usage."""
     ledger, rng = budget.ledger("command lines"), random.Random(seed)
-    with domain(), tempfile.TemporaryDirectory() as name:
+    with own_domain(compiled=False), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
         (folder / "empty.yaml").write_text("")

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one part of the campaign has tried and found."""
+"""The parts of the campaign, and what each has tried and found."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 HANG_S = 1.0
@@ -72,9 +73,6 @@ class Ledger:
             self.found("hangs", f"{name}: {took:.2f} s")
 
 
-Part = Callable[["Budget", int], Ledger]
-
-
 class Budget:
     """How much of a part is run, and how long it may take.
 
@@ -94,3 +92,26 @@ class Budget:
     def cases(self, full: int, least: int = 1) -> range:
         """Return numbers of the cases to try, of `full` in the whole campaign."""
         return range(max(least, round(full * self.share)))
+
+
+ROOMS = {
+    "scenes": "documents extremes invariants bits",
+    "commands": "command_lines surroundings",
+    "recordings": "damages recorder_kills",
+    "nodes": "messages floods services parameters stuck node_kills clock starts",
+}
+PARTS = {part: room for room, parts in ROOMS.items() for part in parts.split()}
+"""Name and module of each part, a function of a budget and a seed."""
+
+
+def run_part(part: str, share: float, seed: int, patience: float = 1.0) -> Ledger:
+    """Run one part in this process."""
+    module = importlib.import_module(f"benchmark.campaign.{PARTS[part]}")
+    began = time.monotonic()
+    try:
+        ledger: Ledger = getattr(module, part)(Budget(share, patience), seed)
+    except Exception as error:
+        ledger = Ledger(part)
+        ledger.found("tracebacks", f"the part itself ended: {type(error).__name__}: {error}")
+    ledger.seconds = time.monotonic() - began
+    return ledger

@@ -19,14 +19,13 @@ from benchmark.campaign.processes import (
     NODE,
     REPLY_S,
     Client,
-    domain,
-    ended,
     is_alive,
     running,
     start,
     stop,
 )
 from benchmark.campaign.scenes import needle
+from benchmark.nodes import own_domain
 
 ENDLESS = """
 from sst_ros.simulation.simulation import Simulation
@@ -196,7 +195,7 @@ def parameters(budget: Budget, seed: int) -> Ledger:
     return ledger
 
 
-def kills(budget: Budget, seed: int) -> Ledger:
+def node_kills(budget: Budget, seed: int) -> Ledger:
     """Kill the player and the controller beside a simulator: it goes on and ends when asked."""
     ledger, rng = budget.ledger("players and controllers killed with -9"), random.Random(seed)
     for number in budget.cases(66, least=1):
@@ -286,15 +285,14 @@ def starts(budget: Budget, seed: int) -> Ledger:
     before = _shared_memory()
     for number in budget.cases(200, least=4):
         ledger.tried += 1
-        with domain():
+        with own_domain(compiled=False):
             kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[number % 4]
             process = start(kind, **({"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
                                      if kind == "recorder" else {}))  # fmt: skip
             # The wait is the experiment: the moment of the signal is random.
             time.sleep(rng.uniform(0.0, 2.0))
-            status, text = ended(
-                process, rng.choice((signal.SIGINT, signal.SIGTERM)), 10.0 * ledger.patience
-            )
+            number_sent = rng.choice((signal.SIGINT, signal.SIGTERM))
+            status, text = process.end(number_sent, 10.0 * ledger.patience)
             if status == 255:
                 ledger.found("hangs", f"{kind} did not end within 10 s")
             if "Traceback" in text:

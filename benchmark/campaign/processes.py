@@ -1,72 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in a ROS domain of their own, a client of them, and the bounds that they keep."""
+"""Nodes that the campaign starts, a client of them, and the bounds that they keep."""
 
 from __future__ import annotations
 
 import math
-import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from benchmark.campaign.ledger import Ledger
-from sst_ros.host import child_process
+from benchmark.nodes import Process, own_domain
 
-FAULT_S = 1.0
-"""A step that does not end is a fault within this time."""
-REPLY_S = 0.5
-"""A node answers every service within this time."""
-CLOSE_S = 2.0
-"""A node ends within this time of a signal."""
+FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
+"""Within this time a step that does not end is a fault, a node answers a service, and it ends."""
+
 NODE = "/sst_simulator"
-EXECUTABLES = Path(__file__).parents[2] / "executables"
 
 
-@contextmanager
-def domain() -> Iterator[int]:
-    """Give the processes that are started inside a ROS domain of their own, on localhost."""
-    before = os.environ.get("SST_ROS_NUMBA")
-    with child_process.own_domain() as number:
-        os.environ["SST_ROS_NUMBA"] = "0"
-        try:
-            yield number
-        finally:
-            os.environ.pop("SST_ROS_NUMBA", None)
-            if before is not None:
-                os.environ["SST_ROS_NUMBA"] = before
-
-
-def start(command: str, patch: str = "", **given: object) -> subprocess.Popen[str]:
-    """Start a node as `ros2 run` does, with parameters; `patch` is code that it runs first."""
-    words = ["--ros-args", *child_process.words(given)] if given else []
-    program = f"{patch}\nimport sys\nfrom sst_ros.__main__ import main\nsys.exit(main())"
-    node = [sys.executable, "-c", program, command] if patch else [str(EXECUTABLES / command)]
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return subprocess.Popen(
-        [*node, *words], env={**os.environ, "PATH": path},
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        pipesize=1 << 20,  # nobody reads before the end, and a full pipe stops the node
-    )  # fmt: skip
-
-
-def ended(process: subprocess.Popen[str], number: int, timeout: float = 20.0) -> tuple[int, str]:
-    """Send a signal, wait for the end; return the exit status and all that was printed."""
-    if process.poll() is None:
-        process.send_signal(number)
-    try:
-        out, _ = process.communicate(timeout=timeout)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        out, _ = process.communicate()
-        return 255, out or ""
-    except ValueError:  # its output has been read and closed already
-        return process.wait(), ""
-    return process.returncode, out or ""
+def start(command: str, patch: str = "", **given: Any) -> Process:
+    """Start a plain node, with parameters; `patch` is code that it runs first."""
+    program = f"{patch}\nimport sys\nfrom sst_ros.__main__ import main\n"
+    program += f"sys.exit(main([{command!r}, *sys.argv[1:]]))"
+    return Process(
+        program if patch else command, python=bool(patch), stderr=subprocess.STDOUT, **given
+    )
 
 
 class Client:
@@ -114,24 +74,26 @@ class Client:
 
 
 @contextmanager
-def running(patch: str = "", **given: object) -> Iterator[tuple[subprocess.Popen[str], Client]]:
+def running(patch: str = "", **given: object) -> Iterator[tuple[Process, Client]]:
     """Give a running simulator and a client of it."""
-    with domain() as number:
+    with own_domain(compiled=False) as number:
         process = start("simulator", patch, **{"scene": "swing", "duration": 0.0, **given})
         client = Client(number)
         try:
             yield process, client
         finally:
             client.close()
-            ended(process, signal.SIGKILL)
+            process.end(signal.SIGKILL, 20.0)
 
 
-def is_alive(ledger: Ledger, process: subprocess.Popen[str], client: Client, after: str) -> bool:
+def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bool:
     """Count a node that has died or does not answer."""
     from std_srvs.srv import SetBool
 
     if process.poll() is not None:
-        ledger.found("tracebacks", f"the node ended after {after}: {ended(process, 0)[1][-300:]}")
+        ledger.found(
+            "tracebacks", f"the node ended after {after}: {process.end(0, 20.0)[1][-300:]}"
+        )
         return False
     reply, took = client.call(SetBool, f"{NODE}/pause", data=False)
     if reply is None:
@@ -142,9 +104,9 @@ def is_alive(ledger: Ledger, process: subprocess.Popen[str], client: Client, aft
     return True
 
 
-def stop(ledger: Ledger, process: subprocess.Popen[str], number: int = signal.SIGINT) -> None:
+def stop(ledger: Ledger, process: Process, number: int = signal.SIGINT) -> None:
     began = time.monotonic()
-    status, text = ended(process, number)
+    status, text = process.end(number, 20.0)
     took = time.monotonic() - began
     if status not in (0, 1):
         ledger.found("tracebacks", f"exit status {status}")

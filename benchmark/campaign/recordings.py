@@ -6,7 +6,6 @@ from __future__ import annotations
 import random
 import shutil
 import signal
-import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -16,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmark.campaign.ledger import Budget, Ledger
-from benchmark.campaign.processes import domain, ended, start
+from benchmark.campaign.processes import start
+from benchmark.nodes import Process, own_domain
 from sst_ros.errors import SstError
 from sst_ros.recording import bag_writer
 from sst_ros.recording.recording import Recording, read
@@ -29,7 +29,7 @@ LAST_CHUNK_NS = 1_000_000_000
 @contextmanager
 def _recorded(seconds: float) -> Iterator[Path]:
     """Record a run of scene `swing`, which moves by itself; give the bag."""
-    with tempfile.TemporaryDirectory() as name, domain():
+    with tempfile.TemporaryDirectory() as name, own_domain(compiled=False):
         bag = Path(name) / "bag"
         recorder = start("recorder", output=bag)
         heard = ["joint_states", "~/orientation", "~/applied_torques", "~/scene"]
@@ -39,11 +39,11 @@ def _recorded(seconds: float) -> Iterator[Path]:
         )  # fmt: skip
         try:
             simulator.wait(timeout=60)
-            ended(recorder, signal.SIGINT)
+            recorder.end(signal.SIGINT, 20.0)
             yield bag
         finally:
             for process in (simulator, recorder):
-                ended(process, signal.SIGKILL)
+                process.end(signal.SIGKILL, 20.0)
 
 
 def _same(one: Recording, other: Recording) -> bool:
@@ -93,12 +93,12 @@ def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: R
     shutil.rmtree(saved, ignore_errors=True)
 
 
-def kills(budget: Budget, seed: int) -> Ledger:
+def recorder_kills(budget: Budget, seed: int) -> Ledger:
     """Kill the recorder at random moments: all but the last chunk comes back."""
     ledger, rng = budget.ledger("recorders killed with -9"), random.Random(seed)
     for number in budget.cases(34, least=1):
         ledger.tried += 1
-        with tempfile.TemporaryDirectory() as name, domain():
+        with tempfile.TemporaryDirectory() as name, own_domain(compiled=False):
             bag = Path(name) / "bag"
             recorder = start("recorder", output=bag)
             simulator = start("simulator", scene="swing", duration=0.0)
@@ -108,13 +108,11 @@ def kills(budget: Budget, seed: int) -> Ledger:
                 ledger.found("lost", f"kill {number}: {error}")
             finally:
                 for process in (simulator, recorder):
-                    ended(process, signal.SIGKILL)
+                    process.end(signal.SIGKILL, 20.0)
     return ledger
 
 
-def _kill(
-    ledger: Ledger, name: str, after: float, recorder: subprocess.Popen[str], bag: Path
-) -> None:
+def _kill(ledger: Ledger, name: str, after: float, recorder: Process, bag: Path) -> None:
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline and _size(bag) < 50_000:
         time.sleep(0.01)

@@ -13,9 +13,10 @@ import sys
 import time
 from pathlib import Path
 
-from benchmark.peers import floor, page, picture, readme, reference, results
-from benchmark.peers.series import Series
-from benchmark.peers.study import TARGETS, studied
+from benchmark.measure import DOCS
+from benchmark.peers import picture, results
+from benchmark.peers.floor import find_floor
+from benchmark.peers.study import TARGETS, Series, run_study, solve_task
 from benchmark.peers.task import Task
 from sst_ros.integration.codegen import numba_version
 
@@ -28,8 +29,6 @@ MODULES = {
     "scipy_peer": "scipy",
 }
 """Who brings series, and the module without which it has none."""
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,28 +44,28 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("needs numba, which compiles our side and MuJoCo's torques: pip install numba")
     begin = time.monotonic()
     task = Task()
-    series, missing = collected(task, options.quick, options.only)
-    truth = reference.solved(task, lambda done, of: progress("reference", done, of))
+    series, missing = collect(task, options.quick, options.only)
+    progress("reference", 0, 0)
+    truth = solve_task(task)
     rounds = options.rounds or (3 if options.quick else 9)
-    curves = studied(task, truth, series, rounds, progress)
-    least = floor.found(task, TARGETS)
+    curves = run_study(task, truth, series, rounds, progress)
+    least = find_floor(task, TARGETS)
     seconds = time.monotonic() - begin
-    result = results.Results(curves, missing, truth.error, rounds, options.quick, seconds, least)
+    result = results.Results(curves, missing, truth, rounds, options.quick, seconds, least)
     progress("", 0, 0)
-    print(results.table(result))
+    print(results.write_table(result))
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)
         results.write(result, options.out)
         picture.draw(options.out)
-        page.write(result, options.out / "peers.md")
         print(f"\nWritten: {options.out}/peers.md, .png, .csv, .json")
         if options.out == DOCS and not (options.quick or options.only):
-            readme.write()
+            results.write_readme()
             print("Written: the table of README.md")
     return 0 if all(curve.passed for curve in curves) else 1
 
 
-def collected(
+def collect(
     task: Task, quick: bool, only: list[str] | None = None
 ) -> tuple[list[Series], dict[str, str]]:
     """Series of all engines that are installed, and why the others have none."""

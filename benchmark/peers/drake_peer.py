@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.peers import tree
-from benchmark.peers.series import Failed, Run, Series, Setting, ladder
+from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 
 ENGINE, PACKAGE = "Drake", "drake"
@@ -25,7 +25,7 @@ def series(task: Task, quick: bool) -> list[Series]:
     Its ties are soft over some tens of steps, so its acceleration is the change of rate over the
     300 steps of 1 us after the first 300.
     """
-    counts = ladder(100, 6400 if quick else 20000, 2.0)
+    counts = make_ladder(100, 6400 if quick else 20000, 2.0)
     settings = [_setting(task, steps) for steps in counts]
     gate = _Model(task, round(1.0 / GATE_STEP))
     return [Series(ENGINE, "SAP, discrete", "nowhere", TOLERANCE, gate.acceleration, settings)]

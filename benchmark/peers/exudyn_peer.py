@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.peers import tree
-from benchmark.peers.series import Failed, Run, Series, Setting, ladder
+from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 
 ENGINE, PACKAGE = "Exudyn", "exudyn"
@@ -23,7 +23,7 @@ GATE_STEP = 1e-5
 
 def series(task: Task, quick: bool) -> list[Series]:
     """Two implicit methods; the acceleration is the change of rate over steps of 10 us."""
-    counts = ladder(40, 1000 if quick else 8000, 2.0)
+    counts = make_ladder(40, 1000 if quick else 8000, 2.0)
     found = []
     for name, kind, radius in (
         ("generalised-alpha, index 3", "GeneralizedAlpha", 0.9),

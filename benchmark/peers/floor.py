@@ -21,8 +21,8 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from benchmark import c_floor
+from benchmark.measure import time_in_turn
 from benchmark.peers.task import DURATION, Task
-from benchmark.timing import interleaved
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, RK4
 from sst_ros.mechanism.frames import rotation_matrix
@@ -39,7 +39,7 @@ class Floor:
     seconds: float | None
 
 
-def found(task: Task, targets: tuple[float, ...]) -> Floor:
+def find_floor(task: Task, targets: tuple[float, ...]) -> Floor:
     """Count and measure."""
     return Floor({target: _needed(task, target) for target in targets}, _seconds(task))
 
@@ -90,4 +90,4 @@ def _seconds(task: Task) -> float | None:
         text = c_floor.source(task.system.program, RK4)
         library = c_floor.built(text, Path(folder), "floor", "-O3", "-march=native")
         calls = {"": lambda: library.slopes(count, array(*task.start))}
-        return median(interleaved(calls, 15, clock=time.process_time)[""]) / count
+        return median(time_in_turn(calls, 15, clock=time.process_time)[""]) / count

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmark.peers.mujoco_model import Model, NativeCallback, python_callback
-from benchmark.peers.series import Failed, Run, Series, Setting, ladder
-from benchmark.peers.task import DURATION, Moving, Pose, Task, relative
+from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
+from benchmark.peers.task import DURATION, Moving, Pose, Task, find_relative
 
 ENGINE, PACKAGE = "MuJoCo", "mujoco"
 
@@ -40,13 +40,13 @@ def series(task: Task, quick: bool) -> list[Series]:
         settings = [
             make(task, integrator, mobility, settle, steps)
             for mobility, settle in pairs
-            for steps in ladder(40, last, factor)
+            for steps in make_ladder(40, last, factor)
         ]
         gates = [model_of(task, integrator, *pair, False) for pair in pairs]
 
         def worst(at: Moving) -> np.ndarray:
             answers = [gate.acceleration(at) for gate in gates]
-            return max(answers, key=lambda answer: relative(answer, at.answer))
+            return max(answers, key=lambda answer: find_relative(answer, at.answer))
 
         found.append(Series(ENGINE, name, python, TOLERANCE, worst, settings))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmark.peers.series import Run, Series, Setting, ladder
+from benchmark.peers.study import Run, Series, Setting, make_ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros import Trajectory, simulate
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -29,9 +29,11 @@ def series(task: Task, quick: bool) -> list[Series]:
     factor = 1.6 if quick else 1.15
     found = [_public(task)]
     for name, (tableau, first, last) in METHODS.items():
-        found.append(_series(task, f"{name}, numba", tableau, True, ladder(first, last, factor)))
+        found.append(
+            _series(task, f"{name}, numba", tableau, True, make_ladder(first, last, factor))
+        )
     found += [_collocation(task, nodes) for nodes in (8, 12)]
-    plain = ladder(5, 80, 2.0 if quick else 1.3)
+    plain = make_ladder(5, 80, 2.0 if quick else 1.3)
     return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
 
 

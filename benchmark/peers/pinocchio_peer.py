@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.peers import tree
-from benchmark.peers.series import Failed, Run, Series, Setting, ladder
+from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros.integration.methods import DOP853, RK4, Tableau
 
@@ -27,13 +27,12 @@ def series(task: Task, quick: bool) -> list[Series]:
     model = Model(task)
     factor = 1.6 if quick else 1.2
     rows = (("RK4", RK4, 10, 1600), ("DOP853", DOP853, 5, 100))
-    return [
-        Series(
-            ENGINE, f"{name} in a Python loop", "the steps and the torques", 1e-10,
-            model.acceleration, [model.setting(method, n) for n in ladder(first, last, factor)],
-        )
-        for name, method, first, last in rows
-    ]  # fmt: skip
+    found, python = [], "the steps and the torques"
+    for name, method, first, last in rows:
+        settings = [model.setting(method, n) for n in make_ladder(first, last, factor)]
+        name = f"{name} in a Python loop"
+        found.append(Series(ENGINE, name, python, 1e-10, model.acceleration, settings))
+    return found
 
 
 class Model:

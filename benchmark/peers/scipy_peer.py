@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmark.peers.series import Failed, Run, Series, Setting
+from benchmark.peers.study import Failed, Run, Series, Setting
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix

@@ -1,25 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gate, scout, time: who may be compared, which settings are worth it, and how long they take."""
+"""Error against processor time of every series that passes its gate.
+
+An engine brings series: a gate, and settings that can be run. Every setting runs once for its
+error; those that no setting with as few steps beats are then timed in rounds.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmark.peers.reference import SAMPLES, Reference, common
-from benchmark.peers.series import Failed, Run, Series, Setting
-from benchmark.peers.task import Pose, Task, apart
-from benchmark.timing import interleaved
+from benchmark.measure import time_in_turn
+from benchmark.peers.task import DURATION, Moving, Pose, Task, find_relative, turn_between
+from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 
 TARGETS = (1e-3, 1e-6, 1e-9)
+SAMPLES = 20
+"""The reference is known at the multiples of DURATION / SAMPLES."""
 
 Progress = Callable[[str, int, int], None]
+
+
+class Run(NamedTuple):
+    """A setting that is ready to go; both start anew each time.
+
+    Attributes:
+        whole: do the second, leave the end in the engine's own terms. This is what is timed.
+        poses: do it in so many equal pieces and tell the pose at the end of each.
+
+    """
+
+    whole: Callable[[], Any]
+    poses: Callable[[int], list[Pose]]
+
+
+class Failed(Exception):
+    """A run that has no result; says why."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to run.
+
+    Attributes:
+        label: for people.
+        steps: how many, all of one length; 0 where they are adaptive.
+        prepare: builds what is needed; it is not timed.
+        samples: False where only the pose at the end can be had.
+
+    """
+
+    label: str
+    steps: int
+    prepare: Callable[[], Run]
+    samples: bool = True
+
+
+@dataclass(frozen=True)
+class Series:
+    """One engine by one method.
+
+    Attributes:
+        engine: whose times are taken together for "best setting".
+        name: short name.
+        python: where Python is interpreted.
+        tolerance: largest relative difference of gamma_ddot at the moving states.
+        acceleration: gamma_ddot of the engine at a moving state.
+        settings: what is swept.
+
+    """
+
+    engine: str
+    name: str
+    python: str
+    tolerance: float
+    acceleration: Callable[[Moving], np.ndarray]
+    settings: Sequence[Setting] = field(default_factory=list)
+
+    def gate(self, task: Task) -> float:
+        """Largest relative difference to the paper's equations at the moving states."""
+        largest = max(find_relative(self.acceleration(at), at.answer) for at in task.moving)
+        return largest if math.isfinite(largest) else math.inf
+
+
+def make_ladder(first: float, last: float, factor: float) -> list[int]:
+    """Step counts from first to last, each about `factor` times the one before."""
+    counts, now = [], float(first)
+    while now <= last * 1.001:
+        count = round(now) if now < 40 else 20 * round(now / 20)
+        if count not in counts:
+            counts.append(count)
+        now *= factor
+    return counts
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Poses by sample number 1 .. SAMPLES, their own error [rad], and how they were found."""
+
+    poses: dict[int, Pose]
+    error: float
+    how: str
+
+
+def solve_task(task: Task) -> Reference:
+    """Solve the task in extended precision."""
+    problem = InitialValueProblem(task.scene)
+    if (problem.count, problem.seconds) != (SAMPLES, DURATION):
+        raise RuntimeError("the reference is known at other times")
+    found = solve_reference(problem, compiled=True)
+    poses = {
+        k: task.pose_of(found.states[k, :7].astype(float).tolist()) for k in range(1, SAMPLES + 1)
+    }
+    return Reference(poses, found.own.orientation, found.how)
 
 
 @dataclass
@@ -69,23 +169,28 @@ class Curve:
         return found
 
 
-def studied(
+def run_study(
     task: Task, reference: Reference, series: list[Series], rounds: int, progress: Progress
 ) -> list[Curve]:
     """Gate all, run all settings for their errors, then time the worthwhile ones in rounds."""
-    curves = [Curve(one, _gate(one, task)) for one in series]
-    runs: dict[int, Run] = {}
-    total = sum(len(curve.series.settings) for curve in curves if curve.passed)
-    done = 0
-    for curve in curves:
-        for setting in curve.series.settings if curve.passed else ():
-            done += 1
+    curves = [Curve(one, one.gate(task)) for one in series]
+    passed = [curve for curve in curves if curve.passed]
+    total = sum(len(curve.series.settings) for curve in passed)
+    calls: dict[int, Callable[[], Any]] = {}
+    points: dict[int, Point] = {}
+    for curve in passed:
+        runs: dict[int, Run] = {}
+        for setting in curve.series.settings:
+            done = sum(len(one.points) for one in passed) + 1
             progress(f"errors: {curve.series.engine}", done, total)
-            curve.points.append(_scouted(setting, reference, runs))
-        _drop(curve, runs)
-    points = {id(p): p for curve in curves for p in curve.points if id(p.setting) in runs}
-    calls = {key: runs[id(point.setting)].whole for key, point in points.items()}
-    seconds = interleaved(
+            curve.points.append(_try(setting, reference, runs))
+        best = math.inf
+        for point in sorted(curve.points, key=lambda p: (p.setting.steps, p.error)):
+            beaten = point.setting.steps and point.error >= best
+            if id(point.setting) in runs and not beaten:
+                calls[id(point)], points[id(point)] = runs[id(point.setting)].whole, point
+            best = min(best, point.error)
+    seconds = time_in_turn(
         calls,
         rounds,
         progress=lambda a, b: progress("rounds of times", a, b),
@@ -96,39 +201,23 @@ def studied(
     return curves
 
 
-def _gate(series: Series, task: Task) -> float:
-    worst = series.gate(task)
-    return worst if math.isfinite(worst) else math.inf
-
-
-def _scouted(setting: Setting, reference: Reference, runs: dict[int, Run]) -> Point:
+def _try(setting: Setting, reference: Reference, runs: dict[int, Run]) -> Point:
+    """Run a setting once for its errors; keep what was prepared in `runs`."""
     nothing = (math.inf, math.inf, math.inf)
     try:
         run = setting.prepare()
-        pieces = (common(setting.steps) if setting.steps else SAMPLES) if setting.samples else 1
+        pieces = math.gcd(setting.steps, SAMPLES) if setting.samples else 1
         found = run.poses(pieces)
     except (Failed, ArithmeticError, ValueError, RuntimeError) as error:
         return Point(setting, *nothing, failed=str(error) or type(error).__name__)
     expected = [reference.poses[(piece + 1) * SAMPLES // pieces] for piece in range(pieces)]
-    angles = [apart(a.rotation, b.rotation) for a, b in zip(found, expected, strict=True)]
+    angles = [turn_between(a.rotation, b.rotation) for a, b in zip(found, expected, strict=True)]
     if not np.all(np.isfinite(angles)):
         return Point(setting, *nothing, failed="not finite")
     runs[id(setting)] = run
-    return Point(setting, angles[-1], max(angles), _gamma(found[-1], expected[-1]))
-
-
-def _gamma(found: Pose, expected: Pose) -> float:
-    turn = found.gamma - expected.gamma
-    return float(np.abs(turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))).max())
-
-
-def _drop(curve: Curve, runs: dict[int, Run]) -> None:
-    """Leave only settings to be timed that no setting with as few steps beats."""
-    best = math.inf
-    for point in sorted(curve.points, key=lambda p: (p.setting.steps, p.error)):
-        if point.setting.steps and point.error >= best:
-            runs.pop(id(point.setting), None)
-        best = min(best, point.error)
+    turn = found[-1].gamma - expected[-1].gamma
+    turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+    return Point(setting, angles[-1], max(angles), float(np.abs(turn).max()))
 
 
 @dataclass(frozen=True)
@@ -147,19 +236,17 @@ class Reached:
     point: Point | None
 
 
-def reached(curves: list[Curve], target: float) -> Reached:
+def reach(curves: list[Curve], target: float) -> Reached:
     """Best over some curves."""
     good = [p for curve in curves for p in curve.front if p.error <= target]
     if not good:
         return Reached(None, None, None)
     point = min(good, key=lambda p: p.time)
-    crossings = [x for curve in curves if (x := _crossing(curve.front, target)) is not None]
+    crossings = []
+    for curve in curves:
+        for rough, fine in pairwise(curve.front):
+            if rough.error > target >= fine.error:
+                share = math.log(rough.error / target) / math.log(rough.error / fine.error)
+                crossings.append(float(rough.time * (fine.time / rough.time) ** share))
+                break
     return Reached(point.time, min(crossings, default=None), point)
-
-
-def _crossing(front: list[Point], target: float) -> float | None:
-    for worse, better in pairwise(front):
-        if worse.error > target >= better.error:
-            share = math.log(worse.error / target) / math.log(worse.error / better.error)
-            return float(worse.time * (better.time / worse.time) ** share)
-    return None

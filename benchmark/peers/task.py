@@ -155,13 +155,13 @@ class Task:
         )
 
 
-def apart(first: Array, second: Array) -> float:
+def turn_between(first: Array, second: Array) -> float:
     """Angle [rad] between two rotations, accurate when it is small."""
     e = first @ second.T
     sine = 0.5 * np.array([e[2, 1] - e[1, 2], e[0, 2] - e[2, 0], e[1, 0] - e[0, 1]])
     return float(np.arctan2(np.linalg.norm(sine), 0.5 * (np.trace(e) - 1.0)))
 
 
-def relative(found: Array, expected: Array) -> float:
+def find_relative(found: Array, expected: Array) -> float:
     """Length of the difference over the length of what is expected."""
     return float(np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected))

@@ -32,7 +32,7 @@ def task(peers):
 def test_kernel_and_paper_agree_where_engines_are_gated(peers, task):
     for at in task.moving:
         assert np.linalg.norm(list(at.velocity.values())) > 0.5
-        assert peers("task").relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
+        assert peers("task").find_relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -70,22 +70,8 @@ def test_short_runs_converge_to_each_other(peers, task):
         series = [s for s in peers(module).series(task, quick=True) if s.name.startswith("DOP853")]
         setting = next(s for s in series[0].settings if s.steps >= 20)
         ends.append(setting.prepare().poses(1)[0])
-    assert peers("task").apart(ends[0].rotation, ends[1].rotation) < 1e-7
+    assert peers("task").turn_between(ends[0].rotation, ends[1].rotation) < 1e-7
     assert np.abs(ends[0].gamma - ends[1].gamma).max() < 1e-7
-
-
-def test_extrapolation_reference_has_its_order(peers, task):
-    """Two steps of the reference's method, against the same with half the step."""
-    reference = peers("reference")
-    mp = reference.mp
-    with mp.workdps(reference.DIGITS):
-        slope = reference._slope(task)
-        start = [mp.mpf(number) for number in task.start]
-        h = mp.mpf(1) / 40
-        one = reference._extrapolated(slope, mp.mpf(0), h, start)
-        half = reference._extrapolated(slope, mp.mpf(0), h / 2, start)
-        two = reference._extrapolated(slope, h / 2, h / 2, half)
-        assert max(abs(a - b) for a, b in zip(one, two, strict=True)) < mp.mpf(10) ** -24
 
 
 @pytest.mark.slow
@@ -99,27 +85,28 @@ def test_our_headline_is_the_public_call(peers, task):
     ends = [setting.prepare().poses(1)[0].rotation for setting in first.settings]
     for setting, end in zip(first.settings, ends, strict=True):
         tolerance = float(setting.label.split()[1])
-        assert peers("task").apart(end, ends[-1]) <= tolerance + 1e-13
+        assert peers("task").turn_between(end, ends[-1]) <= tolerance + 1e-13
 
 
 def test_the_table_has_times_and_their_ratio_to_ours(peers, task):
     study, results = peers("study"), peers("results")
+    truth = study.Reference({}, 0.0, "")
     rows = []
     for module, seconds in (("ours", 1e-5), ("scipy_peer", 1e-3)):
         series = peers(module).series(task, quick=True)[0]
         point = study.Point(series.settings[0], 1e-12, 1e-12, 1e-12, seconds=[seconds] * 3)
         rows.append(study.Curve(series, 0.0, [point]))
-    found = results.Results(rows, {}, 0.0, 3, True, 1.0, None)
-    ours, other = results.rows(found)[1:]
+    found = results.Results(rows, {}, truth, 3, True, 1.0, None)
+    ours, other = found.series_rows()[1:]
     assert set(ours[4:]) == {"0.01 (1 x)"} and set(other[4:]) == {"1 (100 x)"}
 
 
 def test_the_readme_has_the_table_of_the_published_results(peers):
-    readme = peers("readme")
-    text = readme.README.read_text(encoding="utf-8")
-    results = json.loads(readme.RESULTS.read_text(encoding="utf-8"))
-    assert readme.written(text, results) == text, "run python -m benchmark.peers.readme"
-    page = (readme.RESULTS.parent / "peers.md").read_text(encoding="utf-8")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    results = json.loads((ROOT / "docs" / "peers.json").read_text(encoding="utf-8"))
+    filled = peers("results").fill_readme(text, results)
+    assert filled == text, "run python -m benchmark.peers.results"
+    page = (ROOT / "docs" / "peers.md").read_text(encoding="utf-8")
     assert results["machine"]["date"] in page
     for row in results["reached"]:
         if row["method"] == "best of all" and row["ms"] is not None:
@@ -128,8 +115,10 @@ def test_the_readme_has_the_table_of_the_published_results(peers):
 
 def test_the_picture_shows_the_best_settings(peers, tmp_path):
     pytest.importorskip("matplotlib")
+    pandas = pytest.importorskip("pandas")
     picture = peers("picture")
-    assert picture.front([(2.0, 1.0), (1.0, 3.0), (3.0, 2.0)]) == [(1.0, 3.0), (2.0, 1.0)]
+    rows = pandas.DataFrame({"median_ms": [2.0, 1.0, 3.0], "error_at_end_rad": [1.0, 3.0, 2.0]})
+    assert picture.find_front(rows) == ([1.0, 2.0], [3.0, 1.0])
     for name in ("peers.csv", "peers.json"):
         shutil.copy(ROOT / "docs" / name, tmp_path)
     picture.draw(tmp_path)

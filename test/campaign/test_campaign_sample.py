@@ -3,8 +3,7 @@
 
 import pytest
 
-from benchmark.campaign.ledger import Ledger
-from benchmark.campaign.parts import PARTS, run
+from benchmark.campaign.ledger import PARTS, Ledger, run_part
 
 ROS = {"damages", "recorder_kills", *(part for part, room in PARTS.items() if room == "nodes")}
 QUICK = {"messages", *(PARTS.keys() - ROS - {"bits"})}  # which compiles a scene of its own
@@ -23,7 +22,7 @@ def test_nothing_is_found_in_a_share_of(part):
     if part == "bits":
         pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
     # Other tests run at the same time: only what takes ten times its bound is a hang here.
-    ledger = run(part, 0.02, seed=7, patience=10.0)
+    ledger = run_part(part, 0.02, seed=7, patience=10.0)
     assert ledger.tried > 0
     assert ledger.sound, "\n".join(ledger.notes)
 

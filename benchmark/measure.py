@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How all benchmarks measure and say it: times in rounds, the machine, tables, pages, JSON."""
+
+from __future__ import annotations
+
+import datetime
+import gc
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Hashable, Sequence
+from importlib import metadata
+from pathlib import Path
+from statistics import median
+from typing import Any, TypeVar
+
+from sst_ros.report.results import processor
+
+Key = TypeVar("Key", bound=Hashable)
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def time_in_turn(
+    calls: dict[Key, Callable[[], Any]],
+    rounds: int = 9,
+    shortest: float = 2e-3,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[Key, list[float]]:
+    """Seconds of each call, one number a round.
+
+    Every round times every call, so that what slows the machine for a while slows all of them.
+    A call that is shorter than `shortest` is repeated until it is not, and divided. A `clock` of
+    processor time leaves out what others do on the machine meanwhile, which long calls would
+    otherwise have more of than short ones; it is for work of one thread.
+    """
+    repeats = {key: _count_repeats(call, shortest, clock) for key, call in calls.items()}
+    seconds: dict[Key, list[float]] = {key: [] for key in calls}
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for done in range(rounds):
+            for key, call in calls.items():
+                seconds[key].append(_time(call, repeats[key], clock))
+            gc.collect()
+            progress(done + 1, rounds)
+    finally:
+        if collecting:
+            gc.enable()
+    return seconds
+
+
+def divide(seconds: dict[Key, list[float]], first: Key, second: Key) -> float:
+    """Median over the rounds of first / second: each quotient is of the same round."""
+    return median(a / b for a, b in zip(seconds[first], seconds[second], strict=True))
+
+
+def _count_repeats(call: Callable[[], Any], shortest: float, clock: Callable[[], float]) -> int:
+    call()
+    once = _time(call, 1, clock)
+    return max(1, round(shortest / once)) if once < shortest else 1
+
+
+def _time(call: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> float:
+    begin = clock()
+    for _ in range(repeats):
+        call()
+    return (clock() - begin) / repeats
+
+
+def describe_machine(*packages: str) -> dict[str, str]:
+    """Date, processor, load and versions; packages that are not installed are left out."""
+    host = {
+        "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "processor": processor(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "load": f"{os.getloadavg()[0]:.2f} at the end, over 1 min",
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()}",
+    }
+    for package in packages:
+        try:
+            host[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return host
+
+
+def join_line(host: dict[str, str]) -> str:
+    """Return the machine in one line of text."""
+    return ", ".join(f"{key} {value}" for key, value in host.items())
+
+
+def judge(what: str, value: float, target: float, *, least: bool = False) -> str:
+    """Return a line that says whether a target is met; of at most `target`, or `least` that."""
+    met = value >= target if least else value <= target
+    digits = ".0f" if least else ".2f"
+    return f"{what} {value:{digits}}, target {target}: {'met' if met else 'MISSED'}"
+
+
+def format_markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return Markdown of rows, of which the first is the header."""
+    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def format_columns(columns: Sequence[dict[str, str]]) -> str:
+    """Return Markdown with a row for each key and a column for each run."""
+    keys = list(dict.fromkeys(key for column in columns for key in column))
+    return format_markdown([[key, *(column.get(key, "") for column in columns)] for key in keys])
+
+
+def fill(text: str, parts: dict[str, str]) -> str:
+    """Return a page with new parts, each between <!-- begin NAME --> and <!-- end NAME -->."""
+    for name, part in parts.items():
+        begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
+        before, _, rest = text.partition(begin)
+        _, found, after = rest.partition(end)
+        if not found:
+            raise ValueError(f"a page needs a part {name}")
+        text = f"{before}{begin}{part}\n{end}{after}"
+    return text
+
+
+def fill_page(page: Path, parts: dict[str, str], out: Path | None = None) -> None:
+    """Write a page, by default in its place, with new parts; its other text stays."""
+    text = fill(page.read_text(encoding="utf-8"), parts)
+    (out or page).write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path | None, document: Any) -> None:
+    """Write what was measured, where a file was asked for."""
+    if path is not None:
+        text = json.dumps(document, indent=1, ensure_ascii=False)
+        path.write_text(text + "\n", encoding="utf-8")
