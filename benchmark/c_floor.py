@@ -1,8 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same traced program and the same step in C: the floor that compiled Python is held against.
+"""The same programs in C, one state or many at a time: the floor for compiled Python.
 
-The C text is the Python text of `trace` and `steps`, line by line, with types; it is written to a
-temporary folder, compiled by gcc, and forgotten.
+The C text is the Python text that a run or a batch compiles, line by line, with types; it is
+written to a temporary folder, compiled by gcc, and forgotten. Of a right-hand side
+
+    def rhs(t, q0, ...):
+        x1 = q0 * q0
+        x2 = a if x1 > b else c
+        return (x1, x2,)
+
+it makes
+
+    static inline void rhs(double t, double q0, ..., double *restrict out) {
+        double x1, x2;
+        x1 = q0 * q0;
+        x2 = (x1 > b) ? (a) : (c);
+        out[0] = x1;
+        out[1] = x2;
+    }
+
+A batch has loops over lanes of constant length without branches: `for i in range(8):` becomes
+`#pragma omp simd` and `for (long i = 0; i < 8; i++) {`.
 """
 
 from __future__ import annotations
@@ -12,9 +30,11 @@ import ctypes
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from sst_ros.dynamics.expression import Program
+from sst_ros.integration.batch_source import batch_source
 from sst_ros.integration.codegen import explicit_step
 from sst_ros.integration.methods import Tableau
 
@@ -46,18 +66,30 @@ double march(double t, double h, long count, double *y, double *error) {{
 """
 
 
-def compiler() -> str | None:
-    """Path of gcc, None where there is none."""
-    return shutil.which("gcc")
+def has_gcc() -> bool:
+    """Whether there is a compiler; says so where there is none."""
+    found = shutil.which("gcc") is not None
+    if not found:
+        print("gcc is missing: NO C FLOOR. Only Python and numba are timed.", file=sys.stderr)
+    return found
 
 
-def version() -> str:
+def read_version() -> str:
     """First line of gcc --version."""
     done = subprocess.run(["gcc", "--version"], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[0].removeprefix("gcc ")
 
 
-def source(program: Program, tableau: Tableau) -> str:
+def compile_c(text: str, folder: Path, name: str, *flags: str) -> tuple[ctypes.CDLL, str]:
+    """Compile with gcc and load; also return what gcc says."""
+    file, library = folder / f"{name}.c", folder / f"{name}.so"
+    file.write_text(text, encoding="utf-8")
+    command = ["gcc", *flags, "-shared", "-fPIC", "-o", str(library), str(file), "-lm"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return ctypes.CDLL(str(library)), done.stderr
+
+
+def write_step(program: Program, tableau: Tableau) -> str:
     """C text of rhs, step and loops around them, of a program without drive."""
     size = len(program.outputs)
     state = ", ".join(f"y[{j}]" for j in range(size))
@@ -66,13 +98,9 @@ def source(program: Program, tableau: Tableau) -> str:
     return "\n".join([HEAD, *texts, loops])
 
 
-def built(text: str, folder: Path, name: str, *flags: str) -> ctypes.CDLL:
-    """Compile with gcc and load."""
-    file, library = folder / f"{name}.c", folder / f"{name}.so"
-    file.write_text(text, encoding="utf-8")
-    command = ["gcc", *flags, "-shared", "-fPIC", "-o", str(library), str(file), "-lm"]
-    subprocess.run(command, check=True)
-    loaded = ctypes.CDLL(str(library))
+def compile_step(text: str, folder: Path, name: str, *flags: str) -> ctypes.CDLL:
+    """Compile the text of a step."""
+    loaded, _ = compile_c(text, folder, name, *flags)
     numbers = ctypes.POINTER(ctypes.c_double)
     loaded.slopes.argtypes = [ctypes.c_long, numbers]
     loaded.march.argtypes = [ctypes.c_double, ctypes.c_double, ctypes.c_long, numbers, numbers]
@@ -101,10 +129,9 @@ def _assignment(line: str) -> list[str]:
     left, right = line.split(" = ", 1)
     names = left.split(", ")
     if len(names) > 1:
-        call = right.replace("rhs(", "rhs(", 1)[:-1]
         array = f"a_{names[0]}"
         return [
-            f"    double {array}[{len(names)}]; {call}, {array});",
+            f"    double {array}[{len(names)}]; {right[:-1]}, {array});",
             *(f"    {name} = {array}[{i}];" for i, name in enumerate(names)),
         ]
     if match := re.fullmatch(r"\(?(.*) if (.*) else (.*?)\)?", right):
@@ -116,3 +143,72 @@ def _split(text: str) -> list[str]:
     """Split the entries of a tuple."""
     entries = ast.parse(f"({text},)", mode="eval").body
     return [ast.unparse(entry) for entry in ast.iter_child_nodes(entries) if entry._fields]
+
+
+BATCH_HEAD = """\
+#include <math.h>
+#define abs fabs
+#define min(a, b) ((a) < (b) ? (a) : (b))
+"""
+
+SIGNATURE = """\
+void batch(double h, long first, long count, long begin, long end, long columns, double *restrict y,
+           double *restrict d, long *restrict code, double *restrict when, double *restrict error) {
+"""
+
+NUMBERS = ("lo", "last", "n")
+"""Names that are whole numbers; all others are double."""
+
+
+def write_batch(program: Program, margins: Program, tableau: Tableau, size: int) -> tuple[str, int]:
+    """C text, and the number of its loops that shall be SIMD."""
+    nodes = ", ".join(map(repr, tableau.c))
+    lines = [BATCH_HEAD, f"static const double NODES[] = {{{nodes}}};", SIGNATURE]
+    scopes: list[tuple[int, set[str]]] = [(0, set())]
+    for raw in batch_source(program, margins, tableau, size).splitlines()[1:]:
+        line = raw.strip()
+        deep = len(raw) - len(raw.lstrip())
+        while deep <= scopes[-1][0]:
+            scopes.pop()
+            lines.append("}")
+        lines += _translate(line, scopes)
+        if line.endswith(":"):
+            scopes.append((deep, set()))
+    lines += ["}"] * len(scopes)
+    text = "\n".join(lines) + "\n"
+    return text, text.count("#pragma omp simd")
+
+
+def _translate(line: str, scopes: list[tuple[int, set[str]]]) -> list[str]:
+    line = re.sub(r"\b([yd])\[(\d+), (.*?)\]", r"\1[\2 * columns + \3]", line)
+    line = line.replace("y.shape[1]", "columns").replace("int(", "(long)(")
+    if match := re.fullmatch(r"for (\w+) in range\((?:(.*), )?(.*)\):", line):
+        name, start, stop = match[1], match[2] or "0", match[3]
+        # Loops over lanes have a number for their length.
+        simd = ["#pragma omp simd"] if name in "ix" and stop.isdigit() else []
+        return [*simd, f"for (long {name} = {start}; {name} < {stop}; {name}++) {{"]
+    if match := re.fullmatch(r"(el)?if (.*):", line):
+        return [f"{'else ' if match[1] else ''}if ({match[2]}) {{"]
+    left, right = line.split(" = ", 1)
+    if match := re.fullmatch(r"vector\((\d+)\)", right):
+        return [f"double {left}[{match[1]}] __attribute__((aligned(64)));"]
+    if match := re.fullmatch(r"(.*) if (.*) else (.*)", right):
+        condition = match[2].replace(" and ", " & ")
+        right = f"({condition}) ? ({match[1]}) : ({match[3]})"
+    known = any(left in names for _, names in scopes)
+    if left.isidentifier() and not known:
+        scopes[-1][1].add(left)
+        left = f"{'long' if left in NUMBERS else 'double'} {left}"
+    return [f"{left} = {right};"]
+
+
+def compile_batch(text: str, folder: Path, name: str, *flags: str) -> tuple[ctypes.CDLL, int]:
+    """Compile the text of a batch; also say how many loops gcc reports as vectorised."""
+    simd = (*flags, "-fopenmp-simd", "-fopt-info-vec-optimized")
+    loaded, said = compile_c(text, folder, name, *simd)
+    numbers, arrays = (ctypes.c_long,) * 5, (ctypes.c_void_p,) * 5
+    loaded.batch.argtypes = [ctypes.c_double, *numbers, *arrays]
+    loaded.batch.restype = None
+    return loaded, len(
+        {line.split(": optimized")[0] for line in said.splitlines() if "loop" in line}
+    )

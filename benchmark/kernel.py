@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import sys
 import tempfile
 from collections.abc import Callable
@@ -21,7 +20,7 @@ import numba
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import describe_machine, divide, join_line, time_in_turn
+from benchmark.measure import describe_machine, divide, join_line, judge, time_in_turn, write_json
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -57,20 +56,16 @@ def main(arguments: list[str] | None = None) -> int:
     y = [*start.quaternion, *start.body_rate]
     if len(system.state) != 7 or system.drive:
         parser.error("needs a scene with a torque, without lag or moment from a topic")
-    with_c = c_floor.compiler() is not None
-    if not with_c:
-        print("gcc is missing: NO C FLOOR. Only numba and plain Python are timed.", file=sys.stderr)
+    with_c = c_floor.has_gcc()
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
         seconds = time_in_turn(calls, options.rounds, shortest=5e-3)
     host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
-        host["gcc"] = c_floor.version()
+        host["gcc"] = c_floor.read_version()
     rows = _rows(seconds)
     _print(rows, host, options, sum(system.program.operations.values()))
-    if options.json:
-        document = {"machine": host, "scene": options.scene, "rows": rows}
-        options.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, {"machine": host, "scene": options.scene, "rows": rows})
     return 0
 
 
@@ -91,7 +86,7 @@ def _calls(
         calls[work, NUMBA] = partial(fast.step_fixed, 0.0, STEP, STEPS, y, [])
         calls[work, PLAIN] = partial(plain.step_fixed, 0.0, STEP, STEPS // 10, y, [])
         if folder is not None:
-            _add_c(calls, c_floor.source(system.program, method), y, folder, name, fast)
+            _add_c(calls, c_floor.write_step(system.program, method), y, folder, name, fast)
     return calls
 
 
@@ -101,7 +96,7 @@ def _add_c(
     array = ctypes.c_double * len(y)
     expected = fast.step_fixed(0.0, STEP, STEPS, y, [])
     for index, (who, flags) in enumerate(FLAGS.items()):
-        library = c_floor.built(text, folder, f"{name}_{index}", *flags)
+        library = c_floor.compile_step(text, folder, f"{name}_{index}", *flags)
         state, error = array(*y), array()
         library.march(0.0, STEP, STEPS, state, error)
         apart = max(abs(a - b) for a, b in zip(state, expected, strict=True))
@@ -158,8 +153,7 @@ def _print(rows: list[dict[str, Any]], host: dict[str, str], options: Any, size:
     print()
     for row in rows:
         if row["who"] == NUMBA and "over_c" in row:
-            met = "met" if row["over_c"] <= AT_MOST_C else "MISSED"
-            print(f"{row['work']}: numba over C {row['over_c']:.2f}, target {AT_MOST_C}: {met}")
+            print(judge(f"{row['work']}: numba over C", row["over_c"], AT_MOST_C))
         if row["who"] == PLAIN and row["work"] == "rk4 step":
             met = "met" if row["ns"] <= 1e9 * AT_MOST_PLAIN else "MISSED"
             print(f"plain rk4 step {row['ns'] / 1e3:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")

@@ -80,14 +80,14 @@ def _states(machine: CompiledMethod, start: list[float], times: np.ndarray) -> n
 
 
 def _seconds(task: Task) -> float | None:
-    if c_floor.compiler() is None:
+    if not c_floor.has_gcc():
         return None
     import ctypes
 
     count = 1000
     array = ctypes.c_double * len(task.start)
     with tempfile.TemporaryDirectory() as folder:
-        text = c_floor.source(task.system.program, RK4)
-        library = c_floor.built(text, Path(folder), "floor", "-O3", "-march=native")
+        text = c_floor.write_step(task.system.program, RK4)
+        library = c_floor.compile_step(text, Path(folder), "floor", "-O3", "-march=native")
         calls = {"": lambda: library.slopes(count, array(*task.start))}
         return median(time_in_turn(calls, 15, clock=time.process_time)[""]) / count

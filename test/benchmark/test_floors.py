@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
-from benchmark import c_batch, c_floor
+from benchmark import c_floor
 from benchmark.batch import FLAGS, METHODS
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.scene.scene import load
 
-needs_gcc = pytest.mark.skipif(c_floor.compiler() is None, reason="no gcc")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
 
 @needs_gcc
@@ -26,8 +28,8 @@ def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monk
     gamma = np.array(scene.initial.gamma) + np.linspace(-0.05, 0.05, number)[:, None]
     y, code = batch.start(gamma, (0.0, 0.0, 0.0))
     given = batch.drives((0.0, 0.0, 0.0), number)
-    text, _ = c_batch.source(batch.program, batch.limit_distances, method, len(batch.state))
-    library, vectorised = c_batch.built(text, tmp_path, "batch", *FLAGS["C SIMD, no fma"])
+    text, _ = c_floor.write_batch(batch.program, batch.limit_distances, method, len(batch.state))
+    library, vectorised = c_floor.compile_batch(text, tmp_path, "batch", *FLAGS["C SIMD, no fma"])
     assert vectorised > 0
     sets = [
         [y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)] for _ in range(2)
