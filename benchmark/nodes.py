@@ -56,10 +56,11 @@ class Process(subprocess.Popen[str]):
         **given: Any,
     ) -> None:
         words = [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
-        if given:
-            words += ["--ros-args", *child_process.words(given)]
+        options = child_process.words(given)
         if namespace:
-            words += ["--ros-args", "-r", f"__ns:={namespace}"]
+            options += ["-r", f"__ns:={namespace}"]
+        if options:
+            words += ["--ros-args", *options]
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         # Nobody reads before the end, and a full pipe would stop the node.
         super().__init__(
