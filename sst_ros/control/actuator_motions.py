@@ -14,6 +14,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -263,7 +264,9 @@ def through_points(
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, here, gamma[0])
-    return _along(geometry, begun, Quintic(at, gamma, rates, seconds), tuple(at.tolist()))
+    return ActuatorMotion(
+        geometry, cast("Path", Quintic(at, gamma, rates, seconds).at), tuple(at.tolist()), begun
+    )
 
 
 def through_samples(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
@@ -280,7 +283,7 @@ def through_samples(geometry: Geometry, samples: MotionSamples) -> ReferenceMoti
     # Samples lie much denser than the motion turns: several make one piece.
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
     spline = Quintic(times, gamma, samples.gamma_dot, free)
-    return _along(geometry, samples.quaternion, spline, pieces)
+    return ActuatorMotion(geometry, cast("Path", spline.at), pieces, samples.quaternion)
 
 
 def follow_assembly(
@@ -290,16 +293,6 @@ def follow_assembly(
     rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
     x, y, z, w = quaternion_of(rotation).tolist()
     return (x, y, z, w)
-
-
-def _along(
-    geometry: Geometry, start: Quaternion, spline: Quintic, pieces: tuple[float, ...]
-) -> ReferenceMotion:
-    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        (p1, p2, p3), (v1, v2, v3), (a1, a2, a3) = spline.at(time)
-        return (p1, p2, p3), (v1, v2, v3), (a1, a2, a3)
-
-    return ActuatorMotion(geometry, path, pieces, start)
 
 
 def _rows(

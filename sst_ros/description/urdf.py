@@ -42,7 +42,7 @@ from sst_ros.description.tree import (
 )
 from sst_ros.dynamics.limits import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.bodies import Inertia, Payload
+from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import LARGEST, Friction, Scene
 from sst_ros.state import Vector3
@@ -155,7 +155,10 @@ def bodies(scene: Scene) -> list[Body]:
     star, base = scene.star, scene.base
     found = [_body(STAR, star.mass, star.centre, star.inertia, star.radius)]
     if scene.payload is not None:
-        found.append(_payload(scene.payload))
+        own = scene.payload.inertia
+        tensor = np.zeros((3, 3)) if own is None else own.matrix
+        centre = np.array(scene.payload.centre)
+        found.append(Body(PAYLOAD, STAR, scene.payload.mass, centre, tensor))
     for k, leg in enumerate(LEGS):
         for name, link, radius in (
             (name_actuated(leg), scene.actuated_links[k], base.radius),
@@ -174,11 +177,6 @@ def _body(name: str, mass: float, centre: Vector3, inertia: Inertia | None, radi
         return Body(name, name, _mass(about_o, radius), np.zeros(3), about_o, assumed=True)
     c = np.array(centre)
     return Body(name, name, mass, c, about_o - mass * (c @ c * np.eye(3) - np.outer(c, c)))
-
-
-def _payload(payload: Payload) -> Body:
-    tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
-    return Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
 
 
 def _rotor(scene: Scene, leg: int) -> Body:

@@ -111,7 +111,12 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
         rotations[row] = _segment(geometry, points[row - 1], points[row], rotations[row - 1], row)
-    return _describe(geometry, points, rotations)
+    r = kinematics.carriage_directions(geometry, points)
+    mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotations)
+    mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
+    slope = cross(geometry.e @ rotations.transpose(0, 2, 1), r)
+    sigma = np.asarray(np.linalg.svd(slope, compute_uv=False)[:, 2], dtype=float)
+    return Branch(*frozen(points, rotations, mu, beta, sigma, det_j2))
 
 
 def advance(geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike) -> Array:
@@ -166,12 +171,3 @@ def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
             break
         rotation = rotate(rotation, np.linalg.solve(cross(t, r), -residual))
     return best
-
-
-def _describe(geometry: Geometry, gamma: Array, rotation: Array) -> Branch:
-    r = kinematics.carriage_directions(geometry, gamma)
-    mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotation)
-    mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
-    slope = cross(geometry.e @ rotation.transpose(0, 2, 1), r)
-    sigma = np.asarray(np.linalg.svd(slope, compute_uv=False)[:, 2], dtype=float)
-    return Branch(*frozen(gamma, rotation, mu, beta, sigma, det_j2))

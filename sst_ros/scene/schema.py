@@ -47,7 +47,8 @@ class Spec:
     def describe(self) -> str:
         """Describe the values that are allowed."""
         if self.kind == "number":
-            what = "a finite number" if not self.shape else f"{_size(self.shape)} finite numbers"
+            size = " x ".join(map(str, self.shape))
+            what = f"{size} finite numbers" if size else "a finite number"
             bounds = [
                 f"> {self.above:g}" if math.isfinite(self.above) else "",
                 f">= {self.least:g}" if math.isfinite(self.least) else "",
@@ -175,12 +176,13 @@ def accept(spec: Spec, value: Any) -> Any:
         return value
     if spec.kind == "choice" and value in spec.choices:
         return value
-    if spec.kind == "section" and spec.section:
-        return _instance(value, spec.section)
-    listed = isinstance(value, (list, tuple))
-    if spec.kind == "sections" and spec.section and listed and _fits(len(value), spec.lengths):
+    if spec.kind == "section" and spec.section and isinstance(value, spec.section):
+        return value
+    if spec.kind == "sections" and spec.section and isinstance(value, (list, tuple)):
         repeated = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
-        return tuple(_instance(entry, spec.section) for entry in tuple(value) * repeated)
+        fits = not spec.lengths or len(value) in spec.lengths
+        if fits and all(isinstance(entry, spec.section) for entry in value):
+            return tuple(value) * repeated
     raise ValueError
 
 
@@ -206,25 +208,11 @@ def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     return result
 
 
-def _fits(length: int, lengths: tuple[int, ...]) -> bool:
-    return not lengths or length in lengths
-
-
 def frozen_text(value: Any) -> str:
     """Return text without its outer blanks, or raise ValueError."""
     if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
         raise ValueError
     return value.strip()
-
-
-def _instance(value: Any, cls: type[Section]) -> Any:
-    if isinstance(value, cls):
-        return value
-    raise ValueError
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape))
 
 
 def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
