@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder of compiled code: numba unpickles its files, so it is for the user alone (mode 700).
 
-Nobody else may put another folder in its place either: as with StrictModes of OpenSSH all folders
+No other user may put another folder in its place: as with StrictModes of OpenSSH all folders
 above it belong to the user or to root, and no other user can write into them. One of them may be
 writable where its sticky bit keeps others from replacing what is not theirs, as /tmp is, and a
 group may write whose only member is the user.

@@ -200,17 +200,10 @@ class InverseDynamicsController:
         follower = self._follower
         rms, largest = follower.errors
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
-        values: dict[str, object] = {
-            "stage": stage,
-            "mode": self._parameters.mode,
-            "samples": follower.samples,
-            "samples_irregular": follower.irregular,
-            "samples_limited": follower.limited,
-            "error_rms_rad": rms,
-            "error_max_rad": largest,
-            "trajectories_refused": follower.refused,
-            "last_refusal": follower.last_refusal,
-        }
+        counts = follower.samples, follower.irregular, follower.limited
+        refusals = follower.refused, follower.last_refusal
+        row = (stage, self._parameters.mode, *counts, rms, largest, *refusals)
+        values: dict[str, object] = dict(zip(KEYS, row, strict=True))
         doubts = [
             words
             for count, words in (
