@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/paper.md: each equation of the paper, what holds, where it is in the code, its test.
+"""Write the places in the code into docs/paper.md: `python -m tools.paper_page`.
 
-`python -m tools.paper_page`. Places in the code are read from the equation numbers in comments and
-docstrings of `sst_ros/mechanism`, so a renamed function changes the page and a missing number
-stops it.
+They are read from the equation numbers in comments and docstrings of `sst_ros/mechanism`, so a
+renamed function changes the page and a missing number stops it. A row of the table:
+
+    | 4 | $w_k^T s > 0$ | As printed. | `kinematics.direct` |
 """
 
 from __future__ import annotations
@@ -14,13 +15,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.paper_equations import HOLDS, READ, WHOLE
-
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "paper.md"
-TEMPLATE = ROOT / "tools" / "paper_page.md"
-TEST = "test/mechanism/test_paper_equations.py"
 TAG = re.compile(r"Eqs?\. ((?:\d+(?: to \d+)?(?:, | and )?)+)")
+ROW = re.compile(r"^(\| (\d+) \| \$.*\$ \| .* \| )`[\w.]+` \|$", re.MULTILINE)
 
 
 def numbers(text: str) -> Iterator[tuple[int, int]]:
@@ -52,34 +50,18 @@ def places() -> dict[int, str]:
     return {number: place for number, (_, place) in found.items()}
 
 
-def status(number: int) -> str:
-    """Say how the printed equation, as far as its text shows it, stands to the one that holds."""
-    if number in READ:
-        return READ[number]
-    return "As printed." if number in WHOLE else "Signs restored."
-
-
-def table() -> str:
-    """Return the table of all equations.
+def page(text: str) -> str:
+    """Write the places into the rows of the table.
 
     Raises:
         SystemExit: an equation has no place in the code.
 
     """
     code = places()
-    missing = sorted(set(HOLDS) - set(code))
-    if missing:
+    if missing := [row[1] for row in ROW.findall(text) if int(row[1]) not in code]:
         sys.exit(f"sst_ros/mechanism names no place for the equations {missing}")
-    rows = ["| Eq. | what holds | text of the paper | code |", "| --- | --- | --- | --- |"]
-    for number, equation in HOLDS.items():
-        rows.append(f"| {number} | ${equation}$ | {status(number)} | {code[number]} |")
-    return "\n".join(rows)
-
-
-def page() -> str:
-    """Return the whole page."""
-    return TEMPLATE.read_text(encoding="utf-8").replace("{{ equations }}", table())
+    return ROW.sub(lambda row: f"{row[1]}{code[int(row[2])]} |", text)
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

@@ -81,7 +81,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
             assert cell["outputs"] or "assert" in "".join(cell["source"]), (
-                "python -m tools.notebook"
+                "run jupyter-execute --inplace on the notebook"
             )
     assert names["stopped"].status == 1
     assert np.abs(names["held"].gamma[-1] - names["goal"]).max() < 1e-6

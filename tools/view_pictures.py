@@ -1,44 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mechanism as built, with its frames: `python -m tools.view_picture docs/mechanism.png`.
+"""Pictures of the page: `python -m tools.view_pictures`, then docs/mechanism.png or docs/view.webp.
 
-The frames of the paper have their origins at O; {1k}, {2k} and {E} are drawn on their links,
-where they can be distinguished; their axes are x red, y green, z blue.
+The picture shows the mechanism as built. The frames of the paper have their origins at O; {1k},
+{2k} and {E} are drawn on their links, where they can be distinguished; axes are x red, y green,
+z blue. The film shows what `make view` does, of a run in slow motion, so that it is as smooth as
+the motion is, however slowly a machine without graphics draws.
 """
 
 from __future__ import annotations
 
 import io
+import re
+import signal
+import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from sst_ros.description.tree import BASE, LEGS, STAR, end_point, name_actuated, name_intermediate
+from sst_ros.errors import SstError
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import PageServer
-from sst_ros.view.source import ViewState
-from tools.browser import browse
+from sst_ros.view.source import ViewState, simulator
+from tools.browser import Browser, browse
 
 SCENE = "example2"
-SIZE = (1440, 1200)
-WIDTH = 1080
+SIZE, WIDTH = (1440, 1200), 1080
 _PORT = 18400
 _ALONG = np.radians(58.0)
 """Where {1k} is drawn on its bar, from the carriage towards the motor."""
+FILMED, FILM_SIZE, FILM_WIDTH = "swing", (1040, 700), 900
+FRAMES, RATE = 75, 25
+"""Pictures, and how many make a second of the run and of the film."""
+SLOW = 0.01
+"""Time of the run per time."""
+_QUALITY = 55
 
 
 def picture(path: Path) -> None:
-    """Write the picture as PNG.
-
-    Raises:
-        SstError: there is no browser.
-
-    """
-    from PIL import Image
-
+    """Write the picture as PNG."""
     scene = load(SCENE)
     server = PageServer(port=_PORT)
     try:
@@ -97,5 +103,56 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
         )  # fmt: skip
 
 
+def film(path: Path) -> None:
+    """Write the film as an animated WebP.
+
+    Raises:
+        SstError: there is no browser, or the page does not do what it should.
+
+    """
+    command = [sys.executable, "-m", "sst_ros", "view"]
+    with (
+        simulator(FILMED, SLOW),
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            found = re.search(r"http://\S+", process.stdout.readline())
+            if found is None:
+                raise SstError("`view` printed no address")
+            with browse() as page:
+                page.open(found.group(), FILM_SIZE)
+                taken = [Image.open(io.BytesIO(png)).convert("RGB") for png in _pictures(page)]
+        finally:
+            process.send_signal(signal.SIGINT)
+    size = (FILM_WIDTH, FILM_WIDTH * FILM_SIZE[1] // FILM_SIZE[0])
+    frames = [picture.resize(size, Image.Resampling.LANCZOS) for picture in taken]
+    frames[0].save(
+        path,
+        save_all=True,
+        append_images=frames[1:],
+        duration=1000 // RATE,
+        loop=0,
+        quality=_QUALITY,
+        method=6,
+    )
+    print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1e6:.2f} MB, {date.today()}")
+
+
+def _pictures(page: Browser) -> list[bytes]:
+    page.until(lambda: page.time() is not None, "time of a run")
+    page.hide(".mantine-Notification-root")
+    begin, taken = page.time() or 0.0, []
+    for frame in range(FRAMES):
+        _wait(page, begin + (frame + 1) / RATE)
+        taken.append(page.picture())
+    return taken
+
+
+def _wait(page: Browser, time: float) -> None:
+    page.until(lambda: (page.time() or 0.0) >= time - 1e-9, f"time {time:.2f} s")
+    page.drawn()
+
+
 if __name__ == "__main__":
-    picture(Path(sys.argv[1]))
+    (film if sys.argv[1].endswith(".webp") else picture)(Path(sys.argv[1]))
