@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 BLUE, GREEN, GREY, VERMILION, INK = "#0072b2", "#009e73", "#666666", "#d55e00", "#222222"
 GAMMA = np.array([0.95, 0.62, 0.80])
 """The pose of all pictures [rad]: no two lines of geometry.png fall together in it."""
+VIEW = (1.0, 0.72, 0.42)
 HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 
 
@@ -79,6 +80,12 @@ class SphereDrawing:
         self.axes.text(x, y, label, color=colour, fontsize=size, ha="center", va="center",
                        bbox=HALO, zorder=5)  # fmt: skip
 
+    def legend(self, *entries: tuple[str, float, str, str]) -> None:
+        """Explain lines below the drawing: colour, width, style, text of each."""
+        for colour, width, style, label in entries:
+            self.axes.plot([], [], color=colour, lw=width, ls=style, label=label)
+        self.axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False, fontsize=10)
+
     def outward(self, at: Array, length: float) -> Array:
         """Return the projected direction from the centre to a point, scaled to a length."""
         flat = self.flat(at)
@@ -89,12 +96,8 @@ def _pose() -> tuple[Geometry, Array, Array, Array]:
     """Geometry, R, r (3, 3), t (3, 3) of the pose that all pictures show."""
     geometry = Geometry.of(load_scene("example2"))
     rotation = kinematics.admissible(geometry, GAMMA).rotation
-    return (
-        geometry,
-        rotation,
-        kinematics.carriage_directions(geometry, GAMMA),
-        geometry.e @ rotation.T,
-    )
+    r = kinematics.carriage_directions(geometry, GAMMA)
+    return geometry, rotation, r, geometry.e @ rotation.T
 
 
 def _mechanism(sheet: SphereDrawing, *, labels: bool = True) -> None:
@@ -129,7 +132,7 @@ def geometry_picture() -> Figure:
     geometry, rotation, r, t = _pose()
     s, origin = rotation[:, 2], np.zeros(3)
     figure = Figure(figsize=(7.4, 6.6), layout="constrained")
-    sheet = SphereDrawing(figure.subplots(), [1.0, 0.72, 0.42])
+    sheet = SphereDrawing(figure.subplots(), VIEW)
     _mechanism(sheet)
     sheet.arrow(origin, s, INK, "$\\mathbf{s}$", (-0.13, 0.02))
     sheet.arrow(origin, r[0], INK, "$\\mathbf{r}_1$", (-0.28, 0.13))
@@ -142,18 +145,16 @@ def geometry_picture() -> Figure:
         sheet.text(middle, label, sheet.outward(middle, 0.1), BLUE, 15)
     _angle(sheet, s, r[0], r[1], 0.13, "$\\alpha_1$", 0.24, (0.02, 0.0))
     _angle(sheet, r[0], geometry.v[0], s, 0.13, "$\\mu_1$", 0.13, (-0.16, -0.015))
-    sheet.text(s, "$E$", (0.03, 0.08))
-    sheet.text(r[0], "$R_1$", (0.085, -0.06))
-    sheet.text(r[1], "$R_2$", (0.11, -0.01))
-    sheet.text(r[2], "$R_3$", (-0.07, 0.085))
-    sheet.text(origin, "$O$", (-0.06, -0.06))
-    for colour, width, style, label in (
+    shifts = ((0.03, 0.08), (0.085, -0.06), (0.11, -0.01), (-0.07, 0.085), (-0.06, -0.06))
+    for at, name, shift in zip(
+        (s, *r, origin), ("E", "R_1", "R_2", "R_3", "O"), shifts, strict=True
+    ):
+        sheet.text(at, f"${name}$", shift)
+    sheet.legend(
         (GREY, 2.2, "-", "base: fixed spherical triangle"),
         (BLUE, 4.0, "-", "stroke of an actuator: from $P_k$ to its carriage $R_k$"),
         (VERMILION, 2.6, "--", "star: three arcs that slide through the carriages"),
-    ):
-        sheet.axes.plot([], [], color=colour, lw=width, ls=style, label=label)
-    sheet.axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False, fontsize=10)
+    )
     return figure
 
 
@@ -161,28 +162,22 @@ def frames_picture() -> Figure:
     """Fig. 4: the base frame {B} and the star's frame {E}, both with their origin in O."""
     geometry, rotation, _, _ = _pose()
     figure = Figure(figsize=(7.0, 6.4), layout="constrained")
-    sheet = SphereDrawing(figure.subplots(), [1.0, 0.72, 0.42])
+    sheet = SphereDrawing(figure.subplots(), VIEW)
     _mechanism(sheet, labels=False)
     base = np.stack([geometry.v[0], np.cross(geometry.w[0], geometry.v[0]), geometry.w[0]])
-    names = (
-        ("$x$ along $v_1$", (-0.05, -0.07)),
-        ("$y$", (0.08, -0.02)),
-        ("$z$ along $w_1$", (0.06, 0.07)),
+    for end, colour, name, shift in (
+        (1.12 * base[0], BLUE, "$x$ along $v_1$", (-0.05, -0.07)),
+        (1.12 * base[1], BLUE, "$y$", (0.08, -0.02)),
+        (1.12 * base[2], BLUE, "$z$ along $w_1$", (0.06, 0.07)),
+        (0.95 * rotation[:, 0], VERMILION, "$u = t_1 \\times s$", (-0.02, -0.07)),
+        (0.95 * rotation[:, 1], VERMILION, "$v = t_1$", (0.09, -0.05)),
+        (0.95 * rotation[:, 2], VERMILION, "$w = s$", (0.02, 0.1)),
+    ):
+        sheet.arrow(np.zeros(3), end, colour, name, shift, 2.2)
+    sheet.legend(
+        (BLUE, 2.2, "-", "{B}: fixed base frame"),
+        (VERMILION, 2.2, "-", "{E}: frame of the star, $R = [u, v, w]$"),
     )
-    for axis, (name, shift) in zip(base, names, strict=True):
-        sheet.arrow(np.zeros(3), 1.12 * axis, BLUE, name, shift, 2.2)
-    names = (
-        ("$u = t_1 \\times s$", (-0.02, -0.07)),
-        ("$v = t_1$", (0.09, -0.05)),
-        ("$w = s$", (0.02, 0.1)),
-    )
-    for axis, (name, shift) in zip(rotation.T, names, strict=True):
-        sheet.arrow(np.zeros(3), 0.95 * axis, VERMILION, name, shift, 2.2)
-    sheet.axes.plot([], [], color=BLUE, lw=2.2, label="{B}: fixed base frame")
-    sheet.axes.plot(
-        [], [], color=VERMILION, lw=2.2, label="{E}: frame of the star, $R = [u, v, w]$"
-    )
-    sheet.axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False, fontsize=10)
     return figure
 
 
@@ -223,7 +218,7 @@ def planes_picture() -> Figure:
     geometry, rotation, _, _ = _pose()
     s = rotation[:, 2]
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
-    sheets = [SphereDrawing(axes, [1.0, 0.72, 0.42]) for axes in figure.subplots(1, 3)]
+    sheets = [SphereDrawing(axes, VIEW) for axes in figure.subplots(1, 3)]
     for count, sheet in enumerate(sheets, 1):
         grid = _grid()
         inside = np.all(grid @ geometry.w[:count].T > 0, axis=1)
@@ -267,6 +262,7 @@ def flow_chart() -> Figure:
     """Fig. 7: the steps of the direct dynamics, with the functions that take them."""
     figure = Figure(figsize=(7.6, 7.4), layout="constrained")
     axes = figure.subplots()
+    arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.2}
     for row, (step, function, equations) in enumerate(STEPS):
         y = -row
         axes.add_patch(
@@ -277,7 +273,6 @@ def flow_chart() -> Figure:
         axes.text(3.85, y + 0.1, function, va="center", fontsize=9.5, family="monospace")
         axes.text(3.85, y - 0.15, equations, va="center", fontsize=9, color=GREY)
         if row:
-            arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.2}
             axes.annotate("", (1.8, y + 0.33), (1.8, y + 0.67), arrowprops=arrow)
     axes.set_xlim(-0.1, 7.0)
     axes.set_ylim(-len(STEPS) + 0.5, 0.5)

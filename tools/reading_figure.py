@@ -68,27 +68,19 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
 
 
 @styled
-def draw_determined(
-    panels: Sequence[tuple[str, Sequence[str], Array]], title: str, error: str
-) -> Figure:
+def draw_determined(panels: Sequence[tuple[str, Sequence[str], Array]]) -> Figure:
     """Draw how well readings determine combinations of parameters, a panel for each figure read.
 
-    Args:
-        panels: title, labels of the combinations, and their relative standard deviations, rising.
-            Those beyond MOST are counted below the others.
-        title: of the figure.
-        error: of the readings, for the axis.
-
+    A panel has a title, labels of the combinations and their relative standard deviations, rising;
+    those beyond MOST are counted below the others.
     """
     known = [int(np.sum(deviations < MOST)) for _, _, deviations in panels]
-    rows = [
-        count + (count < len(labels)) for count, (_, labels, _) in zip(known, panels, strict=True)
-    ]
+    both = zip(known, panels, strict=True)
+    rows = [count + (count < len(labels)) for count, (_, labels, _) in both]
     figure = Figure(figsize=(8.2, 1.2 + 0.3 * sum(rows) + 0.45 * len(rows)))
     grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=rows)[:, 0]
-    for axes, count, size, (name, labels, deviations) in zip(
-        grid, known, rows, panels, strict=True
-    ):
+    every = zip(grid, known, rows, panels, strict=True)
+    for axes, count, size, (name, labels, deviations) in every:
         places, shown = np.arange(count), deviations[:count]
         colours = [BLUE if value < 1.0 else GREY for value in shown]
         axes.barh(places, shown - LEAST, left=LEAST, height=0.62, log=True, color=colours)
@@ -103,7 +95,9 @@ def draw_determined(
         axes.grid(axis="y", visible=False)
         axes.set_title(name, fontsize=10)
         axes.set_xlim(LEAST, MOST)
+    error = f"{READINGS} readings with an error of 1 deg"
     grid[-1].set_xlabel(f"relative standard deviation ({error})")
+    title = "What readings of the figures determine: combinations of the lost numbers"
     figure.suptitle(title, fontsize=11)
     return figure
 
@@ -116,11 +110,7 @@ def main() -> None:
         panels.append((title, labels, relative))
         for label, value in zip(labels, relative.tolist(), strict=True):
             print(f"{name} {value:10.3g}  {label}")
-    figure = draw_determined(
-        panels, "What readings of the figures determine: combinations of the lost numbers",
-        f"{READINGS} readings with an error of 1 deg",
-    )  # fmt: skip
-    save_figure(figure, DOCS / "readings.png")
+    save_figure(draw_determined(panels), DOCS / "readings.png")
 
 
 if __name__ == "__main__":

@@ -33,13 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SIMULATOR = "sst_simulator"
 LOG_AND_EVENTS = ("/rosout", "/parameter_events")
 PARAMETER_SERVICES = (
-    "describe_parameters",
-    "get_parameter_types",
-    "get_parameters",
-    "get_type_description",
-    "list_parameters",
-    "set_parameters",
-    "set_parameters_atomically",
+    "describe_parameters get_parameter_types get_parameters get_type_description list_parameters "
+    "set_parameters set_parameters_atomically"
 )
 SIMULATION_INTERFACES = simulation_interfaces.SERVICES
 
@@ -175,7 +170,9 @@ def policy(node: Described) -> str:
     """Write the SROS2 policy of a node: what it needs by its declarations, and nothing else."""
     publish = {*LOG_AND_EVENTS, *_names(node, PUBLISHES)}
     subscribe = set(_names(node, SUBSCRIBES))
-    reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES} | set(_names(node, SERVES))
+    reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES.split()} | set(
+        _names(node, SERVES)
+    )
     executed = set(_names(node, EXECUTES))
     if node.command == "simulator":
         subscribe.add("/clock")  # with use_sim_time

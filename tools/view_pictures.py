@@ -144,14 +144,15 @@ def _pictures(page: Browser) -> list[bytes]:
     page.hide(".mantine-Notification-root")
     begin, taken = page.time() or 0.0, []
     for frame in range(FRAMES):
-        _wait(page, begin + (frame + 1) / RATE)
+        due = begin + (frame + 1) / RATE - 1e-9
+
+        def is_shown(due: float = due) -> bool:
+            return (page.time() or 0.0) >= due
+
+        page.until(is_shown, f"time {due:.2f} s")
+        page.drawn()
         taken.append(page.picture())
     return taken
-
-
-def _wait(page: Browser, time: float) -> None:
-    page.until(lambda: (page.time() or 0.0) >= time - 1e-9, f"time {time:.2f} s")
-    page.drawn()
 
 
 if __name__ == "__main__":
