@@ -31,7 +31,7 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        return f"{where}{self.key or 'document'} = {shortened(self.value)}: {self.allowed}"
+        return f"{where}{self.key or 'document'} = {shorten(self.value)}: {self.allowed}"
 
 
 class InputError(SstError):
@@ -128,7 +128,7 @@ def printable(text: str) -> str:
     )
 
 
-def shortened(value: object, limit: int = 80) -> str:
+def shorten(value: object, limit: int = 80) -> str:
     """Return `repr(value)`, cut to `limit` characters."""
     text = repr(value)
     # The end of a path names the file.

@@ -102,14 +102,8 @@ def test_energy_is_conserved_under_gravity_for_10_s():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not NUMBA, reason="numba is not installed")
 def test_energy_is_conserved_under_gravity_for_100_s():
-    assert drift(100.0, compiled=True) <= 1e-10
-
-
-@pytest.mark.slow
-def test_energy_is_conserved_under_gravity_for_100_s_in_plain_python():
-    assert drift(100.0) <= 1e-10
+    assert drift(100.0, compiled=NUMBA) <= 1e-10
 
 
 def resistance(friction, v):

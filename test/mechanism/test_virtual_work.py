@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from lagrange import OUTER, Lagrange, columns, spin, times
+from mechanism.closed_chains import random_geometry, random_mechanism, random_pose
 from models import FAST, agree, assembly_of, samples, seeded_samples, star_orientation
 from mpmath import mpf
 from scipy.optimize import brentq
 
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism import kinematics, rates, virtual_work
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.virtual_work import EquationOfMotion
 
 ISOTROPIC = seeded_samples(1, 6, isotropic=True)
 GENERAL = seeded_samples(2, 6)
@@ -130,3 +133,34 @@ def test_posture_takes_the_admissible_assembly_by_itself():
     gamma = [0.7, 0.8, 0.9]
     chosen = kinematics.admissible(geometry, gamma).rotation
     assert np.array_equal(virtual_work.posture(geometry, gamma).rotation, chosen)
+
+
+@settings(max_examples=80)
+@given(st.integers(0, 2**32 - 1))
+def test_energy_momentum_and_both_dynamics_agree(seed):
+    rng = np.random.default_rng(seed)
+    geometry = random_geometry(rng)
+    mechanism = random_mechanism(rng, geometry)
+    gamma, rotation = random_pose(rng, geometry)
+    rate, torque, moment = rng.normal(size=(3, 3))
+    at = virtual_work.posture(geometry, gamma, rotation)
+    found = EquationOfMotion.of(mechanism, at, rate)
+    assert np.linalg.eigvalsh(found.m)[0] > 0
+    # Kinetic energy of the seven links, one by one.
+    motion = rates.of_actuators(at, rate)
+    body = rotation.T @ motion.omega
+    energy = body @ mechanism.star @ body
+    for k in range(3):
+        energy += motion.omega_a[k] @ mechanism.actuated[k] @ motion.omega_a[k]
+        energy += motion.omega_ipl[k] @ mechanism.intermediate[k] @ motion.omega_ipl[k]
+    np.testing.assert_allclose(found.kinetic_energy, energy / 2, rtol=1e-12)
+    np.testing.assert_allclose(rate @ found.momentum, energy, rtol=1e-12)
+    np.testing.assert_allclose(
+        found.power(torque, moment), torque @ rate + moment @ motion.omega, rtol=1e-10, atol=1e-12
+    )
+    acceleration = found.acceleration(torque, moment)
+    size = np.linalg.norm(acceleration)
+    other = virtual_work.direct_dynamics(mechanism, at, rate, torque, moment)
+    assert np.linalg.norm(acceleration - other) <= 1e-11 * size
+    scale = np.linalg.norm(found.m) * size + np.linalg.norm(found.h) + np.linalg.norm(torque)
+    assert np.linalg.norm(found.torque(acceleration, moment) - torque) <= 1e-12 * scale
