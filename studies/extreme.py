@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sst_ros.integration.codegen import numba_version
-from sst_ros.plot.methods import draw_regions
 from sst_ros.report.results import markdown, provenance, records, table, write
-from sst_ros.report.step_advice import regions
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies import extreme_runs as runs
@@ -68,7 +66,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     steps = limits.largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
     found = table(step._asdict() for step in steps)
-    x, y, growth = regions()
+    x, y, growth = limits.regions()
     write(
         out, "stability", csv=case_table(cases),
         document={
@@ -78,7 +76,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
         page=page(cases, steps),
         figures={
             "stability": limits.draw_largest_steps(found, provenance()),
-            "stability_regions": draw_regions(x, y, growth, limits.scene_points(), provenance()),
+            "stability_regions": limits.draw_regions(x, y, growth, limits.scene_points(), provenance()),
         },
     )  # fmt: skip
     return all(case.passed for case in cases) and not list(limits.faults())

@@ -11,10 +11,11 @@ imaginary.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
@@ -23,11 +24,22 @@ from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, RODAS4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.methods import MARKERS
-from sst_ros.plot.style import free_figure, note, styled
+from sst_ros.plot.style import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    free_figure,
+    note,
+    styled,
+)
 from sst_ros.report.results import table
 from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
+from sst_ros.state import Array
 from sst_ros.sweeps.job_list import run_jobs
 from studies.extreme_scenes import FREE, POSE, changed, start
 from studies.sampled_data import largest_stable
@@ -249,4 +261,78 @@ def draw_largest_steps(steps: DataFrame, footnote: str) -> Figure:
         axes.legend(loc="lower left", fontsize=9)
     panels[0].set_ylabel("step [s]; a method is stable below its line")
     note(figure, footnote, 60 + 80 * len(families))
+    return figure
+
+
+def regions(
+    x: tuple[float, float] = (-8.0, 2.0), y: tuple[float, float] = (-6.0, 6.0), points: int = 401
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return a grid of z, shapes (points,), and abs(R) of every method on it."""
+    real, imaginary = np.linspace(*x, points), np.linspace(*y, points)
+    z = real[None, :] + 1j * imaginary[:, None]
+    found = {name: np.abs(stability_function(method, z)) for name, method in METHODS.items()}
+    return real, imaginary, found
+
+
+@styled
+def draw_regions(
+    x: Array,
+    y: Array,
+    growth: Mapping[str, Array],
+    points: Mapping[str, NDArray[np.complex128]],
+    footnote: str,
+) -> Figure:
+    """Draw regions of absolute stability with the eigenvalues of scenes times their steps in them.
+
+    Args:
+        x: real part of z = h lambda, shape (n,).
+        y: imaginary part, shape (m,).
+        growth: modulus of the stability function by method, shape (m, n).
+        points: eigenvalues times steps by scene.
+        footnote: small print.
+
+    """
+    figure = free_figure(13.0, 8.6)
+    grid = figure.add_gridspec(2, 2, left=0.05, right=0.63, top=0.95, bottom=0.1, hspace=0.14,
+                               wspace=0.08)  # fmt: skip
+    panels: Any = grid.subplots(sharex=True, sharey=True)
+    near = figure.add_axes((0.69, 0.53, 0.3, 0.42))
+    for axes, (method, modulus) in zip(panels.flat, growth.items(), strict=True):
+        colour = MARKERS[method][0]
+        axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
+        axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
+        axes.set_title(f"{method}: stable where coloured")
+    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
+              for name, z in points.items()}  # fmt: skip
+    shown = [z[inside[name]] for name, z in points.items()]
+    colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK)
+    looks: list[dict[str, Any]] = [
+        {"marker": "osD^v<>phX*P"[k % 12], "color": colours[(k + k // 12) % 6],
+         "linestyle": "none", "markersize": 6, "markerfacecolor": "none"}
+        for k in range(len(points))
+    ]  # fmt: skip
+    for axes in (*panels.flat, near):
+        for z, look in zip(shown, looks, strict=True):
+            axes.plot(z.real, z.imag, **look)
+        axes.axhline(0.0, color=INK, linewidth=0.6)
+        axes.axvline(0.0, color=INK, linewidth=0.6)
+    reach = 1.1 * max((float(np.abs(z).max()) for z in shown if len(z)), default=1.0)
+    near.set_xlim(-reach, reach)
+    near.set_ylim(-reach, reach)
+    near.set_title("Near the origin")
+    near.set_xlabel("Re hλ")
+    for axes in panels[1]:
+        axes.set_xlabel("Re hλ")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("Im hλ")
+    handles = [
+        Line2D(
+            [], [], **look, label=name if inside[name].all() else f"{name} (some beyond the axes)"
+        )
+        for name, look in zip(points, looks, strict=True)
+    ]
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.68, 0.46), fontsize=8.5,
+                  frameon=False, ncol=2, title="hλ of the scenes at their start, step h as advised",
+                  title_fontsize=9)  # fmt: skip
+    note(figure, footnote, 170)
     return figure

@@ -205,6 +205,14 @@ COMMANDS: dict[str, Subcommand | str] = {
         *out("folder of the results", "accuracy_out"),
         flag("--mpmath", "reference in 30 digits, slow"),
     ),
+    "report stability": Subcommand(
+        "stable steps along the motion of a scene; runs at its limits and with other numbers",
+        "cli.reports:report_stability",
+        scene("scene", metavar="SCENE"),
+        arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
+        *out("folder of the results", "stability_out"),
+        needs=("pandas", "matplotlib"),
+    ),
     "plot": Subcommand(
         "draw recorded runs, as PDF and PNG",
         "cli.reports:draw_pictures",

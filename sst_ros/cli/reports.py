@@ -12,11 +12,11 @@ from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording import signals
-from sst_ros.report import accuracy
+from sst_ros.report import accuracy, stability
 from sst_ros.report.reference_solution import EXTENDED, MPMATH
 from sst_ros.report.run import report
 from sst_ros.report.text import table, text
-from sst_ros.scene.scene import names
+from sst_ros.scene.scene import load, names
 
 
 def report_run(options: argparse.Namespace) -> None:
@@ -34,6 +34,12 @@ def report_accuracy(options: argparse.Namespace) -> None:
     kind = MPMATH if options.mpmath else EXTENDED
     scenes = [] if options.all else [*options.scenes, *options.scene]
     accuracy.report(scenes or names(), out, kind=kind)
+
+
+def report_stability(options: argparse.Namespace) -> int:
+    """Find the stable steps along a motion, and run the scene with other numbers."""
+    out = free_out(options, "stability_out")
+    return 0 if stability.report(load(options.scene), out, options.only) else 1
 
 
 def draw_pictures(options: argparse.Namespace) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the methods: errors against their cost, regions of absolute stability."""
+"""Figures of the methods: errors against their cost, stable steps."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from numpy.typing import NDArray
 
-from sst_ros.mechanism.geometry import Array
+from sst_ros.integration.methods import METHODS
 from sst_ros.plot.style import (
     BLUE,
     GREEN,
@@ -23,6 +22,7 @@ from sst_ros.plot.style import (
     PURPLE,
     VERMILION,
     free_figure,
+    legend,
     note,
     styled,
 )
@@ -178,64 +178,62 @@ def _legend(rows: DataFrame, targets: Collection[float]) -> list[Line2D]:
 
 
 @styled
-def draw_regions(
-    x: Array,
-    y: Array,
-    growth: Mapping[str, Array],
-    points: Mapping[str, NDArray[np.complex128]],
-    footnote: str,
-) -> Figure:
-    """Draw regions of absolute stability with the eigenvalues of scenes times their steps in them.
+def draw_stability(steps: DataFrame, runs: DataFrame, title: str, footnote: str) -> Figure:
+    """Draw eigenvalues and stable steps along a motion, and how runs with other numbers ended.
 
     Args:
-        x: real part of z = h lambda, shape (n,).
-        y: imaginary part, shape (m,).
-        growth: modulus of the stability function by method, shape (m, n).
-        points: eigenvalues times steps by scene.
+        steps: t_s, decay, oscillation [1/s], and the longest stable step of each method [s].
+        runs: name, passed, result, error and estimate [rad], nan where there is none.
+        title: of the figure.
         footnote: small print.
 
     """
-    figure = free_figure(13.0, 8.6)
-    grid = figure.add_gridspec(2, 2, left=0.05, right=0.63, top=0.95, bottom=0.1, hspace=0.14,
-                               wspace=0.08)  # fmt: skip
-    panels: Any = grid.subplots(sharex=True, sharey=True)
-    near = figure.add_axes((0.69, 0.53, 0.3, 0.42))
-    for axes, (method, modulus) in zip(panels.flat, growth.items(), strict=True):
-        colour = MARKERS[method][0]
-        axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
-        axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
-        axes.set_title(f"{method}: stable where coloured")
-    inside = {name: (z.real >= x[0]) & (z.real <= x[-1]) & (np.abs(z.imag) <= y[-1])
-              for name, z in points.items()}  # fmt: skip
-    shown = [z[inside[name]] for name, z in points.items()]
-    colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK)
-    looks: list[dict[str, Any]] = [
-        {"marker": "osD^v<>phX*P"[k % 12], "color": colours[(k + k // 12) % 6],
-         "linestyle": "none", "markersize": 6, "markerfacecolor": "none"}
-        for k in range(len(points))
-    ]  # fmt: skip
-    for axes in (*panels.flat, near):
-        for z, look in zip(shown, looks, strict=True):
-            axes.plot(z.real, z.imag, **look)
-        axes.axhline(0.0, color=INK, linewidth=0.6)
-        axes.axvline(0.0, color=INK, linewidth=0.6)
-    reach = 1.1 * max((float(np.abs(z).max()) for z in shown if len(z)), default=1.0)
-    near.set_xlim(-reach, reach)
-    near.set_ylim(-reach, reach)
-    near.set_title("Near the origin")
-    near.set_xlabel("Re hλ")
-    for axes in panels[1]:
-        axes.set_xlabel("Re hλ")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("Im hλ")
-    handles = [
-        Line2D(
-            [], [], **look, label=name if inside[name].all() else f"{name} (some beyond the axes)"
-        )
-        for name, look in zip(points, looks, strict=True)
-    ]
-    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.68, 0.46), fontsize=8.5,
-                  frameon=False, ncol=2, title="hλ of the scenes at their start, step h as advised",
-                  title_fontsize=9)  # fmt: skip
-    note(figure, footnote, 170)
+    figure = free_figure(11.0, 5.2 + 0.36 * len(runs))
+    high = 1.0 / figure.get_figheight()
+    middle = (0.36 * len(runs) + 1.6) * high
+    above = figure.add_gridspec(1, 2, left=0.075, right=0.985, top=1.0 - 0.75 * high,
+                                bottom=middle, wspace=0.2)  # fmt: skip
+    left, right = figure.add_subplot(above[0, 0]), figure.add_subplot(above[0, 1])
+    for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
+        values = np.where(steps[name] > 0.0, steps[name], np.nan)
+        left.plot(steps.t_s, values, line, color=colour, linewidth=1.8, label=name)
+    left.set_ylabel("fastest rate of the eigenvalues [1/s]")
+    free = []
+    for name in METHODS:
+        if np.isfinite(steps[name]).any():
+            values = np.where(np.isfinite(steps[name]), steps[name], np.nan)
+            right.plot(steps.t_s, values, color=MARKERS[name][0], linewidth=1.8, label=name)
+        else:
+            free.append(name)
+    right.plot([], [], " ", label=f"{', '.join(free)}: every step")
+    right.set_ylabel("longest stable step [s]")
+    for axes in (left, right):
+        axes.set_yscale("log")
+        axes.set_xlabel("time t [s]")
+        legend(axes)
+    below = figure.add_gridspec(1, 1, left=0.11, right=0.985, top=middle - 0.85 * high,
+                                bottom=0.85 * high)  # fmt: skip
+    _ends(figure.add_subplot(below[0, 0]), runs)
+    figure.suptitle(title, fontsize=12)
+    note(figure, footnote, 185)
     return figure
+
+
+def _ends(axes: Axes, runs: DataFrame) -> None:
+    """Draw error and estimate of each run, with how it ended beside them."""
+    axes.set_xscale("log")
+    axes.set_xlim(1e-17, 1e3)
+    for place, run in enumerate(runs.itertuples()):
+        colour = GREEN if run.passed else VERMILION
+        error, estimate = (max(value, 2e-17) for value in (run.error, run.estimate))
+        axes.plot([error, estimate], [place, place], color=colour, linewidth=1.0)
+        axes.plot(estimate, place, "|", color=colour, markersize=13, markeredgewidth=2.0)
+        axes.plot(error, place, "o", color=colour, markersize=6)
+        text = run.result if len(run.result) < 68 else f"{run.result[:66]} ..."
+        words = text if run.passed else f"FAILED: {text}"
+        axes.text(3e-7, place, words, va="center", fontsize=8, color=INK)
+    axes.set_yticks(range(len(runs)), list(runs.name))
+    axes.set_ylim(len(runs) - 0.5, -0.5)
+    axes.set_xticks([1e-16, 1e-14, 1e-12, 1e-10, 1e-8])
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("error of the orientation (dot), its estimate (bar) [rad]", loc="left")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +23,8 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import SstError
 from sst_ros.integration.compiled_method import Method
-from sst_ros.integration.methods import DORMAND_PRINCE, METHODS, Rosenbrock
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.integration.methods import DORMAND_PRINCE, Rosenbrock
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import GAUSS, simulate
 
@@ -76,21 +77,24 @@ def step_advice(scene: Scene) -> StepAdvice:
 
 
 def eigenvalues(
-    scene: Scene, state: Sequence[float] | None = None, t: float = 0.0
+    scene: Scene, state: Sequence[float] | None = None, torque: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> NDArray[np.complex128]:
-    """Eigenvalues of the linearised dynamics without torques [1/s], shape (7,) or (10,).
+    """Eigenvalues of the linearised dynamics [1/s], shape (7,) or (10,).
 
     Args:
         scene: a scene.
         state: quaternion, body rate [rad/s] and lagged torques, if any; by default the start.
-        t: time [s].
+        torque: that acts [N m], shape (3,).
 
     """
     dynamics = Dynamics.of(scene)
     y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
     lagged = (0.0,) * (len(dynamics.state) - len(y))
-    drive = (0.0,) * len(dynamics.drive)
-    return np.asarray(ODE(dynamics).eigenvalues(t, (*y, *lagged), drive), dtype=complex)
+    drive = (*torque, *(0.0,) * (len(dynamics.drive) - 3))
+    return np.asarray(_ode(dynamics).eigenvalues(0.0, (*y, *lagged), drive), dtype=complex)
+
+
+_ode = lru_cache(maxsize=4)(ODE)  # whose Jacobian is traced once
 
 
 def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
@@ -127,13 +131,3 @@ def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.
 
 def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:
     return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)
-
-
-def regions(
-    x: tuple[float, float] = (-8.0, 2.0), y: tuple[float, float] = (-6.0, 6.0), points: int = 401
-) -> tuple[Array, Array, dict[str, Array]]:
-    """Return a grid of z, shapes (points,), and abs(R) of every method on it."""
-    real, imaginary = np.linspace(*x, points), np.linspace(*y, points)
-    z = real[None, :] + 1j * imaginary[:, None]
-    found = {name: np.abs(stability_function(method, z)) for name, method in METHODS.items()}
-    return real, imaginary, found

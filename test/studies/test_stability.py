@@ -9,10 +9,9 @@ import pytest
 from matplotlib import image
 
 from sst_ros.integration.methods import METHODS
-from sst_ros.plot.methods import draw_regions
 from sst_ros.plot.style import save_figure
 from sst_ros.report.results import table
-from sst_ros.report.step_advice import regions, stability_function
+from sst_ros.report.step_advice import stability_function
 from studies import stability_limits
 from studies.extreme import page
 from studies.extreme_cases import catalogue
@@ -22,11 +21,13 @@ from studies.stability_limits import (
     LargestStep,
     bisect_step,
     draw_largest_steps,
+    draw_regions,
     eigenvalues,
     faults,
     largest_step,
     limits_of_theory,
     oscillating,
+    regions,
 )
 
 CASES = catalogue()

@@ -1,0 +1,401 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stability report of one scene: which steps are stable along its motion, and what it survives.
+
+The eigenvalues of the linearised dynamics along the motion give the longest step in which each
+method is stable. Then the scene is run as it is and with other numbers: ten times the torque, ten
+times the rates, a hundred times the stiffness and the friction, from poses at its limits and beside
+its nearest singularity. Each run has to end with a value within its error estimate, which a run for
+a hundredth of the tolerance checks, or with a limit or an error that names the reason.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sst_ros.dynamics import kernel
+from sst_ros.errors import InputError, Problem, SstError, suggestion
+from sst_ros.host.output import slices
+from sst_ros.integration.methods import METHODS
+from sst_ros.mechanism import kinematics, workspace
+from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.plot.methods import draw_stability
+from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.step_advice import (
+    LONGEST_S,
+    TOLERANCE,
+    WHOLE_RUN_S,
+    eigenvalues,
+    largest_stable_step,
+    step_advice,
+)
+from sst_ros.scene.loads import Initial, JointFriction
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.state import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+INSTANTS = 50
+"""The motion is linearised at this many instants."""
+
+FINER, FACTOR, ROUNDING = 1e-2, 10.0, 1e-13
+"""A run is checked by one for FINER times the tolerance. Its estimate holds if the true error is at
+most FACTOR times as large, or ROUNDING [rad]."""
+
+TURNS = 181
+"""Turns of the star about each axis, up to pi, among which limits and singularities are found."""
+
+SPIN = 1.0
+"""Angular velocity with which a run goes from a limit into it [rad/s]."""
+
+BESIDE = 1e-3
+"""Angle between a singular pose and the start beside it [rad]."""
+
+Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
+"""Makes another scene of one and its motion, or gives the reason why there is none."""
+
+
+class StressRun(NamedTuple):
+    """What became of a run.
+
+    Attributes:
+        name: of the row.
+        change: what is other than in the scene.
+        passed: it ended with a value within its estimate, or with a named reason; None where the
+            scene has nothing to change.
+        result: in words.
+        method: what `auto` took.
+        error: distance of the orientation at the end from a finer run [rad], nan if unknown.
+        estimate: what the run estimated [rad].
+        wall_s: computing time of both runs [s].
+
+    """
+
+    name: str
+    change: str
+    passed: bool | None
+    result: str
+    method: str = ""
+    error: float = math.nan
+    estimate: float = math.nan
+    wall_s: float = 0.0
+
+
+class StabilityReport(NamedTuple):
+    """Steps along the motion, and the runs.
+
+    Attributes:
+        scene: its name.
+        steps: a row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the
+            eigenvalues [1/s], and the longest stable step of each method [s], inf for every one.
+        advice: that of `step_advice`.
+        runs: a row each.
+
+    """
+
+    scene: str
+    steps: DataFrame
+    advice: str
+    runs: list[StressRun]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no run failed."""
+        return all(run.passed is not False for run in self.runs)
+
+
+def report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
+    """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
+
+    Args:
+        scene: what is examined.
+        out: folder of the files.
+        only: names of rows of ROWS; by default all.
+
+    Returns:
+        Whether no run failed.
+
+    Raises:
+        InputError: a name is unknown, or `out` cannot be written.
+        SstError: the scene cannot start.
+
+    """
+    found = examine(scene, only, shown=True)
+    print(page(found))
+    steps, runs = records(found.steps.replace(math.inf, None)), records(_run_table(found))
+    write(
+        out, "stability", csv=_run_table(found),
+        document={"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs},
+        page=page(found), figures={"stability": figure(found)},
+    )  # fmt: skip
+    return found.passed
+
+
+def examine(scene: Scene, only: Sequence[str] = (), *, shown: bool = False) -> StabilityReport:
+    """Find the stable steps along the motion of a scene, and run it with other numbers."""
+    for name in only:
+        if name not in ROWS:
+            allowed = f"must be one of {', '.join(ROWS)}{suggestion(name, ROWS)}"
+            raise InputError("report stability", [Problem("--only", name, allowed)])
+    chosen = [name for name in ROWS if name in only or not only]
+    seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
+    began = time.perf_counter()
+    motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
+    took = time.perf_counter() - began
+    if shown:
+        about = max(1.0, 2.0 * took) * len(chosen)
+        print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
+    runs = []
+    for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
+        name = chosen[part.start]
+        what, change = ROWS[name]
+        runs.append(_run(name, what, change(scene, motion), seconds))
+    return StabilityReport(scene.name, _steps(scene, motion), step_advice(scene).text, runs)
+
+
+def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
+    """Linearise the motion at INSTANTS."""
+    instants = motion.at(np.linspace(motion.t[0], motion.t[-1], INSTANTS))
+    rows = []
+    for k, t in enumerate(instants.t.tolist()):
+        state = (*instants.quaternion[k].tolist(), *instants.body_rate[k].tolist())
+        torque = instants.torque[k].tolist()
+        lags = scene.actuators is not None and scene.actuators.time_constant is not None
+        values = eigenvalues(scene, (*state, *torque) if lags else state, torque)
+        row = {"t_s": t, "decay": max(0.0, float(-values.real.min())),
+               "oscillation": float(np.abs(values.imag).max())}  # fmt: skip
+        limits = {name: largest_stable_step(method, values) for name, method in METHODS.items()}
+        rows.append(row | limits)
+    return table(rows)
+
+
+def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRun:
+    """Run a scene at two tolerances, and judge how it ended."""
+    if isinstance(changed, str):
+        return StressRun(name, what, None, changed)
+    began = time.perf_counter()
+    try:
+        with np.errstate(all="ignore"):
+            run, fine = (
+                simulate(changed, duration=seconds, tolerance=tolerance)
+                for tolerance in (TOLERANCE, FINER * TOLERANCE)
+            )
+    except SstError as fault:
+        reason = f"{type(fault).__name__}: {str(fault).splitlines()[0]}"
+        return StressRun(name, what, True, reason, wall_s=time.perf_counter() - began)
+    wall = time.perf_counter() - began
+    at = min(float(run.t[-1]), float(fine.t[-1]))
+    ends = [motion.at(at).quaternion[0] for motion in (run, fine)]
+    error = float(angle_between(*ends))
+    holds = error <= max(FACTOR * run.error_estimate, ROUNDING)
+    passed = run.status == fine.status and (run.status < 0 or holds)
+    result = run.message if run.status == fine.status else f"{run.message}; finer: {fine.message}"
+    return StressRun(name, what, passed, result, run.method, error, run.error_estimate, wall)
+
+
+def _stronger(scene: Scene, _: Trajectory) -> Scene | str:
+    if scene.torque is None:
+        return "the scene has no torques of its own"
+    first, second, third = (10.0 * value for value in scene.torque.amplitude)
+    torque = dataclasses.replace(scene.torque, amplitude=(first, second, third))
+    return dataclasses.replace(scene, torque=torque)
+
+
+def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
+    rates = np.array(scene.initial.gamma_dot)
+    if not rates.any():  # it starts at rest: ten times the rates that it reaches
+        rates = np.abs(motion.gamma_dot).max(axis=0)
+    if not rates.any():
+        return "nothing moves"
+    first, second, third = (10.0 * rates).tolist()
+    initial = dataclasses.replace(scene.initial, gamma_dot=(first, second, third))
+    return dataclasses.replace(scene, initial=initial)
+
+
+def _stiffer(scene: Scene, _: Trajectory) -> Scene | str:
+    stroke = scene.stroke
+    if not scene.springs and stroke.stiffness is None:
+        return "the scene has no springs and no elastic stops"
+    springs = tuple(
+        dataclasses.replace(spring, stiffness=100.0 * spring.stiffness) for spring in scene.springs
+    )
+    if stroke.stiffness is not None:
+        stroke = dataclasses.replace(stroke, stiffness=100.0 * stroke.stiffness)
+    return dataclasses.replace(scene, springs=springs, stroke=stroke)
+
+
+def _rougher(scene: Scene, _: Trajectory) -> Scene | str:
+    if scene.friction is None:
+        return "the scene has no friction"
+    joints = {}
+    for field in dataclasses.fields(JointFriction):
+        if one := getattr(scene.friction, field.name):
+            numbers = {key: 100.0 * getattr(one, key) for key in ("viscous", "coulomb", "static")}
+            joints[field.name] = dataclasses.replace(one, **numbers)
+    return dataclasses.replace(scene, friction=JointFriction(**joints))
+
+
+def _at_limit(quantity: Callable[[workspace.Measures], Array]) -> Change:
+    """Start at the nearest pose in which a distance to a limit is zero, going into it."""
+
+    def change(scene: Scene, motion: Trajectory) -> Scene | str:
+        found = _first_zeros(scene, motion, quantity)
+        if not len(found.angle):
+            return "no turn of the star meets it"
+        poses = found.poses(found.angle)
+        # Where another limit is met as well, or before, that one ends the run.
+        beyond = _measure(found.geometry, poses).margin < -1e-9
+        nearest = int(np.lexsort((found.angle, beyond))[0])
+        return _start(scene, poses[nearest], SPIN * found.axis[nearest])
+
+    return change
+
+
+def _beside_singularity(scene: Scene, motion: Trajectory) -> Scene | str:
+    """Start at rest beside the nearest pose with det J1 = 0 or det J2 = 0."""
+    candidates: list[tuple[bool, float, Array]] = []
+    for quantity in (lambda found: found.det_j1, lambda found: found.det_j2):
+        found = _first_zeros(scene, motion, quantity)
+        poses = found.poses(np.maximum(found.angle - BESIDE, 0.0))
+        outside = ~_measure(found.geometry, poses).admissible
+        candidates += zip(outside.tolist(), found.angle.tolist(), poses, strict=True)
+    if not candidates:
+        return "no turn of the star meets one"
+    _, _, pose = min(candidates, key=lambda candidate: candidate[:2])
+    return _start(scene, pose, np.zeros(3))
+
+
+class _Zeros(NamedTuple):
+    """Turns of the star from its start about axes (n, 3) by angles (n,) [rad]."""
+
+    geometry: Geometry
+    start: Array
+    axis: Array
+    angle: Array
+
+    def poses(self, angle: Array) -> Array:
+        """Orientations after turns by other angles about the axes, shape (n, 3, 3)."""
+        turns = Rotation.from_rotvec(angle[:, None] * self.axis).as_matrix()
+        return np.asarray(turns @ self.start)
+
+
+def _first_zeros(
+    scene: Scene, motion: Trajectory, quantity: Callable[[workspace.Measures], Array]
+) -> _Zeros:
+    """Turn the star about many axes up to where a quantity becomes zero; those where it does."""
+    geometry = Geometry.of(scene)
+    start = rotation_matrix(motion.quaternion[0])
+    axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    angles = np.linspace(0.0, np.pi, TURNS)
+    every = _Zeros(geometry, start, np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
+    values = quantity(_measure(geometry, every.poses(every.angle))).reshape(len(axes), TURNS)
+    sign = np.sign(values[0, 0])
+    beyond = sign * values <= 0.0
+    meets = beyond.any(axis=1) & ~beyond[:, 0]
+    first = beyond.argmax(axis=1)[meets]
+    found = _Zeros(geometry, start, axes[meets], angles[first - 1])
+    low, high = angles[first - 1], angles[first]
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        inside = sign * quantity(_measure(geometry, found.poses(middle))) > 0.0
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    return found._replace(angle=low)
+
+
+def _measure(geometry: Geometry, rotation: Array) -> workspace.Measures:
+    return workspace.measures(geometry, kinematics.inverse(geometry, rotation)[0], rotation)
+
+
+def _start(scene: Scene, rotation: Array, rate: Array) -> Scene:
+    """Start a scene at an orientation with an angular velocity in {B} [rad/s]."""
+    a, b, c = kinematics.inverse(Geometry.of(scene), rotation)[0].tolist()
+    x, y, z, w = quaternion_of(rotation).tolist()
+    turning = (rotation.T @ rate).tolist()
+    rates = kernel.joints(kernel.model_of(scene), (x, y, z, w, *turning)).gamma_dot
+    p, q, r = (float(each) for each in rates)
+    start = Initial(gamma=(a, b, c), gamma_dot=(p, q, r), orientation=(x, y, z, w))
+    return dataclasses.replace(scene, initial=start)
+
+
+ROWS: dict[str, tuple[str, Change]] = {
+    "as-it-is": ("nothing", lambda scene, _: scene),
+    "torque": ("ten times the torque", _stronger),
+    "rates": ("ten times the rates at the start", _faster),
+    "stiffness": ("a hundred times the stiffness", _stiffer),
+    "friction": ("a hundred times the friction", _rougher),
+    "stroke": ("from an end of the stroke into it", _at_limit(lambda found: found.stroke)),
+    "edge": ("from beta = 0 into it", _at_limit(lambda found: found.edge)),
+    "reach": ("from the largest beta into it", _at_limit(lambda found: found.reach)),
+    "singularity": (f"from {BESIDE:g} rad beside the nearest singularity", _beside_singularity),
+}
+"""Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""
+
+
+def _run_table(found: StabilityReport) -> DataFrame:
+    return table((run._asdict() for run in found.runs), StressRun._fields)
+
+
+def step_lines(found: StabilityReport) -> Iterator[str]:
+    """Yield what the eigenvalues along the motion mean for the step of each method."""
+    steps = found.steps
+    for kind, words in (("decay", "fastest decay"), ("oscillation", "fastest oscillation")):
+        at = int(steps[kind].argmax())
+        yield f"The {words} is {steps[kind][at]:.3g} 1/s, at {steps.t_s[at]:.3g} s"
+    for name in METHODS:
+        at = int(steps[name].argmin())
+        least = steps[name][at]
+        yield (
+            f"{name}: every step is stable" if math.isinf(least)
+            else f"{name}: unstable in steps above {least:.2g} s, at {steps.t_s[at]:.3g} s"
+        )  # fmt: skip
+    yield "gauss: every step is stable; it is as long as its iteration converges"
+    yield f"Advice: {found.advice}"
+
+
+def page(found: StabilityReport) -> str:
+    """Write the report as Markdown."""
+    verdicts = {True: "yes", False: "**FAILED**", None: "-"}
+    rows = [
+        {
+            "row": run.name, "changed": run.change, "passed": verdicts[run.passed],
+            "end": run.result,
+            "error [rad]": "-" if math.isnan(run.error) else f"{run.error:.1e}",
+            "estimate [rad]": "-" if math.isnan(run.estimate) else f"{run.estimate:.1e}",
+            "time [s]": f"{run.wall_s:.2f}",
+        }
+        for run in found.runs
+    ]  # fmt: skip
+    failed = sum(run.passed is False for run in found.runs)
+    return "\n".join([
+        f"# Stability of {found.scene}", "", "![steps and runs](stability.png)", "",
+        *(f"- {line}." for line in step_lines(found)), "",
+        f"{len(rows)} runs, {failed} failed. A run passes if it ends as the finer one does, and if "
+        f"its error is at most {FACTOR:g} times its estimate, or {ROUNDING:g} rad; where no step "
+        "resolves it, if that is said.", "",
+        markdown(table(rows)), "", provenance(), "",
+    ])  # fmt: skip
+
+
+def figure(found: StabilityReport) -> Figure:
+    """Draw the report."""
+    runs = [run for run in found.runs if run.passed is not None]
+    return draw_stability(
+        found.steps,
+        table((run._asdict() for run in runs), StressRun._fields),
+        f"Stability of {found.scene}",
+        provenance(),
+    )

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stability of one scene: steps, runs with other numbers, and what is said of them."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros import __main__ as cli
+from sst_ros.errors import InputError
+from sst_ros.integration.methods import METHODS
+from sst_ros.mechanism import kinematics, workspace
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report import stability
+from sst_ros.report.stability import ROWS, examine, figure, page
+from sst_ros.scene.scene import Scene, load
+from sst_ros.simulation.simulate import simulate
+
+EXAMPLE2 = dataclasses.replace(load("example2_stroke"), duration=0.2)
+FEW = ("as-it-is", "stroke", "singularity")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return examine(EXAMPLE2, FEW)
+
+
+def changed(name, scene=EXAMPLE2):
+    return ROWS[name][1](scene, simulate(scene, duration=0.1))
+
+
+def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
+    assert [run.name for run in found.runs] == list(FEW) and found.passed
+    whole, stroke, singular = found.runs
+    assert whole.result == "reached the end" and 0.0 < whole.error <= 10.0 * whole.estimate
+    assert stroke.result.startswith("stopped at t = 0.0000")
+    assert singular.passed and "initial.gamma" in singular.result  # which lies beyond the stroke
+
+
+def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch):
+    honest = stability.simulate
+
+    def careless(scene, tolerance, **options):
+        motion = honest(scene, tolerance=max(tolerance, 1e-2 * (tolerance > 1e-10)), **options)
+        motion.error_estimate = tolerance
+        return motion
+
+    monkeypatch.setattr(stability, "simulate", careless)
+    report = examine(dataclasses.replace(load("example2_stroke"), duration=0.5), ["as-it-is"])
+    assert report.runs[0].passed is False and not report.passed
+    assert "| **FAILED** |" in page(report) and "1 runs, 1 failed" in page(report)
+
+
+def test_the_numbers_are_ten_and_a_hundred_times_those_of_the_scene():
+    torque = EXAMPLE2.torque.amplitude
+    assert changed("torque").torque.amplitude == tuple(10.0 * each for each in torque)
+    moving = dataclasses.replace(EXAMPLE2.initial, gamma_dot=(0.1, 0.2, -0.3))
+    faster = changed("rates", dataclasses.replace(EXAMPLE2, initial=moving))
+    assert faster.initial.gamma_dot == pytest.approx((1.0, 2.0, -3.0))
+    hung, rough = load("gravity_payload"), load("friction")
+    for before, after in zip(hung.springs, changed("stiffness", hung).springs, strict=True):
+        assert after.stiffness == 100.0 * before.stiffness
+    bouncing = load("elastic_stops")
+    assert changed("stiffness", bouncing).stroke.stiffness == 100.0 * bouncing.stroke.stiffness
+    after = changed("friction", rough).friction
+    assert after.gamma.coulomb == 100.0 * rough.friction.gamma.coulomb
+    assert after.beta.viscous == 100.0 * rough.friction.beta.viscous
+    assert after.beta.smoothing == rough.friction.beta.smoothing
+    assert changed("stiffness") == "the scene has no springs and no elastic stops"
+    assert changed("friction") == "the scene has no friction"
+
+
+@pytest.mark.parametrize("kind", ["stroke", "edge", "reach"])
+def test_a_run_at_a_limit_starts_there_and_goes_into_it(kind):
+    scene = changed(kind)
+    assert isinstance(scene, Scene)
+    geometry = Geometry.of(scene)
+    rotation = rotation_matrix(np.array(scene.initial.orientation))
+    measured = workspace.measures(geometry, np.array(scene.initial.gamma), rotation)
+    assert 0.0 <= getattr(measured, kind) < 1e-9
+    report = examine(EXAMPLE2, [kind])
+    assert report.passed and report.runs[0].result.startswith("stopped at t = 0.0000")
+
+
+def test_a_run_beside_a_singularity_starts_beside_it():
+    scene = changed("singularity")
+    geometry = Geometry.of(scene)
+    rotation = rotation_matrix(np.array(scene.initial.orientation))
+    gamma, _, _ = kinematics.inverse(geometry, rotation)
+    measured = workspace.measures(geometry, gamma, rotation)
+    assert min(abs(measured.det_j1), abs(measured.det_j2)) < 2e-3
+
+
+def test_the_steps_are_those_of_the_eigenvalues(found):
+    assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
+    assert (found.steps.rodas4 == math.inf).all()
+    stiff = examine(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
+    for name, reach in (("rk4", 2.785), ("dopri5", 3.307)):
+        assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(reach, rel=3e-3)
+    assert "rodas4: every step is stable." in page(stiff)
+
+
+def test_the_figure_and_the_page_show_every_method_and_run(found):
+    said = page(found)
+    assert all(f"- {name}: " in said for name in METHODS) and "\n- gauss: every step" in said
+    assert all(f"| {name} | {ROWS[name][0]} | yes |" in said for name in FEW)
+    lines = {line.get_label() for axes in figure(found).axes for line in axes.lines}
+    assert {"rk4", "dopri5", "dop853", "rodas4: every step", "decay"} <= lines
+
+
+def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
+    words = ["report", "stability", "example1", "--only", "as-it-is", "friction", "--out"]
+    assert cli.main([*words, str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("2 runs of 0.523599 s, each at two tolerances: about ")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "stability.csv", "stability.json", "stability.md", "stability.png",
+    }  # fmt: skip
+    document = json.loads((tmp_path / "out" / "stability.json").read_text())
+    assert [run["passed"] for run in document["runs"]] == [True, None]
+    assert len(document["steps"]) == 50 and document["steps"][0]["rodas4"] is None
+    pixels = image.imread(tmp_path / "out" / "stability.png")
+    assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 1000
+    assert cli.main([*words[:3], "--only", "frictio"]) == 1
+    assert "--only = 'frictio': must be one of as-it-is" in capsys.readouterr().err
+
+
+def test_an_unknown_row_is_refused_with_the_nearest():
+    with pytest.raises(InputError, match="singularity"):
+        examine(EXAMPLE2, ["singularities"])
