@@ -66,7 +66,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
     steps = limits.largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
     found = table(step._asdict() for step in steps)
-    x, y, growth = limits.regions()
+    regions = limits.draw_regions(*limits.regions(), limits.scene_points(), provenance())
     write(
         out, "stability", csv=case_table(cases),
         document={
@@ -76,7 +76,7 @@ def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool
         page=page(cases, steps),
         figures={
             "stability": limits.draw_largest_steps(found, provenance()),
-            "stability_regions": limits.draw_regions(x, y, growth, limits.scene_points(), provenance()),
+            "stability_regions": regions,
         },
     )  # fmt: skip
     return all(case.passed for case in cases) and not list(limits.faults())
