@@ -32,12 +32,7 @@ def run(
 ) -> int:
     """Run a study; return the exit status: 1, too, where its results are not as they should be.
 
-    Args:
-        study: what to run with its options.
-        arguments: those that it takes.
-        words: given on the command line.
-        careful: refuse to overwrite earlier results without `--force`.
-
+    A careful one refuses to overwrite earlier results without `--force`.
     """
     if careful:
         arguments.add_argument("--force", action="store_true", help="overwrite earlier results")

@@ -34,8 +34,6 @@ OFFSET = 1e-8
 SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
 
-_TICKS, _TICKS_OF_DELAY = 600, 200
-_FIRST, _FACTOR, _ACCURACY = 0.5, 1.15, 2e-3
 _GONE, _LOST = 1e-3, 1e2 * OFFSET
 
 
@@ -44,12 +42,10 @@ class Channel:
     """What a channel changes; all zeros change nothing.
 
     Attributes:
-        delay: delay of commands in samples. Until the first one arrives, it acts already, as
-            if the controller had been there before.
+        delay: of commands in samples. Until the first one arrives, it acts already.
         counts: steps of the encoders per turn; 0 for exact angles. An encoder measures no rate:
             that is the difference of the last two angles over the period.
-        noise: standard deviations of normal noise on gamma [rad] and gamma_dot [rad/s], new at
-            every sample.
+        noise: standard deviations on gamma [rad] and gamma_dot [rad/s], new at every sample.
 
     """
 
@@ -114,10 +110,9 @@ class ModelError:
 
 
 def make_heavier(scene: Scene, factor: float) -> Scene:
-    """Return a scene whose bodies weigh `factor` times as much, in the same places.
+    """Return a scene whose bodies have `factor` times the mass and inertia, in the same places.
 
-    Masses and inertias go together: a mass that does not fit its inertia is no rigid body. So
-    every torque of inertia and of weight is `factor` times as large.
+    Then every torque of inertia and of weight is `factor` times as large.
     """
     document = values_of(scene)
     bodies = [document["star"], *document["actuated_links"], *document["intermediate_links"]]
@@ -239,17 +234,14 @@ def bandwidth_in_theory(loop: ControlLoop) -> float:
 
 
 def bandwidth_limit(loop: ControlLoop) -> float:
-    """Find the largest stable bandwidth [rad/s] in mode computed_torque by bisection.
-
-    The pose at the start of the motion is held at rest; the model is exact.
-    """
-    first = _FIRST * bandwidth_in_theory(loop)
-    return largest_stable(lambda bandwidth: is_stable(loop, bandwidth), first, _FACTOR, _ACCURACY)
+    """Find the largest bandwidth [rad/s] at which computed torque holds the start of the motion."""
+    first = 0.5 * bandwidth_in_theory(loop)
+    return largest_stable(lambda bandwidth: is_stable(loop, bandwidth), first, 1.15, 2e-3)
 
 
 def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
     """Return whether a small error is less in the last quarter of a run than in the second."""
-    ticks = _TICKS + _TICKS_OF_DELAY * loop.channel.delay
+    ticks = 600 + 200 * loop.channel.delay
     rest = RestMotion(loop.motion, ticks * loop.period_ns / NANOSECONDS)
     settings = replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
     held = replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)

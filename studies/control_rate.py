@@ -124,9 +124,8 @@ class ControlStudy:
     def resolved_from(self, method: str) -> float:
         """Least rate [Hz] from which on the error is that of the hold; infinite if there is none.
 
-        At this rate and at every higher one the method's own error, that with the exact profile, is
-        below a part OWN_ERROR of that with held torques. A lower rate at which it is so
-        does not count: errors of either sign may cancel there.
+        From there on the method's own error, that with the exact profile, is below a part OWN_ERROR
+        of that with held torques. Below, errors of either sign may cancel.
         """
         runs = self.rows[(self.rows.by == RUN_LOOP) & (self.rows.method == method)]
         errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
@@ -168,15 +167,8 @@ def control_study(
 ) -> ControlStudy:
     """Run the grid, one point after another: processor times are those of a core that is free.
 
-    Rates whose period does not divide the spacing of the reference are left out.
-
-    Args:
-        scene: a scene with torques.
-        rates: control rates [Hz].
-        methods: of integration.
-        compiled: under numba, where it is installed.
-        recorded: runs the nodes at one of NODE_RATES with a hold.
-        shown: draw a progress bar on the terminal.
+    Rates whose period does not divide the spacing of the reference are left out. `recorded` runs
+    the nodes at one of NODE_RATES with a hold.
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
@@ -187,11 +179,8 @@ def control_study(
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
     problem = InitialValueProblem(scene)
     reference = solve_reference(problem, compiled=compiled and numba_version() is not None)
-    points = [
-        (rate, method, hold)
-        for rate, method, hold in itertools.product(rates, methods, HOLDS)
-        if problem.interval_ns % (NANOSECONDS // rate) == 0
-    ]
+    whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
+    points = list(itertools.product(whole, methods, HOLDS))
     run = partial(run_controlled, scene, seconds=problem.seconds, compiled=compiled)
     rows = [
         row_of(problem, reference, run(*points[part.start]))
@@ -222,10 +211,8 @@ def advice(study: ControlStudy) -> str:
     late = "; ".join(f"{name}, below {rate:g} Hz," for name, rate in least_rates if rate > RATES[0])
     largest = max(map(study.spread, (START, MIDDLE)))
     if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
-        return (
-            f"the methods differ by up to {largest:.2g} times at the same rate: choose a finer "
-            "method or tolerance first"
-        )
+        differ = f"the methods differ by up to {largest:.2g} times at the same rate"
+        return f"{differ}: choose a finer method or tolerance first"
     held = [study.resolved(hold) for hold in (START, MIDDLE)]
     least = held[0].rate_Hz.min()
     start, middle = (rows[rows.rate_Hz == least].largest_rad.max() for rows in held)
@@ -307,8 +294,8 @@ def grid(study: ControlStudy) -> DataFrame:
             "largest error [rad]": error,
             "at the end [rad]": f"{group.final_rad.max():.1e}",
             "per tick [us]": f"{fast:.0f} to {slow:.0f}" if slow > 1.1 * fast else f"{slow:.0f}",
-            "share of a core [%]": f"{100 * group.core_share.min():.2g} to "
-                                   f"{100 * group.core_share.max():.2g}",
+            "share of a core [%]": "{:.2g} to {:.2g}".format(
+                *(100 * group.core_share.agg(["min", "max"]))),
         })  # fmt: skip
     return table(rows)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,18 +47,16 @@ estimate of an error that is not resolved must not be above {FACTOR:g} times wha
 """
 
 
-def report(out: Path, *, workers: int | None = None, long: bool = False) -> bool:
+def report(out: Path, workers: int | None = None, *, long: bool = False) -> bool:
     """Run all cases, find the largest steps, print it all and write it into `out`.
 
-    Files: stability.csv, .json, .md, .png, and stability_regions.png.
+    Files: stability.csv, .json, .md, .png, and stability_regions.png. The result is whether every
+    case passed, and the coefficients of every method meet their conditions.
 
     Args:
         out: folder of the files.
         workers: processes; None for one a core.
         long: run the cases that take minutes even compiled, too.
-
-    Returns:
-        Whether every case passed, and the coefficients of every method meet their conditions.
 
     """
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
@@ -92,11 +91,8 @@ def with_batches(cases: Sequence[CaseResult], workers: int | None) -> list[CaseR
         return list(cases)
     groups = runs.batch_groups(catalogue())
     found = run_jobs(_batched, groups, "batches         ", workers)
-    rows = {
-        catalogue()[number].name: row
-        for group, found_rows in zip(groups, found, strict=True)
-        for number, row in zip(group, found_rows, strict=True)
-    }
+    names = [catalogue()[number].name for number in chain.from_iterable(groups)]
+    rows = dict(zip(names, chain.from_iterable(found), strict=True))
     return [
         replace(case, batch=words, correct=case.correct and agrees)
         for case in cases
@@ -181,11 +177,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = parser("extreme", "Stiff and extreme cases, and largest stable steps.", DOCS)
     arguments.add_argument("--long", action="store_true", help="the cases that take minutes, too")
     arguments.add_argument("--workers", type=int, help="processes; default: one a core")
-    return run(
-        lambda options: report(options.out, workers=options.workers, long=options.long),
-        arguments,
-        words,
-    )
+    return run(lambda given: report(given.out, given.workers, long=given.long), arguments, words)
 
 
 if __name__ == "__main__":

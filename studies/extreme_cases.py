@@ -320,7 +320,8 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
     ]
     yield "Friction and actuators", "", [
         *(Case(f"Stribeck friction, smoothing {v:g} rad/s",
-               make.rubbing(coulomb=1.0, static=make.BREAKAWAY, smoothing=v, stribeck=0.1),
+               {"friction.gamma": {"coulomb": 1.0, "static": make.BREAKAWAY, "smoothing": v,
+                                   "stribeck": 0.1}},
                make.CREEP_PUSH, 20, MS,
                "each joint creeps at smoothing artanh(tau / static), a part in 100 of that path",
                from_creep, 1e-2,
@@ -346,9 +347,9 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
              *ENERGY, 1e-9, "each contact is located; their errors add up",
              loose=None, estimate=UNSTABLE),
         Case("sharp Coulomb friction and three contacts",
-             {**make.bouncing_thrice(1e5, 3.0), **make.rubbing(coulomb=2.0, smoothing=0.01)}, REST,
-             30, 10 * MS, *TIGHT, 1e-8,
-             "friction of 2 N m changes its sign within 0.01 rad/s, at each contact",
+             {**make.bouncing_thrice(1e5, 3.0),
+              "friction.gamma": {"coulomb": 2.0, "smoothing": 0.01}}, REST, 30, 10 * MS, *TIGHT,
+             1e-8, "friction of 2 N m changes its sign within 0.01 rad/s, at each contact",
              loose=FINER, estimate=SHARP_FRICTION),
     ]
     yield "Torques that jump", "", [

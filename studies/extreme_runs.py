@@ -3,15 +3,10 @@
 
 A case runs interpreted, one control period a call; through the tick loop of the simulator node; and
 compiled, in as few calls as possible: all must end in the same bits, and as the truth says.
-
-**Error estimate.** It is checked in a run at a loose tolerance, whose steps are as long as that
-allows: its true error is its distance from the run at the default tolerance, which is smaller by
-orders of magnitude.
-
-**Batches.** Cases whose scenes have the same terms are scenarios of one batch. What a batch
-promises is held for each: the bits of fixed steps of the case's own scene; and where its local
-error estimate is as small as that of a simulation, the end of the simulation, or the same limit
-within a step of the same time.
+Its error estimate is checked at a loose tolerance, where the true error is the distance from the
+run at the default tolerance. Cases whose scenes have the same terms are scenarios of one batch: it
+has the bits of fixed steps of each scene alone, and where its local error estimate is as small as
+that of a simulation, the end of the simulation, or the same limit within a step of the same time.
 """
 
 from __future__ import annotations
@@ -33,7 +28,6 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_of
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
@@ -71,8 +65,8 @@ class CaseRun:
         """Whether both ended in the same bits, or with the same error."""
         if self.simulation is None or other.simulation is None:
             return False
-        same = self.simulation.state == other.simulation.state
-        return same and str(self.error) == str(other.error)
+        ends = (self.simulation.state, str(self.error))
+        return ends == (other.simulation.state, str(other.error))
 
 
 class EstimateCheck(NamedTuple):
@@ -246,14 +240,14 @@ def batch_groups(cases: Sequence[Case]) -> list[tuple[int, ...]]:
         except SstError:
             continue
         # Which terms a scene has, and its choices: all of it but the values of its numbers.
-        terms = tuple((k, v if isinstance(v, str) else None) for k, v in leaves_of(scene).items())
+        terms = tuple((k, isinstance(v, str) and v) for k, v in leaves(values_of(scene)))
         groups.setdefault(terms, []).append(number)
     return [tuple(group) for group in groups.values()]
 
 
 def run_batch(cases: Sequence[Case]) -> list[tuple[str, bool]]:
     """Run cases of the same terms as one batch; what was compared, and whether it agrees."""
-    numbers = [leaves_of(case.scene()) for case in cases]
+    numbers = [dict(leaves(values_of(case.scene()))) for case in cases]
     varied = {
         key: [row[key] for row in numbers]
         for key, value in numbers[0].items()
@@ -263,18 +257,16 @@ def run_batch(cases: Sequence[Case]) -> list[tuple[str, bool]]:
     return [compare_row(batch, row, case, len(cases)) for row, case in enumerate(cases)]
 
 
-def leaves_of(scene: Scene) -> dict[str, Any]:
-    """Return the numbers and choices of a scene that act on its motion, by their keys."""
-    return dict(_leaves({k: v for k, v in values_of(scene).items() if k not in _NO_EFFECT}))
-
-
-def _leaves(section: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(section: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield key and value of the numbers and choices that act on the motion of a scene."""
     for name, value in section.items():
+        if name in _NO_EFFECT:
+            continue
         if isinstance(value, dict):
-            yield from _leaves(value, f"{path}{name}.")
+            yield from leaves(value, f"{path}{name}.")
         elif isinstance(value, list) and isinstance(value[0], dict):
             for i, entry in enumerate(value):
-                yield from _leaves(entry, f"{path}{name}[{i}].")
+                yield from leaves(entry, f"{path}{name}[{i}].")
         else:
             yield f"{path}{name}", value
 
@@ -300,11 +292,11 @@ def compare_row(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bo
         return "another end than fixed steps of its own", False
     if error[0] > BATCH_TOLERANCE or code[0] >= NOT_FINITE:
         return "bits", True
-    reason, stop = "", 0.0
+    reason, stop = "", float(when[0])
     if code[0]:
         index = int(np.broadcast_to(batch.columns.geometry, count)[row])
-        geometry = batch.columns.geometries.of_rows(index)
-        reason, stop = batch.model.limits(geometry)[int(code[0]) - 1].reason, float(when[0])
+        limits = batch.model.limits(batch.columns.geometries.of_rows(index))
+        reason = limits[int(code[0]) - 1].reason
     agree = _agree(run(case), y[:7, 0].tolist(), reason, stop, h)
     return ("bits and end" if agree else "another end than the simulation"), agree
 

@@ -100,11 +100,6 @@ def sprung(stiffness: float, damping: float) -> Changes:
     return {"friction": {"gamma": {"viscous": damping}}, "springs": springs}
 
 
-def rubbing(**friction: float) -> Changes:
-    """Give the actuators friction."""
-    return {"friction": {"gamma": friction}}
-
-
 @cache
 def singular_pose() -> Array:
     """Return a rotation R with det J2 = 0 of the scene SINGULAR, shape (3, 3)."""

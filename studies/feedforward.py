@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_ros.control.controller import INSTANTS, MODES, ControllerSettings
 from sst_ros.control.inverse_dynamics import InverseDynamics
@@ -38,25 +37,14 @@ from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism.geometry import Array
 from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
-from studies.control_loop import (
-    SHARE,
-    Channel,
-    ControlLoop,
-    ModelError,
-    at_start,
-    bandwidth_in_theory,
-    bandwidth_limit,
-    ideal_plant,
-    model_errors,
-    run_loop,
-)
+from studies import control_loop as loops
+from studies.control_loop import SHARE, Channel, ControlLoop, ModelError, model_errors, run_loop
 from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, slope
 
@@ -210,8 +198,10 @@ def _tracked(
         return named | {"failure": failure}
     found = evaluate(track, int(limited.sum()))
     late = track.time >= motion.duration + 0.5 * REST_S
-    if failure := "" if open_loop else _restless(track.error[late], limited[late], found.band):
-        return named | {"failure": failure}
+    swing, saturated = float(np.ptp(track.error[late], axis=0).max()), limited[late].any()
+    if not open_loop and (saturated or not swing <= found.band):
+        cause = ", torques at their limit" if saturated else ""
+        return named | {"failure": f"{RESTLESS}: swings by {swing:.1g} rad{cause}"}
     power = found.torque_rms**2
     shares = [
         float(np.nansum(share * power) / power.sum()) if power.any() else None
@@ -224,24 +214,13 @@ def _tracked(
     return named | dict(zip(COLUMNS[len(named) :], numbers, strict=True))
 
 
-def _restless(error: Array, limited: NDArray[np.bool_], band: float) -> str:
-    """Return why a loop with feedback does not rest long after the motion; empty if it does."""
-    swing = float(np.ptp(error, axis=0).max())
-    if not limited.any() and swing <= band:
-        return ""
-    saturated = ", torques at their limit" if limited.any() else ""
-    return f"{RESTLESS}: swings by {swing:.1g} rad{saturated}"
-
-
-def _limit(
-    plant: Scene, settings: ControllerSettings, period_ns: int, delay: int
-) -> dict[str, Any]:
+def _limit(plant: Scene, settings: ControllerSettings, period: int, delay: int) -> dict[str, Any]:
     ideal, real = (
-        ControlLoop(each, each, _motion(each), settings, period_ns, Channel(delay=delay))
-        for each in (ideal_plant(plant), plant)
+        ControlLoop(each, each, _motion(each), settings, period, Channel(delay=delay))
+        for each in (loops.ideal_plant(plant), plant)
     )
-    return {"delay": delay, "theory": bandwidth_in_theory(real), "ideal": bandwidth_limit(ideal),
-            "real": bandwidth_limit(real)}  # fmt: skip
+    found = loops.bandwidth_in_theory(real), *map(loops.bandwidth_limit, (ideal, real))
+    return dict(zip(("delay", "theory", "ideal", "real"), (delay, *found), strict=True))
 
 
 def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[str, Any]:
@@ -260,7 +239,7 @@ def _unheld(plant: Scene) -> tuple[float, float]:
         return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
 
     simulation = Simulation(
-        at_start(plant, motion), "dop853", tolerance=1e-13,
+        loops.at_start(plant, motion), "dop853", tolerance=1e-13,
         step_budget=WHOLE_MOTION_BUDGET,
     )  # fmt: skip
     largest, step = 0.0, round(motion.duration * NANOSECONDS / 20)
@@ -328,11 +307,9 @@ def rms_table(study: FeedforwardStudy) -> DataFrame:
 
 def title(study: FeedforwardStudy) -> str:
     """Return scene and settings in one line."""
-    plan = study.plan
-    return (
-        f"Feedforward on {plan.scene.name}: {study.seconds:g} s of motion, control period "
-        f"{plan.period_ns / 1e6:g} ms, damping ratio {plan.damping_ratio:g}, seed {plan.seed}"
-    )
+    plan, period = study.plan, f"control period {study.plan.period_ns / 1e6:g} ms"
+    text = f"Feedforward on {plan.scene.name}: {study.seconds:g} s of motion, {period}"
+    return f"{text}, damping ratio {plan.damping_ratio:g}, seed {plan.seed}"
 
 
 def findings(study: FeedforwardStudy) -> Iterator[str]:
@@ -405,14 +382,11 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
 def main(words: Sequence[str] | None = None) -> int:
     """Run a study from the command line."""
     arguments = parser("feedforward", "Every mode of control with every model error.", DOCS)
-    arguments.add_argument(
-        "--scene", default="reach", help="scene with a motion: name, or path of a .yaml file"
-    )
+    what = "scene with a motion: name, or path of a .yaml file"
+    arguments.add_argument("--scene", default="reach", help=what)
     arguments.add_argument("--period", type=float, default=1e-3, help="control period [s]")
-    arguments.add_argument(
-        "--bandwidths", type=float, nargs="+", default=[20.0, 60.0, 180.0], metavar="W",
-        help="of the feedback [rad/s]; default: 20 60 180",
-    )  # fmt: skip
+    what, usual = "of the feedback [rad/s]; default: 20 60 180", FeedforwardPlan.bandwidths
+    arguments.add_argument("--bandwidths", type=float, nargs="+", default=usual, help=what)
     arguments.add_argument("--damping-ratio", type=float, default=1.0, help="of the feedback")
     arguments.add_argument("--seed", type=int, default=8, help="of the noise; default: 8")
     arguments.add_argument("--workers", type=int, help="processes; default: one a core")
@@ -431,12 +405,9 @@ def _from_command_line(options: argparse.Namespace) -> bool:
     ]:  # fmt: skip
         raise InputError("feedforward", wrong)
     plan = FeedforwardPlan(
-        load(options.scene),
-        period_ns=round(options.period * 1e9),
-        bandwidths=tuple(dict.fromkeys(options.bandwidths)),
-        damping_ratio=options.damping_ratio,
-        seed=options.seed,
-    )
+        load(options.scene), round(options.period * 1e9),
+        tuple(dict.fromkeys(options.bandwidths)), options.damping_ratio, options.seed,
+    )  # fmt: skip
     report(plan, options.out, workers=options.workers)
     return True
 

@@ -59,8 +59,7 @@ def identification(out: Path, name: str = FOLLOWED) -> bool:
     model = dataclasses.replace(given.with_values({"friction": GUESS}), name=f"{name}_model")
     plant = unknown(given)
     designed = design(model, UNKNOWN)
-    scenes = {"plant": plant, "model": model, "exciting": designed.scene}
-    for key, scene in scenes.items():
+    for key, scene in {"plant": plant, "model": model, "exciting": designed.scene}.items():
         (out / f"{key}.yaml").write_text(dump(scene), encoding="utf-8")
     print(f"{name}: bodies of the plant differ by {SHARE:.0%}, friction is not known", flush=True)
     _follow(out, "exciting")
@@ -70,8 +69,7 @@ def identification(out: Path, name: str = FOLLOWED) -> bool:
     print(found.table(), flush=True)
     for key in ("model", "identified"):
         _follow(out, key)
-    text = compare(out, found.table())
-    print(text, flush=True)
+    print(compare(out, found.table()), flush=True)
     return True
 
 
@@ -79,17 +77,16 @@ def unknown(scene: Scene, share: float = SHARE) -> Scene:
     """Return a plant whose bodies differ from those of a scene: two kinds heavier, one lighter."""
     signs = {"star": 1.0, "actuated_links": -1.0, "intermediate_links": 1.0}
     parts = ("mass", *(f"inertia.{part}" for part in INERTIA))
-    names = [f"{body}.{part}" for body in signs for part in parts]
-    factors = [1.0 + sign * share for sign in signs.values() for _ in parts]
-    numbers = np.array([value_of(scene, name) for name in names], dtype=float) * factors
-    plant = scene.with_values(dict(zip(names, numbers.tolist(), strict=True)))
-    return dataclasses.replace(plant, name=f"{scene.name}_plant")
+    values = {
+        f"{body}.{part}": (value_of(scene, f"{body}.{part}") or 0.0) * (1.0 + sign * share)
+        for body, sign in signs.items() for part in parts
+    }  # fmt: skip
+    return dataclasses.replace(scene.with_values(values), name=f"{scene.name}_plant")
 
 
 def measured(bag: Path, seed: int = 0) -> dict[str, object]:
     """Read a recording as encoders and torque sensors would have given it."""
-    recording = read_bag(bag)
-    motion = recording.trajectory
+    motion = read_bag(bag).trajectory
     step = 2.0 * math.pi / COUNTS
     noise = np.random.default_rng(seed).normal(size=(len(motion.t) - 1, 3))
     torque = motion.torque[1:] + noise * NOISE * np.abs(motion.torque).max(axis=0)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import argparse
 import html
 from collections.abc import Sequence
 from functools import partial
@@ -40,8 +39,6 @@ STEP = 1e-3
 DIFFERENCES = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 """First derivative of order 8 at the middle of nine values, times the spacing."""
 
-INDEX = "index.html"
-
 
 class LargestDifference(NamedTuple):
     """A largest difference over a run, and what it may be."""
@@ -58,11 +55,8 @@ class LargestDifference(NamedTuple):
         return self.value <= self.limit
 
     def __str__(self) -> str:
-        relation = "within" if self.within else "ABOVE"
-        return (
-            f"{self.scene}: {self.what}: {self.value:.1e} {self.unit}, "
-            f"{relation} {self.limit:.0e} {self.unit}"
-        )
+        limit = f"{'within' if self.within else 'ABOVE'} {self.limit:.0e} {self.unit}"
+        return f"{self.scene}: {self.what}: {self.value:.1e} {self.unit}, {limit}"
 
 
 @styled
@@ -90,8 +84,8 @@ def paper(out: Path) -> list[LargestDifference]:
         found.append(difference)
         paths.insert(2, path)
         lines = [*map(str, found), *dict.fromkeys(notes)]
-        (out / INDEX).write_text(_page(paths, lines), encoding="utf-8")
-    print("\n".join([*lines, f"Files: {out}: {INDEX}, {len(paths)} pictures"]), flush=True)
+        (out / "index.html").write_text(_page(paths, lines), encoding="utf-8")
+    print("\n".join([*lines, f"Files: {out}: index.html, {len(paths)} pictures"]), flush=True)
     return found
 
 
@@ -212,9 +206,7 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     below.set_yscale("log")
     below.set_ylabel("largest difference\nof three actuators [N m]")
     below.set_xlabel("time t [s]")
-    title = (
-        f"Inverse dynamics of Example 1, the check that the paper's text describes\n{ASSUMPTION}"
-    )
+    title = f"Inverse dynamics of Example 1, the check in the paper's text\n{ASSUMPTION}"
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
     what = "torques by inverse dynamics against 1.13 sin 12t"
     return path, LargestDifference(scene.name, what, float(apart.max()), TORQUE_LIMIT, "N m")
@@ -223,9 +215,8 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
 def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
     """Format the index page."""
     text = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
-    pictures = "".join(
-        f"<figure><img alt='{path.stem}' src='{path.name}'></figure>" for path in paths
-    )
+    figure = "<figure><img alt='{0.stem}' src='{0.name}'></figure>"
+    pictures = "".join(map(figure.format, paths))
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>Figs. 8 to 14</title>"
         "<style>body{font-family:sans-serif;max-width:60em;margin:2em auto}img{max-width:100%}"
@@ -240,10 +231,8 @@ def main(words: Sequence[str] | None = None) -> int:
     """Draw the figures from the command line."""
     arguments = parser("paper", "Figs. 8 to 14 of the paper.", Path("paper_out"))
 
-    def study(given: argparse.Namespace) -> bool:
-        return all(each.within for each in paper(given.out))
-
-    return run(study, arguments, words, careful=True)
+    return run(lambda given: all(each.within for each in paper(given.out)), arguments, words,
+               careful=True)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -35,14 +35,7 @@ _FINEST = 1e-4
 
 
 def pole(product: float, damping: float, delay: int) -> float:
-    """Modulus of the loop's outermost pole.
-
-    Args:
-        product: bandwidth times period [rad].
-        damping: damping ratio.
-        delay: samples by which commands are late.
-
-    """
+    """Modulus of the outermost pole; `product` is bandwidth x period [rad], delay in samples."""
     polynomial = np.zeros(delay + 3)
     polynomial[:3] = (1.0, -2.0, 1.0)
     rate, angle = 2.0 * damping * product, 0.5 * product**2

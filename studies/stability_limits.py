@@ -57,7 +57,7 @@ AMPLITUDE = 1e-4
 WRONG_ORDER, CONDITION, ROUNDING = 0.04, 1e-12, 1e-13
 """Faults: difference from the order, relative, and from a condition; errors of R(z) by rounding."""
 
-_SHORTEST_S, _STEPS, _GROWTH = 1e-9, 400, 10.0
+_STEPS, _GROWTH = 400, 10.0
 
 
 def faults() -> Iterator[str]:
@@ -128,10 +128,8 @@ def limits_of_theory() -> Iterator[str]:
             modulus = np.abs(stability_function(method, z))
             outside = np.flatnonzero(modulus > 1.0 + 1e-9)
             reach.append(1e-4 * (outside[0] - 1) if len(outside) else math.inf)
-        yield (
-            f"{name}: stable for h lambda from -{reach[0]:.3f} to 0, and up to {reach[1]:.3f} i on "
-            "the imaginary axis"
-        )
+        real = f"{name}: stable for h lambda from -{reach[0]:.3f} to 0"
+        yield f"{real}, and up to {reach[1]:.3f} i on the imaginary axis"
 
 
 class LargestStep(NamedTuple):
@@ -189,7 +187,7 @@ def largest_step(family: str, method: Method, coefficient: float) -> LargestStep
 
 def bisect_step(stable: Callable[[float], bool]) -> float:
     """Return the largest h for which `stable` holds, to one per cent; nan where there is none."""
-    return LONGEST_S if stable(LONGEST_S) else largest_stable(stable, _SHORTEST_S, 1e3, 0.01)
+    return LONGEST_S if stable(LONGEST_S) else largest_stable(stable, 1e-9, 1e3, 0.01)
 
 
 def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:
