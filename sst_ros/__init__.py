@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from sst_ros.scene.bodies import arc_inertia as arc_inertia
     from sst_ros.scene.loads import SineTorque as SineTorque
     from sst_ros.scene.scene import Scene as Scene
+    from sst_ros.simulation.simulate import prepare as prepare
     from sst_ros.simulation.simulate import simulate as simulate
     from sst_ros.simulation.simulation import Simulation as Simulation
     from sst_ros.simulation.torque import TorqueTable as TorqueTable
@@ -78,6 +79,7 @@ _MODULES = {
     "inverse_kinematics": "mechanism.kinematics:inverse",
     "load_scene": "scene.scene:load",
     "plot_workspace": "plot.workspace",
+    "prepare": "simulation.simulate",
     "read_bag": "recording.recording:read",
     "reference_motion": "control.reference_motions",
     "simulate": "simulation.simulate",

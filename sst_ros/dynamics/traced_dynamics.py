@@ -191,6 +191,12 @@ class ODE:
     def _linearised(self) -> Function:
         return compile_program(self.jacobian)
 
+    @cached_property
+    def linearised_by_torque(self) -> Function:
+        """The derivative, and its derivatives by t, the state and the torques of the drive."""
+        by = ("t", *self.state, *TORQUE)
+        return compile_program(with_jacobian(self.derivative, self._inputs, by))
+
     @property
     def joints(self) -> Program:
         """Nine angles and nine rates, of quaternion and body rate."""
@@ -241,6 +247,12 @@ def _clamp(torque: Any, limit: float) -> Any:
 def ode_with_work(dynamics: Dynamics) -> ODE:
     """Give the system that counts work: traced once for all runs of the same dynamics."""
     return ODE(dynamics, work=True)
+
+
+@lru_cache(maxsize=32)
+def ode_under(dynamics: Dynamics, torque: SineTorque) -> ODE:
+    """Give the system under a sine whose phases are its drive, which counts work."""
+    return ODE(dynamics, torque, work=True, phases=True)
 
 
 def compile_program(program: Program) -> Function:

@@ -65,14 +65,35 @@ def write_into(out: Path, origin: str) -> Iterator[None]:
         raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
 
 
+class Bar:
+    """A bar that shows on a terminal how much is done.
+
+    Args:
+        label: what is done.
+        shown: whether it is drawn, if stderr is a terminal.
+
+    """
+
+    def __init__(self, label: str, shown: bool) -> None:
+        self._label, self._percent = label, -1
+        self._drawn = shown and sys.stderr.isatty()
+
+    def draw(self, share: float) -> None:
+        """Show that this share is done, from 0 to 1."""
+        percent = int(100.0 * share)
+        if not self._drawn or percent == self._percent:
+            return
+        self._percent = percent
+        bar = "#" * (40 * percent // 100)
+        end = "\n" if percent == 100 else ""
+        print(f"\r{self._label} [{bar:40}] {percent:3d} %", end=end, file=sys.stderr)
+
+
 def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
     """Yield slices of `size`, 0 for some fifty; where `shown`, draw a bar on a terminal."""
     size = size or max(1, total // _PARTS)
-    drawn = shown and sys.stderr.isatty()
+    bar = Bar(label, shown)
     for start in range(0, total, size):
         done = min(start + size, total)
         yield slice(start, done)
-        if drawn:
-            bar = "#" * (40 * done // total)
-            end = "\n" if done == total else ""
-            print(f"\r{label} [{bar:40}] {100 * done // total:3d} %", end=end, file=sys.stderr)
+        bar.draw(done / total)

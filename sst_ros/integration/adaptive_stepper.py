@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
 from sst_ros.integration.coarse_solution import Point, rescaled
@@ -13,13 +15,22 @@ from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
+    Linearisation,
     Method,
     StepPoint,
     Vector,
 )
 from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock
+from sst_ros.integration.methods import (
+    DOP853,
+    DORMAND_PRINCE,
+    METHODS,
+    RK4,
+    RODAS4,
+    Rosenbrock,
+)
 from sst_ros.integration.step_control import GROW, better_method, step_factor
+from sst_ros.mechanism.geometry import Array
 
 _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
@@ -55,7 +66,11 @@ class AdaptiveStepper:
         tolerance: largest local error estimate of a step: of the quaternion, and of the rate
             relative to its length.
         compiled: by numba.
-        derivative: see `CompiledMethod`; with it only explicit methods are used.
+        derivative: see `CompiledMethod`; without `linearise` only explicit methods are used.
+        linearise: see `CompiledMethod`.
+        find_jump: finds a jump of `derivative` between two times; see `AppliedTorque.jump`.
+        max_step: longest step [s].
+        doubling: control the steps of RK4, too, by the distance of a pair from one step.
         ranges: see `CompiledMethod`.
         budget: of evaluations; without one there is no bound.
 
@@ -74,8 +89,12 @@ class AdaptiveStepper:
         *,
         compiled: bool,
         derivative: Function | None = None,
+        linearise: Linearisation | None = None,
+        find_jump: Callable[[float, float, Vector], tuple[float, float] | None] | None = None,
         ranges: JointRanges = (),
         budget: EvaluationBudget | None = None,
+        max_step: float = float("inf"),
+        doubling: bool = False,
     ) -> None:
         self.tolerance = tolerance
         self.history: list[MethodChange] = []
@@ -84,7 +103,9 @@ class AdaptiveStepper:
         self._ode = ode
         self._auto = method == "auto"
         self._compiled = compiled
-        self._derivative = derivative
+        self._derivative, self._linearise = derivative, linearise
+        self._find_jump, self._max_step = find_jump, max_step
+        self._doubling = doubling and method == RK4.name
         self._ranges = ranges
         self._methods: dict[str, CompiledMethod] = {}
         self._current = self._method_of(DORMAND_PRINCE if self._auto else METHODS[method])
@@ -95,6 +116,11 @@ class AdaptiveStepper:
     def method(self) -> Method:
         """The method in use."""
         return self._current.method
+
+    @property
+    def machine(self) -> CompiledMethod:
+        """The steps of the method in use."""
+        return self._current
 
     def load(self, h: float, at: StepPoint, d: Vector) -> None:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
@@ -128,18 +154,26 @@ class AdaptiveStepper:
             BudgetSpent: the period takes more evaluations than it may.
 
         """
-        rejected = 0
+        rejected, stops = 0, list[float]()
         while True:
             left = end - t
-            h = min(self._h, left)
+            h = min(self._h, self._max_step, left)
             if left - h < 1e-3 * h:
                 h = left
+            if stops:  # a step ends before a jump, the next one steps over it
+                h = min(h, stops[0] - t)
             z = rescaled(y, z, order, self.method.order)
             order = self.method.order
             self.budget.charge(self._current.pair_cost)
             new_y, new_z, size = self._current.step_pair(t, h, y, z, d)
+            if self._doubling and size < float("inf"):
+                size = self._current.doubling_error(h, (y, z), (new_y, new_z))
             factor = self._factor(size)
             if size > self.tolerance:
+                stops = self._jump_in(t, h, y)
+                if stops:
+                    self._h = h
+                    continue
                 self._h = h * min(factor, 1.0)
                 if self._h < 1e-15 * max(abs(t), end - t) or self._h < 1e-200:
                     raise CannotStep(f"steps of {self._h:.1e} s do not resolve it")
@@ -147,14 +181,18 @@ class AdaptiveStepper:
                 self._choose_method(t, h, y, d, rejected)
                 continue
             rejected = 0
-            if h < left or factor < 1.0 or self._h < float("inf"):
-                self._h = max(self._h, h * factor) if h == left else h * factor
+            stopped = bool(stops) and h == stops[0] - t
+            if stopped or h == left:
+                if factor < 1.0 or self._h < float("inf"):
+                    self._h = max(self._h, h * factor)
+            else:
+                self._h = h * factor
             yield AcceptedStep(t, h, new_y, new_z, order)
             if h < left or isinstance(self.method, Rosenbrock):
                 self._choose_method(t + h, h, new_y, d)
             if h == left:
                 return
-            t, y, z = t + h, new_y, new_z
+            t, y, z = stops.pop(0) if stopped else t + h, new_y, new_z
 
     def step_many(self, h: float, count: int, at: Point, d: Vector) -> tuple[int, Point]:
         """Do what `accepted_steps` does for up to `count` periods of h, one step a period.
@@ -163,7 +201,7 @@ class AdaptiveStepper:
         another method, or leave `ranges`. The bits are those of `accepted_steps`. One call takes at
         most the evaluations of one period's budget.
         """
-        if self._h < h or self._derivative is not None:
+        if min(self._h, self._max_step) < h or self._derivative is not None:
             return 0, at
         machine = self._current
         method, cost = machine.method, machine.pair_cost
@@ -207,7 +245,8 @@ class AdaptiveStepper:
         return new_y, new_z, self.method.order
 
     def _factor(self, size: float) -> float:
-        return step_factor(size / self.tolerance, self.method.error_order)
+        order = self.method.order if self._doubling else self.method.error_order
+        return step_factor(size / self.tolerance, order)
 
     def _choose_method(self, t: float, h: float, y: Vector, d: Vector, rejected: int = 0) -> None:
         """Change the method if, by the eigenvalues of the Jacobian, another takes longer steps.
@@ -217,7 +256,7 @@ class AdaptiveStepper:
         """
         self._since_choice += 1
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(self.method, Rosenbrock)
-        if not self._auto or self._derivative is not None:
+        if not self._auto or (self._derivative is not None and self._linearise is None):
             return
         if self._since_choice < _CHOOSE_EVERY and not early:
             return
@@ -225,7 +264,7 @@ class AdaptiveStepper:
             self._since_choice = 0
         self.budget.charge(JACOBIAN_COST)
         try:
-            eigenvalues = self._ode.eigenvalues(t, y, d)
+            eigenvalues = self._eigenvalues(t, y, d)
         except (ArithmeticError, ValueError):
             return  # no finite Jacobian here; the step size has to do
         method, reason = better_method(
@@ -235,6 +274,22 @@ class AdaptiveStepper:
             self._current = self._method_of(method)
             self.history.append(MethodChange(self.origin + t, method.name, reason))
 
+    def _jump_in(self, t: float, h: float, y: Vector) -> list[float]:
+        """Return times just before and after a jump of the derivative in a step, if any."""
+        found = self._find_jump(t, t + h, y) if self._find_jump is not None else None
+        if found is None or h < 1e-13 * max(abs(self.origin + t), h):
+            return []
+        margin = 4e-16 * max(abs(self.origin + found[1]), h)
+        return [time for time in (found[0] - margin, found[1] + margin) if time > t]
+
+    def _eigenvalues(self, t: float, y: Vector, d: Vector) -> Array:
+        if self._linearise is None:
+            return self._ode.eigenvalues(t, y, d)
+        size = len(y)
+        matrix = [[0.0] * size for _ in range(size)]
+        self._linearise(t, y, d, (), [0.0] * size, [0.0] * size, matrix)
+        return np.asarray(np.linalg.eigvals(np.array(matrix)))
+
     def _method_of(self, method: Method) -> CompiledMethod:
         if method.name not in self._methods:
             self._methods[method.name] = CompiledMethod(
@@ -242,6 +297,7 @@ class AdaptiveStepper:
                 method,
                 compiled=self._compiled,
                 derivative=self._derivative,
+                linearise=self._linearise,
                 ranges=self._ranges,
             )
         return self._methods[method.name]

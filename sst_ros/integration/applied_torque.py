@@ -5,11 +5,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
+
+import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compile_program
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
+
+_SEARCHED = 8
+"""Parts of a step in which a jump is looked for."""
+_TIME_STEP = 1e-7
+"""For the derivative of a torque by time [s]: an error of 1e-9 where it changes within 1 ms."""
+_STATE_STEP = 1e-7
+"""For its derivatives by the state, relative to numbers above 1: half of the digits remain."""
 
 
 class StateFeedback:
@@ -29,7 +39,14 @@ class StateFeedback:
         self._lag = len(dynamics.state) > 7
 
     def __call__(self, t: float, y: Sequence[float]) -> Vector3:
-        """Torques [N m] at a time [s] and the numbers of a state."""
+        """Torques [N m] at a time [s] and the numbers of a state.
+
+        Raises:
+            ArithmeticError: the state is not finite, as in a trial step that is too long.
+
+        """
+        if not math.isfinite(sum(y)):
+            raise ArithmeticError("the state of a trial step is not finite")
         lagged = (y[7], y[8], y[9]) if self._lag else (0.0, 0.0, 0.0)
         state = State.of(round(t * NANOSECONDS), y, self._dynamics.joints(*y[:7]), lagged)
         first, second, third = self._function(t, state)
@@ -107,3 +124,72 @@ class AppliedTorque:
         size = len(self._ode.state)
         torque = self.at(self._torque, self._start + t, inputs[:size])
         return self._rhs(t, *inputs[:size], *torque, *inputs[size + 3 :])
+
+    def jump(self, begin: float, end: float, y: Sequence[float]) -> tuple[float, float] | None:
+        """Locate a jump of a function's torques: the last time before it and the first one after.
+
+        Bisection keeps the half with the larger change: that of a jump stays, any other shrinks
+        (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them for the same purpose).
+
+        Args:
+            begin: time of the derivative from which it is looked for [s].
+            end: time up to which it is [s].
+            y: state, the same at all times.
+
+        """
+        torque = self._torque
+        assert torque is not None
+
+        def acting(time: float) -> Vector3:
+            return self.at(torque, self._start + time, y)
+
+        times = np.linspace(begin, end, _SEARCHED + 1).tolist()
+        found = [acting(time) for time in times]
+        changes = [math.dist(a, b) for a, b in pairwise(found)]
+        most = max(changes)
+        k = changes.index(most)
+        (low, high), (before, after) = times[k : k + 2], found[k : k + 2]
+        while low < (middle := 0.5 * (low + high)) < high:
+            here = acting(middle)
+            if math.dist(before, here) >= math.dist(here, after):
+                high, after = middle, here
+            else:
+                low, before = middle, here
+            if not math.dist(before, after) > 0.5 * most:
+                return None
+        return low, high
+
+    def linearise(
+        self,
+        t: float,
+        y: Sequence[float],
+        d: Sequence[float],
+        _numbers: Any,
+        slope: Any,
+        by_time: Any,
+        matrix: Any,
+    ) -> None:
+        """Fill in derivative, df/dt and df/dy: exact by the state, by differences of the torque.
+
+        See `CompiledMethod` for the arguments.
+        """
+        torque, size = self._torque, len(self._ode.state)
+        assert torque is not None
+        time = self._start + t
+        now = self.at(torque, time, y)
+        found = self._ode.linearised_by_torque(t, *y, *now, *d[3:])
+        slope[:] = found[:size]
+        rows = np.array(found[2 * size :]).reshape(size + 3, size).T
+        by_state, by_torque = rows[:, :size], rows[:, size:]
+        earlier, later = (self.at(torque, time + x, y) for x in (-_TIME_STEP, _TIME_STEP))
+        rate = (np.array(later) - earlier) / (2.0 * _TIME_STEP)
+        by_time[:] = (np.array(found[size : 2 * size]) + by_torque @ rate).tolist()
+        if isinstance(torque, StateFeedback):
+            turns = np.zeros((3, size))
+            for i in range(size - 1):  # the last number is the work, which no torque sees
+                step = _STATE_STEP * max(1.0, abs(y[i]))
+                moved = [*y[:i], y[i] + step, *y[i + 1 :]]
+                turns[:, i] = (np.array(self.at(torque, time, moved)) - now) / step
+            by_state = by_state + by_torque @ turns
+        for i, row in enumerate(by_state.tolist()):
+            matrix[i][:] = row

@@ -21,6 +21,8 @@ from sst_ros.integration.methods import Rosenbrock, Tableau
 Method = Tableau | Rosenbrock
 Vector = Sequence[float]
 Function = Callable[..., tuple[float, ...]]
+Linearisation = Callable[[float, Vector, Vector, Any, Any, Any, Any], None]
+"""(t, y, d, numbers, slope, by_time, matrix) -> None: fills the derivative, df/dt and df/dy."""
 JointRanges = Sequence[tuple[int, float, float]]
 StepPoint = tuple[list[float], list[float], tuple[float, ...]]
 """Solution, coarse solution, and the joints' nine angles and nine rates."""
@@ -53,7 +55,8 @@ class CompiledMethod:
         system: what is integrated.
         method: how.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
-        derivative: rhs(t, state.., drive..) to use instead of the ODE's, plain and explicit only.
+        derivative: rhs(t, state.., drive..) to use instead of the ODE's, in plain Python.
+        linearise: the derivatives of `derivative`, which a Rosenbrock method needs.
         ranges: joints that `step_many` looks at, see `limits.ranges_of`.
 
     Attributes:
@@ -70,6 +73,7 @@ class CompiledMethod:
         *,
         compiled: bool,
         derivative: Function | None = None,
+        linearise: Linearisation | None = None,
         ranges: JointRanges = (),
     ) -> None:
         self.system = system
@@ -77,12 +81,14 @@ class CompiledMethod:
         self.compiled = compiled = compiled and codegen.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
         self.pair_cost = 3 * (len(method.a) + (JACOBIAN_COST if implicit else 0))
-        if derivative is not None and (implicit or compiled):
-            raise ValueError("a derivative of its own needs an explicit method and plain Python")
+        if derivative is not None and (compiled or (implicit and linearise is None)):
+            raise ValueError("a derivative of its own needs plain Python and, if implicit, its own")
         texts, constants, numbers = _source(system, method, by_structure=compiled)
         self._module: ModuleType = codegen.load(texts, constants, numba=compiled)
         if derivative is not None:
             self._module.__dict__["rhs"] = derivative
+        if linearise is not None and implicit:
+            self._module.__dict__["linearise"] = linearise
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
         self._numbers = self._vector(numbers)
@@ -112,6 +118,25 @@ class CompiledMethod:
         except (ArithmeticError, ValueError):
             return list(y), list(z), float("inf")
         return self._listed(new_y), self._listed(new_z), float(size)
+
+    def doubling_error(
+        self, h: float, begin: tuple[Vector, Vector], end: tuple[Vector, Vector]
+    ) -> float:
+        """Local error estimate of a pair of steps by its distance from the one step of z.
+
+        Args:
+            h: length of the pair [s].
+            begin: y and z before it.
+            end: y and z after it.
+
+        Returns:
+            As `step_pair`, whose estimate is zero for a method that has none.
+
+        """
+        share = 1.0 / (2.0**self.method.order - 1.0)
+        rows = zip(*begin, *end, strict=True)
+        error = self._vector([share * ((p - y) - (q - z)) for y, z, p, q in rows])
+        return float(self._module.size_of(error, self._vector(begin[0]), self._vector(end[0]), h))
 
     def step_many(
         self, h: float, count: int, tolerance: float, at: StepPoint, d: Vector

@@ -13,17 +13,23 @@ class BudgetSpent(CannotStep):
 
 
 class EvaluationBudget:
-    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run."""
+    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
 
-    def __init__(self, per_period: int | None = None) -> None:
-        self.per_period = per_period
+    Args:
+        per_period: how many; None for no bound.
+        whole_run: they are those of a run, whatever its periods.
+
+    """
+
+    def __init__(self, per_period: int | None = None, *, whole_run: bool = False) -> None:
+        self.per_period, self._whole_run = per_period, whole_run
         self.spent = 0
         self._end: float = float("inf")
 
     def begin(self) -> None:
         """Begin a period."""
         if self.per_period is not None:
-            self._end = self.spent + self.per_period
+            self._end = self.per_period + (0 if self._whole_run else self.spent)
 
     def charge(self, evaluations: int) -> None:
         """Count evaluations before they are made.
@@ -33,5 +39,6 @@ class EvaluationBudget:
 
         """
         if self.spent + evaluations > self._end:
-            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the step")
+            what = "motion" if self._whole_run else "step"
+            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the {what}")
         self.spent += evaluations

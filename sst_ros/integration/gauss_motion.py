@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -24,6 +25,9 @@ NEAR = 0.05
 """Distance above which no limit is met between nodes that resolve the motion to the tolerance."""
 
 _ROUNDING = 1e-14
+_HOPELESS, _SLOW = 128, 4.0
+"""Steps from which on doubling them must bring two solutions nearer by this factor: a motion that
+is smooth enough gains far more, one with kinks a factor of two."""
 _ITERATIONS = (5, 6, 8)
 _MOST_ITERATIONS = 10
 
@@ -58,7 +62,6 @@ class GaussMotion:
         h: length of a step [s].
         error: estimated error of the orientation at the end [rad]: the distance from a finer
             solution.
-        run: compute the motion; `states` then has it.
 
     Raises:
         NotSmooth: the tolerance is not reached.
@@ -87,13 +90,14 @@ class GaussMotion:
         self.count, self.iterations, self.error = self._settings(tolerance)
         self.h = duration / self.count
         self._motion = self._prepared(self.count, self.iterations)
-        self.run = self._motion.run
+        self._lock = threading.Lock()
         self.run()
 
-    @property
-    def states(self) -> Array:
-        """States at the ends of the steps of the last run, shape (count, numbers of the state)."""
-        return self._motion.states
+    def run(self) -> Array:
+        """Compute the states at the ends of the steps, shape (count, numbers of the state)."""
+        with self._lock:
+            self._motion.run()
+            return self._motion.states
 
     @property
     def evaluations(self) -> int:
@@ -110,7 +114,7 @@ class GaussMotion:
     @cached_property
     def samples(self) -> Array:
         """States at the times of `grid`."""
-        return np.vstack([self._y, self.states])
+        return np.vstack([self._y, self.run()])
 
     @cached_property
     def ending(self) -> Ending | None:
@@ -126,11 +130,13 @@ class GaussMotion:
     def at(self, times: Array) -> Array:
         """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
         steps = np.clip(np.searchsorted(self.grid, times, side="right") - 1, 0, self.count - 1)
-        ends = (
-            self._inside(int(k), float(t) - float(self.grid[k]))
-            for k, t in zip(steps, times, strict=True)
-        )
-        return np.array(list(ends)).reshape(len(times), -1)
+        _ = self.samples
+        with self._lock:  # all of them use the same arrays
+            ends = [
+                self._inside(int(k), float(t) - float(self.grid[k]))
+                for k, t in zip(steps, times, strict=True)
+            ]
+        return np.array(ends).reshape(len(times), -1)
 
     def energy_residual(self, end: float) -> float:
         """Energy at `end` [s], less that at 0, less the work done, by Gauss quadrature [J]."""
@@ -179,7 +185,7 @@ class GaussMotion:
         fine = max(_ROUNDING, 0.01 * tolerance)
         count, end = self._converged(fine)
         if not end:
-            raise NotSmooth(f"{self._finest} steps of collocation do not reach {tolerance:g} rad")
+            raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
         best: tuple[int, int, int, float] | None = None
         for iterations in _ITERATIONS:
             steps, error = count, self._error(count, iterations, end)
@@ -196,13 +202,16 @@ class GaussMotion:
 
     def _converged(self, fine: float) -> tuple[int, list[float]]:
         """Double the steps until two ends are the same to `fine`; no end where they never are."""
-        count, before = 1, [math.nan] * 7
+        count, before, distance = 1, [math.nan] * 7, math.inf
         while count <= self._finest:
             motion = self._prepared(count, _MOST_ITERATIONS)
             end = motion.end if math.isfinite(_change(motion)) else [math.nan] * 7
-            if _apart(before, end) < fine:
+            apart = _apart(before, end)
+            if apart < fine:
                 return count, end
-            count, before = 2 * count, end
+            if count > _HOPELESS and not _SLOW * apart < distance:
+                break
+            count, before, distance = 2 * count, end, apart
         return count, []
 
     def _error(self, count: int, iterations: int, reference: Sequence[float]) -> float:

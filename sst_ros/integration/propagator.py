@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, ode_with_work
+from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
@@ -19,6 +20,7 @@ from sst_ros.integration.adaptive_stepper import (
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
 from sst_ros.integration.coarse_solution import ErrorGrowth, Point, coulomb_joints
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.evaluation_budget import EvaluationBudget
 from sst_ros.integration.events import (
     contact_events_of,
@@ -28,7 +30,7 @@ from sst_ros.integration.events import (
     load_root_finder,
     may_occur,
 )
-from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
+from sst_ros.integration.methods import RK4
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 
@@ -51,6 +53,30 @@ class Checkpoint(NamedTuple):
     kept: StepperCheckpoint
 
 
+class Passage(NamedTuple):
+    """An accepted step, or the part of it before an event.
+
+    Attributes:
+        time: when it begins [s].
+        t: the same since the period began, as `method` takes it [s].
+        h: its length [s].
+        begin, end: solutions.
+        drive: what acts.
+        method: the steps that were taken.
+        last: whether it ends with the period.
+
+    """
+
+    time: float
+    t: float
+    h: float
+    begin: Point
+    end: Point
+    drive: tuple[float, ...]
+    method: CompiledMethod
+    last: bool
+
+
 class Propagator:
     """Advances a scene through periods of constant drive, or of torques that are a function.
 
@@ -63,6 +89,9 @@ class Propagator:
         derivative: derivative of the state in plain Python, in place of the traced one and with
             its inputs; for explicit methods, and for torques that are numbers or functions.
         limits: whether the limits of the scene end the motion.
+        max_step: longest step [s].
+        observe: called after each accepted step, for motions whose steps are their own: RK4 has
+            error control, too, and periods are not done by one call of compiled code.
 
     Attributes:
         dynamics, ode: of the scene.
@@ -82,6 +111,8 @@ class Propagator:
         budget: EvaluationBudget,
         derivative: Function | None = None,
         limits: bool = True,
+        max_step: float = float("inf"),
+        observe: Callable[[Passage], None] | None = None,
     ) -> None:
         geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -100,12 +131,13 @@ class Propagator:
             compiled=compiled,
             ranges=self._ranges,
             budget=budget,
+            max_step=max_step,
+            doubling=observe is not None,
         )
+        self._observe = observe
         self._constant = self._stepper = self._new_stepper(self.ode, derivative=derivative)
         self._others: dict[SineTorque | None, AdaptiveStepper] = {}
-        # Torque functions are evaluated in Python, and have no Jacobian.
-        implicit = isinstance(METHODS.get(integrator), Rosenbrock)
-        self._explicit = "auto" if implicit else integrator
+        self._linearise = self.torque.linearise if derivative is None else None
         self.accepted_steps = 0
         self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
         self._first = self._before = self._checkpoint(self._constant)
@@ -157,7 +189,7 @@ class Propagator:
         drive = (*numbers, *moment) if moment else numbers
         try:
             done = 0
-            if stepper is self._constant:
+            if stepper is self._constant and self._observe is None:
                 end, done = self._step_many(at, h, count, drive)
             if not done:
                 end, done = self._adaptive(at, start, h, drive), 1
@@ -213,14 +245,12 @@ class Propagator:
         if sine not in self._others:
             if sine is None:
                 new = self._new_stepper(
-                    self.ode, method=self._explicit, compiled=False, ranges=(),
-                    derivative=self.torque.derivative,
+                    self.ode, compiled=False, ranges=(),
+                    derivative=self.torque.derivative, linearise=self._linearise,
+                    find_jump=self.torque.jump,
                 )  # fmt: skip
             else:
-                limit = self.torque.limit_of(sine)
-                new = self._new_stepper(
-                    ODE(self.dynamics, sine, limit=limit, work=True, phases=True)
-                )
+                new = self._new_stepper(ode_under(self.dynamics, sine))
             self._others[sine] = new
         return self._others[sine]
 
@@ -257,10 +287,16 @@ class Propagator:
             end = self._point(step.y, step.z, step.order)
             self.accepted_steps += 1
             self._growth = self._growth.after(at, end)
+            found = None
             if not step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
                 found = self._event_in(step, at, end, drive)
-                if found is not None:
-                    return found
+            if self._observe is not None:
+                point, x, _ = found or (end, step.t + step.h, None)
+                start, machine = self._stepper.origin + step.t, self._stepper.machine
+                last = found is None and step.h == h - step.t
+                self._observe(Passage(start, step.t, x - step.t, at, point, drive, machine, last))
+            if found is not None:
+                return found
             at = end
         return at, h, None
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
@@ -56,20 +57,39 @@ def refuse_bad_options(
             raise InputError("simulation", [Problem(name, value, allowed)])
 
 
-def refuse_bad_step(torque: Any, dt_ns: int, moment: Any) -> None:
-    """Raise InputError for arguments of a step that are not allowed; names each."""
-    if dt_ns > 0 and finite_vector(torque) and finite_vector(moment):
-        return
+def refuse_bad_step(torque: Any, dt_ns: Any, count: Any, moment: Any) -> tuple[int, int]:
+    """Return the length [ns] and the number of steps, or name each argument that is not allowed.
+
+    Raises:
+        InputError: one is not allowed.
+
+    """
+    length, number = _whole(dt_ns), _whole(count)
+    if length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment):
+        return length, number
     problems = []
     if not (callable(torque) or isinstance(torque, SineTorque)) and finite_vector(torque) is None:
         allowed = "must be three finite numbers [N m], a SineTorque or a function of t [s]"
         problems.append(Problem("torque", torque, allowed))
     if finite_vector(moment) is None:
         problems.append(Problem("moment", moment, "must be three finite numbers [N m]"))
-    if dt_ns <= 0:
-        problems.append(Problem("dt_ns", dt_ns, "must be > 0 [ns]"))
+    if length <= 0:
+        problems.append(Problem("dt_ns", dt_ns, "must be > 0, in whole nanoseconds"))
+    if number <= 0:
+        problems.append(Problem("count", count, "must be > 0, a whole number"))
     if problems:
         raise InputError("step", problems)
+    return length, number
+
+
+def _whole(value: Any) -> int:
+    """Return a whole number of any type as int, 0 for anything else."""
+    if type(value) is int:
+        return value
+    try:
+        return 0 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        return 0
 
 
 def _one_of(names: tuple[str, ...]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,14 +46,14 @@ class SampledMotion:
         dense: Callable[[Array], Array] | None = None,
     ) -> None:
         given = {"t": t, "quaternion": quaternion, "body_rate": body_rate, "torque": torque}
-        arrays = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        arrays = {name: _own(value) for name, value in given.items()}
         self.scene = scene
         self.t: Array = arrays["t"]
         self.quaternion: Array = arrays["quaternion"]
         self.body_rate: Array = arrays["body_rate"]
         self.torque: Array = arrays["torque"]
         if joints is not None:
-            self._joints = arrays["joints"] = np.asarray(joints, dtype=float)
+            self._joints = arrays["joints"] = _own(joints)
         _refuse_misfits(arrays)
         self.status = status
         self.message = message
@@ -64,17 +64,6 @@ class SampledMotion:
         self.law = law
         self.dense = dense
         self._residual = energy_residual
-
-    @classmethod
-    def _shared(cls: type[T], shared: dict[str, Any], y: Array) -> T:
-        """Build one from its other attributes and checked states (n, 7 or 10), for `simulate`."""
-        new = cls.__new__(cls)
-        new.__dict__.update(shared)
-        new.quaternion = y[:, :4]
-        new.body_rate = y[:, 4:7]
-        if y.shape[1] > 7:
-            new.torque = y[:, 7:10]
-        return new
 
     def __len__(self) -> int:
         return len(self.t)
@@ -154,10 +143,19 @@ class SampledMotion:
         return (*self.quaternion.T, *self.body_rate.T)
 
 
+def _own(value: ArrayLike) -> Array:
+    """Return an array that nothing can change: a copy, unless it is one already."""
+    array: Array = np.asarray(value, dtype=float)
+    if array is value and (array.flags.writeable or not array.flags.owndata):
+        array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
 def _refuse_misfits(arrays: dict[str, Array]) -> None:
     t, problems = arrays["t"], []
-    if t.ndim != 1 or not np.all(np.isfinite(t)):
-        problems.append(Problem("t", t, "must be finite times [s], shape (n,)"))
+    if t.ndim != 1 or not np.all(np.isfinite(t)) or np.any(t[1:] <= t[:-1]):
+        problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
     wanted = {"quaternion": 4, "body_rate": 3, "torque": 3, "joints": 18}
     for name, array in arrays.items():
         if name != "t" and array.shape != (len(t), wanted[name]):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,11 +16,10 @@ from sst_ros.integration.gauss_motion import NotSmooth
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
-from sst_ros.simulation.simulate_steps import stepped
+from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
 from sst_ros.simulation.torque import profile_of
 from sst_ros.simulation.torque_profile import (
-    ConstantTorque,
     FeedbackFunction,
     FunctionTorque,
     SineProfile,
@@ -48,9 +47,11 @@ def simulate(
     method: str = "auto",
     tolerance: float = 1e-9,
     control_period: float | None = None,
+    breaks: ArrayLike = (),
+    max_step: float | None = None,
     progress: bool = False,
 ) -> Trajectory:
-    """Simulate a motion from the initial state of a scene.
+    """Simulate a motion from the initial state of a scene: `prepare(...).run()`.
 
     Where a limit of the scene ends the motion, or no step resolves it, the trajectory has the part
     that is valid, and its `status` and `message` give the reason.
@@ -66,16 +67,18 @@ def simulate(
             mapping or `Initial` with gamma, gamma_dot, orientation.
         t_eval: times at which samples are returned [s], ascending, in whole nanoseconds (others
             are rounded). By default the ends of the steps of Gauss collocation, the control
-            periods, or 200 even intervals.
+            periods, or 200 even intervals. The steps do not depend on them.
         method: "gauss" (Gauss collocation), "dopri5", "dop853", "rk4" (explicit Runge-Kutta of
             order 5, 8, 4), "rodas4" (Rosenbrock, order 4, for stiff scenes) or "auto".
         tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
-            `error_estimate` exceeds it is run again by smaller steps, up to twice. With
-            `control_period` it runs once, and the tolerance is that of the local error of a step;
-            "rk4" has none.
+            `error_estimate` exceeds it is run again by smaller steps, up to three times; if it
+            still does, `status` is 2. With `control_period` it runs once.
         control_period: a function is called once a period [s], at its beginning, and its torques
             are held until the next, as those of a controller. Without it a function is part of the
             differential equation, called in each stage of a step, and must have no memory.
+        breaks: times at which a function jumps or has a kink [s], ascending. Jumps in time are
+            found without it, unless a pulse is shorter than a step.
+        max_step: longest step [s]; by default the error alone decides. Not for collocation.
         progress: draw a bar on a terminal.
 
     Raises:
@@ -84,48 +87,80 @@ def simulate(
         SingularConfiguration: the motion starts from a parallel singularity.
 
     """
-    key: Any = None
-    plain = initial is None and t_eval is None and control_period is None
-    if plain and type(scene) is Scene and type(torque) in _IMMUTABLE:
-        acting = torque if torque is None or type(torque) is tuple else id(torque)
-        key = (id(scene), acting, duration, tolerance, method)
-        known = _known.get(key)
-        if known is not None:
-            return known[2].trajectory(None)
+    return prepare(
+        scene,
+        torque,
+        duration,
+        initial=initial,
+        t_eval=t_eval,
+        method=method,
+        tolerance=tolerance,
+        control_period=control_period,
+        breaks=breaks,
+        max_step=max_step,
+    ).run(progress=progress)
+
+
+def prepare(
+    scene: Scene | Mapping[str, Any] | str | Path,
+    torque: TorqueInput = None,
+    duration: float | None = None,
+    *,
+    initial: InitialInput = None,
+    t_eval: ArrayLike | None = None,
+    method: str = "auto",
+    tolerance: float = 1e-9,
+    control_period: float | None = None,
+    breaks: ArrayLike = (),
+    max_step: float | None = None,
+) -> PreparedRun:
+    """Prepare a motion that is run many times, by the arguments of `simulate`.
+
+    All that does not change from run to run is done once: the scene's equations, the choice of the
+    method, and for collocation of its steps.
+
+    Raises:
+        InputError, AssemblyError, SingularConfiguration: as `simulate`.
+
+    """
     given = with_initial(scene_of(scene), initial)
-    law = _law(given, torque)
+    profile = _profile(given, torque)
     span = _span(given, duration)
-    period = _checked_period(control_period, law)
+    period = _checked_period(control_period, profile, span)
     times = _times(t_eval, span)
     _refuse_bad_options(method, tolerance)
+    jumps, longest = _breaks(breaks, span), _longest(max_step)
     reason = ""
     if method in (AUTO, GAUSS):
         try:
-            motion = CollocatedMotion(given, law, span, period, tolerance, method == GAUSS)
+            if len(jumps) or longest < span / NANOSECONDS:
+                raise NotSmooth("collocation takes no breaks and no max_step")
+            motion = CollocatedMotion(given, profile, span, period, tolerance, method == GAUSS)
         except NotSmooth as error:
             if method == GAUSS:
                 raise InputError("simulate", [Problem("method", method, str(error))]) from None
             reason = f" (auto: {error})"
         else:
-            if key is not None:
-                _remember(key, (scene, torque, motion))
-            return motion.trajectory(times)
-    return stepped(given, law, method, tolerance, span, period, reason, times, progress)
+            return PreparedRun(lambda _: motion.trajectory(times))
+    task = Task(given, profile, span, period, method, tolerance, jumps, longest)
+    return PreparedRun(lambda progress: integrate(task, reason, times, progress))
 
 
-_known: dict[Any, tuple[Any, Any, CollocatedMotion]] = {}
-"""Motions that were prepared, with the scene and the torque whose identities their keys have."""
+class PreparedRun:
+    """A motion that can be run any number of times, by several threads at once.
 
-_IMMUTABLE = (type(None), tuple, SineTorque, SineProfile, ConstantTorque)
+    A torque function is called anew in each run.
+    """
+
+    def __init__(self, run: Callable[[bool], Trajectory]) -> None:
+        self._run = run
+
+    def run(self, *, progress: bool = False) -> Trajectory:
+        """Compute the motion; the trajectory has arrays of its own."""
+        return self._run(progress)
 
 
-def _remember(key: Any, motion: tuple[Any, Any, CollocatedMotion]) -> None:
-    while len(_known) >= 32:
-        _known.pop(next(iter(_known)), None)
-    _known[key] = motion
-
-
-def _law(scene: Scene, torque: TorqueInput) -> TorqueProfile | FeedbackFunction:
+def _profile(scene: Scene, torque: TorqueInput) -> TorqueProfile | FeedbackFunction:
     if torque is not None:
         return profile_of(torque)
     return profile_of((0.0, 0.0, 0.0)) if scene.torque is None else SineProfile(scene.torque)
@@ -151,13 +186,37 @@ def _nanoseconds(name: str, value: Any) -> int:
     return round(seconds * NANOSECONDS)
 
 
-def _checked_period(period: float | None, law: Any) -> int | None:
+def _checked_period(period: float | None, profile: Any, span: int) -> int | None:
     if period is None:
         return None
-    if isinstance(law, TorqueProfile) and not isinstance(law, FunctionTorque):
+    if isinstance(profile, TorqueProfile) and not isinstance(profile, FunctionTorque):
         allowed = "is for a function; give none for numbers and profiles"
         raise InputError("simulate", [Problem("control_period", period, allowed)])
-    return _nanoseconds("control_period", period)
+    found = _nanoseconds("control_period", period)
+    if span > MOST_PERIODS * found:
+        allowed = f"must be at least {span / NANOSECONDS / MOST_PERIODS:.3g} s for this duration"
+        raise InputError("simulate", [Problem("control_period", period, allowed)])
+    return found
+
+
+def _breaks(breaks: ArrayLike, span: int) -> Array:
+    """Return the times of jumps inside the motion [s]."""
+    try:
+        times: Array = np.atleast_1d(np.array(breaks, dtype=float))
+        fits = times.ndim == 1 and bool(np.all(np.isfinite(times)) and np.all(np.diff(times) > 0))
+    except (TypeError, ValueError):
+        fits = False
+    if fits:
+        return times[(times > 0.0) & (times < span / NANOSECONDS)]
+    raise InputError("simulate", [Problem("breaks", breaks, "must be ascending times [s]")])
+
+
+def _longest(max_step: float | None) -> float:
+    if max_step is None:
+        return math.inf
+    if isinstance(max_step, (int, float)) and not isinstance(max_step, bool) and max_step > 0.0:
+        return float(max_step)
+    raise InputError("simulate", [Problem("max_step", max_step, "must be a number > 0 [s]")])
 
 
 def _times(t_eval: ArrayLike | None, span: int) -> np.ndarray | None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from functools import partial
 from typing import Any
 
@@ -18,7 +17,7 @@ from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamp
 
-_FINEST_PER_SECOND, _FINEST = 256, 4096
+_FINEST_PER_SECOND, _FINEST = 1024, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
 
 
@@ -50,7 +49,7 @@ class CollocatedMotion:
         self._motion = motion = GaussMotion(
             scene, torque, start, duration, tolerance, compiled=asked or None, finest=finest
         )
-        self._scene, self._law, self._lag, self._lock = scene, law, lag, threading.Lock()
+        self._scene, self._law, self._lag = scene, law, lag
         self._start = np.array([start])
         self._end, self._ending = duration, motion.ending
         status, message = 0, "reached the end"
@@ -59,10 +58,8 @@ class CollocatedMotion:
             status = 1
             message = f"stopped at t = {self._end:.12f} s: {self._ending.limit.reason}"
         chosen = "" if asked else " (auto: a smooth motion under a profile)"
-        self._shared: dict[str, Any] = {
-            "scene": scene,
-            "t": motion.grid,
-            "torque": motion.torque(motion.grid),
+        self._times = motion.grid.copy()
+        self._of_the_run: dict[str, Any] = {
             "status": status,
             "message": message,
             "method": f"gauss, order {2 * NODES}: {motion.count} steps of {motion.h:.3g} s, "
@@ -71,22 +68,21 @@ class CollocatedMotion:
             "evaluations": motion.evaluations,
             "step": motion.h,
             "law": law,
-            "_residual": partial(motion.energy_residual, self._end),
+            "energy_residual": partial(motion.energy_residual, self._end),
             "dense": motion.at,
         }
 
     def trajectory(self, times: np.ndarray | None) -> Trajectory:
         """Compute the motion; times [ns] of the samples, None for the ends of the steps."""
-        with self._lock:
-            self._motion.run()
-            states = self._motion.states
+        t = self._times if times is None else times / NANOSECONDS
         if times is None and self._ending is None:
-            return Trajectory._shared(self._shared, np.concatenate([self._start, states]))
-        t = self._motion.grid if times is None else times / NANOSECONDS
-        if self._ending is not None:
-            t = np.append(t[t < self._end], self._end)
-        shared = self._shared | {"t": t, "torque": self._motion.torque(t)}
-        return Trajectory._shared(shared, self._motion.at(t))
+            y = np.concatenate([self._start, self._motion.run()])
+        else:
+            if self._ending is not None:
+                t = np.append(t[t < self._end], self._end)
+            y = self._motion.at(t)
+        torque = y[:, 7:10] if self._lag else self._motion.torque(t)
+        return Trajectory(self._scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
 
 
 def _traced(scene: Scene, law: Any, period: int | None) -> SineTorque | tuple[float, float, float]:

@@ -1,193 +1,279 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions by the steps of `Simulation`: any torque, control periods, limits, stiff scenes."""
+"""Motions by steps with error control: any torque, control periods, limits, stiff scenes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from sst_ros.errors import Diverged, RunStopped
-from sst_ros.host.output import slices
-from sst_ros.integration.applied_torque import StateFeedback
-from sst_ros.integration.methods import RK4, RODAS4
+from sst_ros.host.output import Bar
+from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.coarse_solution import Point
+from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
+from sst_ros.integration.halved_steps import HalvedSteps
+from sst_ros.integration.methods import DORMAND_PRINCE
+from sst_ros.integration.propagator import LimitReached, Passage, Propagator
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, begin, unresolved
 from sst_ros.simulation.torque import TorqueTable
-from sst_ros.simulation.torque_profile import FeedbackFunction, SineProfile, TorqueProfile, three
+from sst_ros.simulation.torque_profile import (
+    ConstantTorque,
+    FeedbackFunction,
+    SineProfile,
+    TorqueProfile,
+    three,
+)
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 SAMPLES = 200
 """Intervals of a motion without `t_eval`."""
 
+MOST_PERIODS = WHOLE_MOTION_BUDGET // (7 * len(DORMAND_PRINCE.a))
+"""Control periods that the budget of a motion reaches: a step and its check take 7 thirds."""
 
-_ATTEMPTS, _FINEST = 3, 1e-14
+UNMET = 2
+"""Status of a motion that reached its end with an error estimate above the tolerance."""
+
+_ATTEMPTS, _FINEST = 4, 1e-14
 """Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
 
 
-def stepped(
-    scene: Scene,
-    law: TorqueProfile | FeedbackFunction,
-    method: str,
-    tolerance: float,
-    span: int,
-    period: int | None,
-    reason: str,
-    times: np.ndarray | None,
-    progress: bool,
-) -> Trajectory:
+@dataclass(frozen=True)
+class Task:
+    """What is simulated.
+
+    Attributes:
+        scene: what moves.
+        torque: what acts.
+        span: length of the motion [ns].
+        period: control period [ns]; None where torques are not held.
+        method: name of the method, or auto.
+        tolerance: largest error estimate at the end [rad].
+        breaks: further times at which the torques jump [s], ascending.
+        max_step: longest step [s].
+
+    """
+
+    scene: Scene
+    torque: TorqueProfile | FeedbackFunction
+    span: int
+    period: int | None
+    method: str
+    tolerance: float
+    breaks: Array
+    max_step: float
+
+
+def integrate(task: Task, reason: str, times: np.ndarray | None, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
 
     A function whose torques are held is called once a period and may have a memory: one run.
 
-    Arguments are those of `Simulation`, of `SteppedMotion` and of its `run`; `reason`, why this
-    method was chosen ("" where the caller chose it), ends the method of the trajectory.
+    Args:
+        task: what is simulated.
+        reason: why this method was chosen, "" where the caller chose it.
+        times: of the samples [ns]; None for the control periods, or even ones.
+        progress: draw a bar on a terminal.
+
     """
-    local, once, spent = tolerance, period is not None or method == RK4.name, 0
-    for attempt in range(1, _ATTEMPTS + 1):
-        simulation = Simulation(scene, method, tolerance=local, step_budget=WHOLE_MOTION_BUDGET)
-        motion = SteppedMotion(simulation, law, span, period).run(times, progress)
+    local = tolerance = task.tolerance
+    spent = 0
+    for _ in range(_ATTEMPTS):
+        motion = SteppedMotion(task, local, times, progress).run()
         motion.method += reason
         motion.evaluations = spent = spent + motion.evaluations
         excess = motion.error_estimate / tolerance
-        if once or attempt == _ATTEMPTS or motion.status < 0 or not excess > 1.0:
+        if task.period is not None or motion.status < 0 or not excess > 1.0:
             break
         local = max(local / (5.0 * excess), _FINEST)
+    if excess > 1.0:
+        unmet = f"the error estimate {motion.error_estimate:.1e} rad exceeds the tolerance"
+        motion.message = f"{motion.message}; {unmet} {tolerance:g} rad"
+        motion.status = motion.status or UNMET
     return motion
 
 
 class SteppedMotion:
-    """A motion by the steps of `Simulation`.
+    """One run of a motion.
 
     Args:
-        simulation: of what moves, at its start.
-        law: torques that act.
-        span: length of the motion [ns].
-        period: control period [ns]; None where torques are not held.
+        task: what is simulated.
+        tolerance: largest local error of a step.
+        times: of the samples [ns], None for the control periods, or even ones.
+        progress: draw a bar on a terminal.
 
     """
 
     def __init__(
-        self,
-        simulation: Simulation,
-        law: TorqueProfile | FeedbackFunction,
-        span: int,
-        period: int | None,
+        self, task: Task, tolerance: float, times: np.ndarray | None, progress: bool
     ) -> None:
-        self._simulation, self._law, self._span, self._period = simulation, law, span, period
-        self._scene, self._method = simulation.scene, simulation.method
-        if not isinstance(law, TorqueProfile):
-            self._feedback = StateFeedback(_checked(law), self._simulation.dynamics)
-        self._samples: list[State] = []
-        self._held: list[tuple[int, Vector3]] = []
+        self._task, self._scene = task, task.scene
+        self._end = task.span / NANOSECONDS
+        self._budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
+        self._propagator = Propagator(
+            task.scene,
+            task.method,
+            tolerance,
+            compiled=False,
+            budget=self._budget,
+            max_step=task.max_step,
+            observe=self._pass,
+        )
+        self._method = self._propagator.method
+        self._start = self._at = begin(task.scene, self._propagator)
+        self._check = HalvedSteps(self._at, self._budget)
+        self._bar = Bar(f"{self._scene.name}, simulating", progress)
+        self._held: list[tuple[float, Vector3]] = []
+        self._samples: list[tuple[float, Point, Vector3]] = []
+        self._wanted: list[float] = (self._times(times) / NANOSECONDS)[::-1].tolist()
+        self._torque: Torque = (0.0, 0.0, 0.0)
+        self._time = self._period_end = 0.0
 
-    def run(self, times: np.ndarray | None, progress: bool) -> Trajectory:
-        """Go to the end or a limit; times [ns] of the samples, None for the ends of all steps."""
-        simulation, status, message = self._simulation, 0, "reached the end"
-        ends = self._ends(times)
-        wanted = None if times is None else times.tolist()[::-1]
-        if wanted is None or wanted[-1] == 0:
-            self._samples.append(simulation.state)
-            if wanted:
-                wanted.pop()
+    def run(self) -> Trajectory:
+        """Go to the end or a limit."""
+        status, message, stop = 0, "reached the end", None
+        time = 0.0
+        moment = (0.0, 0.0, 0.0) if self._propagator.dynamics.has_moment_topic else ()
+        if self._wanted[-1] == 0.0:
+            self._take(self._wanted.pop(), self._at)
         try:
-            for part in slices(len(ends), 0, f"{self._scene.name}, simulating", progress):
-                for end in ends[part]:
-                    self._step(int(end), wanted)
-        except RunStopped as stopped:
-            status, message = (-1 if isinstance(stopped, Diverged) else 1), str(stopped)
-            self._approach(math.floor(stopped.time * NANOSECONDS), wanted)
+            for time, h, end in self._periods():
+                self._torque = self._propagator.torque.acting(self._asked(time, end))
+                self._period_end = end
+                self._propagator.advance(self._at, time, h, 1, self._torque, moment)
+        except LimitReached as reached:
+            status, time, stop = 1, reached.time, reached.limit.reason
+            self._sample(math.floor(time * NANOSECONDS) / NANOSECONDS)
+        except (CannotStep, ArithmeticError, ValueError) as error:
+            status, time = -1, self._time
+            stop = unresolved(error, Geometry.of(self._scene), self._state(time, self._at))
+        if stop is not None:
+            message = f"stopped at t = {time:.12f} s: {stop}"
+        if status < 0:
+            self._take(self._time, self._at)
         return self._trajectory(status, message)
 
-    def _ends(self, times: np.ndarray | None) -> np.ndarray:
-        """Return the ends of the steps [ns]: control periods, breaks of the torque, samples."""
-        if self._period is not None:
-            ends = np.arange(self._period, self._span, self._period, dtype=np.int64)
-            return np.append(ends, self._span)
-        if times is None:
-            times = np.rint(np.linspace(0, self._span, SAMPLES + 1)).astype(np.int64)
-        breaks = self._law.breaks() if isinstance(self._law, TorqueProfile) else np.empty(0)
-        found = np.union1d(times, np.rint(breaks * NANOSECONDS).astype(np.int64))
-        return np.union1d(found[(found > 0) & (found < self._span)], self._span)
+    def _times(self, times: np.ndarray | None) -> Array:
+        """Return the times of the samples [ns]."""
+        span, period = self._task.span, self._task.period
+        if times is not None:
+            return np.asarray(times)
+        if period is not None:
+            return np.append(np.arange(0, span, period, dtype=np.int64), span)
+        return np.unique(np.rint(np.linspace(0, span, SAMPLES + 1)).astype(np.int64))
 
-    def _step(self, end: int, wanted: list[int] | None) -> None:
-        simulation = self._simulation
-        begin = simulation.time_ns
-        simulation.step(self._torque(begin, end), end - begin)
-        if wanted is None:
-            self._samples.append(simulation.state)
+    def _periods(self) -> Iterator[tuple[float, float, float]]:
+        """Yield begin, length and end of periods [s]: none has a jump of the torque inside."""
+        span, period = self._task.span, self._task.period
+        if period is not None:
+            for start in range(0, span, period):
+                end = min(start + period, span)
+                yield start / NANOSECONDS, (end - start) / NANOSECONDS, end / NANOSECONDS
             return
-        while wanted and wanted[-1] <= end:
-            self._samples.append(simulation.within(wanted.pop()))
+        breaks = self._task.breaks
+        if isinstance(self._task.torque, TorqueProfile):
+            actuators = self._scene.actuators
+            limit = actuators.torque_limit if actuators else None
+            torque = self._task.torque
+            breaks = np.concatenate([breaks, torque.breaks(), torque.crossings(limit, self._end)])
+        inside = breaks[(breaks > 0.0) & (breaks < self._end)]
+        for first, last in pairwise([0.0, *np.unique(inside).tolist(), self._end]):
+            yield first, last - first, last
 
-    def _approach(self, end: int, wanted: list[int] | None) -> None:
-        """Add the last valid state before a limit, whose time is known to the nanosecond."""
-        simulation = self._simulation
-        begin = simulation.time_ns
-        if end <= begin:
-            return
-        try:
-            torque = self._held[-1][1] if self._held else self._torque(begin, end)
-            simulation.step(torque, end - begin)
-        except RunStopped:
-            return
-        while wanted and wanted[-1] < end:
-            self._samples.append(simulation.within(wanted.pop()))
-        self._samples.append(simulation.state)
+    def _asked(self, time: float, end: float) -> Torque:
+        """Return the torques that are asked for from `time` to `end` [s]."""
+        torque = self._task.torque
+        if self._task.period is not None:
+            if isinstance(torque, TorqueProfile):
+                held = torque(time)
+            else:
+                held = _checked(torque)(time, self._state(time, self._at))
+            self._held.append((time, held))
+            return held
+        if not isinstance(torque, TorqueProfile):
+            return StateFeedback(_checked(torque), self._propagator.dynamics)
+        piece = torque.between(time, end)
+        if isinstance(piece, SineProfile):
+            return piece.sine
+        return piece.torque if isinstance(piece, ConstantTorque) else piece
 
-    def _torque(self, begin: int, end: int) -> Any:
-        """Torques of the step from begin to end [ns]: numbers, or a function of time."""
-        law, start = self._law, begin / NANOSECONDS
-        if self._period is None:
-            if not isinstance(law, TorqueProfile):
-                return self._feedback
-            if isinstance(law, SineProfile) and self._method == RODAS4.name:
-                return law.sine  # traced, which is slower here: the method needs its derivative
-            piece = law.between(start, end / NANOSECONDS)
-            return getattr(piece, "torque", piece)
-        state = self._simulation.state
-        torque = law(start) if isinstance(law, TorqueProfile) else _checked(law)(start, state)
-        self._held.append((begin, torque))
-        return torque
+    def _pass(self, step: Passage) -> None:
+        """Go with the second solution through a step of the run, and take samples in it."""
+        self._check.add(step)
+        end = self._period_end if step.last else step.time + step.h
+        self._last = step
+        while self._wanted and self._wanted[-1] < end:
+            self._sample(self._wanted.pop())
+        if self._wanted and self._wanted[-1] == end:
+            self._take(self._wanted.pop(), step.end)
+        self._time, self._at = end, step.end
+        self._bar.draw(end / self._end)
+
+    def _sample(self, time: float) -> None:
+        """Take a sample inside the last step, by a pair of shorter ones."""
+        step, x = self._last, time - self._last.time
+        if x > 0.0:
+            y = step.method.step_fixed(step.t, 0.5 * x, 2, step.begin.y, step.drive)
+            self._take(time, self._propagator.begin(y))
+
+    def _take(self, time: float, at: Point) -> None:
+        if not self._samples or self._samples[-1][0] < time:
+            self._samples.append((time, at, self._acting(time, at)))
+
+    def _acting(self, time: float, at: Point) -> Vector3:
+        """Torques that the actuators give, until this time."""
+        if len(self._propagator.dynamics.state) > 7:  # they lag
+            return at.y[7], at.y[8], at.y[9]
+        return self._propagator.torque.at(self._torque, time, at.y)
+
+    def _state(self, time: float, at: Point) -> State:
+        return State.of(round(time * NANOSECONDS), at.y, at.joints, self._acting(time, at))
 
     def _trajectory(self, status: int, message: str) -> Trajectory:
-        simulation, samples = self._simulation, self._samples
-        law: Any = self._law
+        propagator, at = self._propagator, self._at
+        dynamics = propagator.dynamics
+        torque: Any = self._task.torque
         if self._held:
             times, torques = zip(*self._held, strict=True)
-            law = TorqueTable(np.array(times) / NANOSECONDS, torques)
-        changes = [f"{to} from {at:g} s ({why})" for at, to, why in simulation.changes]
-        torque = np.array([state.torque for state in samples]).reshape(-1, 3)
-        if self._period is None and len(samples) and samples[0].time_ns == 0:
-            torque[0] = self._first(law)
+            torque = TorqueTable(times, torques)
+        acting = np.array([acting for _, _, acting in self._samples]).reshape(-1, 3)
+        if self._task.period is None and self._samples and self._samples[0][0] == 0.0:
+            acting[0] = self._first(torque)
+        states = np.array([point.y[:7] for _, point, _ in self._samples]).reshape(-1, 7)
+        stored = dynamics.total_energy(at.y) - dynamics.total_energy(self._start.y)
+        changes = [f"{to} from {at:g} s ({why})" for at, to, why in propagator.changes]
         return Trajectory(
             self._scene,
-            np.array([state.time_ns for state in samples]) / NANOSECONDS,
-            np.array([state.quaternion for state in samples]).reshape(-1, 4),
-            np.array([state.body_rate for state in samples]).reshape(-1, 3),
-            torque,
-            joints=np.array([sum(state.joints, ()) for state in samples]).reshape(-1, 18),
+            np.array([time for time, _, _ in self._samples]),
+            states[:, :4],
+            states[:, 4:],
+            acting,
+            joints=np.array([point.joints for _, point, _ in self._samples]).reshape(-1, 18),
             status=status,
             message=message,
             method=", then ".join([self._method, *changes]),
-            error_estimate=simulation.error_estimate,
-            energy_residual=simulation.energy_residual,
-            evaluations=simulation.evaluations,
-            step=simulation.time_ns / NANOSECONDS / max(simulation.accepted_steps, 1),
-            law=law,
+            error_estimate=self._check.errors(at.y)[0],
+            energy_residual=stored - at.y[-1],
+            evaluations=self._budget.spent,
+            step=self._time / max(self._check.steps, 1),
+            law=torque,
         )
 
-    def _first(self, law: Any) -> Any:
+    def _first(self, torque: Any) -> Vector3:
         """Torques that act at t = 0; a state before the first step does not know them."""
-        scene, lag = self._scene.actuators, 0.0
-        if scene is not None and scene.time_constant is not None:
-            return (lag,) * 3
-        known = isinstance(law, TorqueProfile)
-        torque = law(0.0) if known else law(0.0, self._samples[0])
-        return clamp(torque, scene.torque_limit if scene else None)
+        actuators = self._scene.actuators
+        if actuators is not None and actuators.time_constant is not None:
+            return (0.0, 0.0, 0.0)
+        known = isinstance(torque, TorqueProfile)
+        found = torque(0.0) if known else torque(0.0, self._state(0.0, self._start))
+        return clamp(found, actuators.torque_limit if actuators else None)
 
 
 def _checked(function: FeedbackFunction) -> Callable[[float, State], Vector3]:

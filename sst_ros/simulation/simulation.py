@@ -121,7 +121,7 @@ class Simulation:
             derivative=derivative,
         )
         self._warned = not self.compiled
-        self._start = self._initial()
+        self._start = begin(scene, self._propagator)
         self._now = self._before = _Instant(0, self._start)
         self.reset()
 
@@ -157,7 +157,7 @@ class Simulation:
             as `step`: the state is then that after the last step before, at `time_ns`.
 
         """
-        refuse_bad_step(torque, dt_ns, moment)
+        dt_ns, count = refuse_bad_step(torque, dt_ns, count, moment)
         torque = self.acting(torque)
         if callable(torque) and not self._warned:
             self._warned = True
@@ -193,9 +193,9 @@ class Simulation:
                 assert reached.limit.error is not None
                 raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
             except (CannotStep, ArithmeticError, ValueError) as error:
-                numbers = ", ".join(f"{name} = {x:.3g}" for name, x in self.conditioning.items())
                 kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
-                raise kind(f"{error or 'not finite'} ({numbers})", start, self.state) from None
+                reason = unresolved(error, self.geometry, self.state)
+                raise kind(reason, start, self.state) from None
             self._before = at
             self._now = _Instant(at.time_ns + done * dt_ns, point, torque, held)
             count -= done
@@ -306,10 +306,7 @@ class Simulation:
     @property
     def conditioning(self) -> dict[str, float]:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
-        r = kinematics.carriage_directions(self.geometry, self.state.joints.gamma)
-        rotation = rotation_matrix(self.state.quaternion)
-        _, _, determinant, _ = kinematics.describe_assemblies(self.geometry, r, rotation)
-        return {"sin_mu": float(np.sin(self.state.joints.mu).min()), "det_j2": float(determinant)}
+        return conditioning(self.geometry, self.state)
 
     def _as_state(self, at: _Instant) -> State:
         return State.of(at.time_ns, at.point.y, at.point.joints, self._torque(at))
@@ -322,12 +319,32 @@ class Simulation:
             return at.torque
         return self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
 
-    def _initial(self) -> Point:
-        gamma = np.array(self.scene.initial.gamma)
-        outside = np.any((gamma < 0) | (gamma > self.geometry.arc))
-        if self.scene.stroke.at_end == "stop" and outside:
-            ends = ", ".join(f"{arc:.6f}" for arc in self.geometry.arc)
-            allowed = f"must lie in the stroke, 0 to ({ends}) rad"
-            problem = Problem("initial.gamma", self.scene.initial.gamma, allowed)
-            raise InputError(self.scene.name, [problem])
-        return self._propagator.begin(list(initial_state(self.scene, self.geometry)))
+
+def begin(scene: Scene, propagator: Propagator) -> Point:
+    """Return the initial state of a scene, for its propagator.
+
+    Raises:
+        AssemblyError, SingularConfiguration, InputError: as `Simulation`.
+
+    """
+    gamma, geometry = np.array(scene.initial.gamma), Geometry.of(scene)
+    outside = np.any((gamma < 0) | (gamma > geometry.arc))
+    if scene.stroke.at_end == "stop" and outside:
+        ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
+        allowed = f"must lie in the stroke, 0 to ({ends}) rad"
+        raise InputError(scene.name, [Problem("initial.gamma", scene.initial.gamma, allowed)])
+    return propagator.begin(list(initial_state(scene, geometry)))
+
+
+def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
+    """Return the least sin(mu_k), zero at a serial singularity, and det J2, at a parallel one."""
+    r = kinematics.carriage_directions(geometry, state.joints.gamma)
+    rotation = rotation_matrix(state.quaternion)
+    _, _, determinant, _ = kinematics.describe_assemblies(geometry, r, rotation)
+    return {"sin_mu": float(np.sin(state.joints.mu).min()), "det_j2": float(determinant)}
+
+
+def unresolved(error: Exception, geometry: Geometry, state: State) -> str:
+    """Say why no step goes on from a state, and how near it is to a singularity."""
+    numbers = ", ".join(f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items())
+    return f"{error or 'not finite'} ({numbers})"

@@ -19,6 +19,7 @@ from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     FeedbackFunction,
     FunctionTorque,
+    LostTorque,
     PolynomialTorque,
     SineProfile,
     TorqueProfile,
@@ -104,6 +105,8 @@ def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
     if record is None:
         return None
     more = {name: value for name, value in record.items() if name != "kind"}
+    if record["kind"] == "function":
+        return LostTorque()
     if record["kind"] == "constant":
         return ConstantTorque(three(more["torque"], "torque"))
     if record["kind"] == "sine":

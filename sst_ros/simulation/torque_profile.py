@@ -19,6 +19,10 @@ TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
 
 
+_MOST_CROSSINGS = 1e5
+"""Radians of a sine beyond which its clamping is not computed in advance."""
+
+
 class TorqueProfile:
     """Base of the torques that are known as a function of time alone."""
 
@@ -30,13 +34,17 @@ class TorqueProfile:
         """Return the times [s] at which the torques or their derivatives jump, ascending."""
         return np.empty(0)
 
+    def crossings(self, limit: float | None, end: float) -> Array:
+        """Return the times from 0 to `end` [s] at which a torque passes the limit [N m], if any."""
+        return np.empty(0)
+
     def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
         """Torques [N m] on [begin, end], between which no break lies; ends belong to it."""
         return self
 
-    def record(self) -> dict[str, Any] | None:
-        """Numbers from which `profile_from` builds the same profile; None for a function."""
-        return None
+    def record(self) -> dict[str, Any]:
+        """Numbers from which `profile_from` builds the same profile."""
+        return {"kind": "function"}
 
     def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -72,6 +80,23 @@ class SineProfile(TorqueProfile):
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return self.sine.values(t)
+
+    def crossings(self, limit: float | None, end: float) -> Array:
+        """See `TorqueProfile`."""
+        found = [np.empty(0)]
+        rows = zip(self.sine.amplitude, self.sine.frequency, self.sine.phase, strict=True)
+        for amplitude, frequency, phase in rows:
+            if limit is None or abs(amplitude) <= limit or not frequency:
+                continue
+            if abs(frequency) * end > _MOST_CROSSINGS:
+                continue  # the step control has to find them
+            angle = np.arcsin(limit / amplitude)
+            first, last = sorted((phase, phase + frequency * end))
+            turns = np.pi * np.arange(np.floor(first / np.pi) - 1, np.ceil(last / np.pi) + 2)
+            for shift in (angle, -angle):
+                found.append((turns + shift - phase) / frequency)
+        times = np.unique(np.concatenate(found))
+        return np.asarray(times[(times > 0.0) & (times < end)])
 
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
@@ -118,6 +143,18 @@ class PolynomialTorque(TorqueProfile):
         """See `TorqueProfile`."""
         return self.x
 
+    def crossings(self, limit: float | None, end: float) -> Array:
+        """See `TorqueProfile`."""
+        found = []
+        for piece in range(0 if limit is None else self.c.shape[1]):
+            length = self.x[piece + 1] - self.x[piece]
+            for coefficients in self.c[:, piece].T:
+                for bound in (limit, -limit) if limit is not None else ():
+                    roots = np.roots([*coefficients[:-1], coefficients[-1] - bound])
+                    real = roots.real[abs(roots.imag) <= 1e-9 * length]
+                    found.append(self.x[piece] + real[(real > 0.0) & (real < length)])
+        return np.unique(np.concatenate(found)) if found else np.empty(0)
+
     def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
@@ -152,6 +189,14 @@ class FunctionTorque(TorqueProfile):
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
+
+
+class LostTorque(TorqueProfile):
+    """Torques of a function that a file does not have: known at the samples alone."""
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`; they are nowhere known."""
+        return np.full((len(t), 3), np.nan)
 
 
 def three(value: Any, name: str) -> Vector3:

@@ -13,6 +13,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.simulation import trajectory_file
 from sst_ros.simulation.interpolation import integrated
 from sst_ros.simulation.sampled_motion import Array, Law, SampledMotion
+from sst_ros.simulation.torque_profile import LostTorque
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,15 +25,14 @@ __all__ = ["JOINTS", "Array", "Law", "Trajectory"]
 JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 
 _OF_THE_RUN = (
-    "scene", "status", "message", "method", "error_estimate", "_residual", "evaluations", "step",
-    "law", "dense",
+    "status", "message", "method", "error_estimate", "evaluations", "step", "law", "dense",
 )  # fmt: skip
 _FEW = 300
 """Samples below which a picture asks for more."""
 
 
 class Trajectory(SampledMotion):
-    """A motion over n instants. Arrays are shared between calls: treat them as read-only.
+    """A motion over n instants. Arrays are its own, and read-only.
 
     Args:
         scene: what moves.
@@ -42,8 +42,8 @@ class Trajectory(SampledMotion):
         torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`.
         joints: angles and rates of the joints where they are known already, shape (n, 18): gamma,
             mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
-        status: 0 where the motion reached its end, 1 where a limit ended it, -1 where no step
-            resolved it.
+        status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it reached its
+            end with an error estimate above the tolerance, -1 where no step resolved it.
         message: the same in words.
         method: the integrator, and why it was chosen.
         error_estimate: estimated error of the orientation at the end [rad], nan if unknown.
@@ -61,7 +61,7 @@ class Trajectory(SampledMotion):
     """
 
     def at(self, t: ArrayLike) -> Trajectory:
-        """Sample the motion at other times, to the accuracy of the run.
+        """Sample the motion at other times, ascending, to the accuracy of the run.
 
         Each state is integrated from the sample before it, under the torques that act there.
 
@@ -69,7 +69,8 @@ class Trajectory(SampledMotion):
             t: one time or times [s], shape (m,), within the trajectory.
 
         Raises:
-            InputError: a time lies outside.
+            InputError: a time lies outside; or between samples that were loaded from a file, of a
+                run under a function.
 
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
@@ -77,8 +78,15 @@ class Trajectory(SampledMotion):
         if times.ndim != 1 or not np.all(inside):
             allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
             raise InputError("at", [Problem("t", t, allowed)])
+        if isinstance(self.law, LostTorque) and not np.all(np.isin(times, self.t)):
+            allowed = "must be times of samples: the function of the torques is not in the file"
+            raise InputError("at", [Problem("t", t, allowed)])
+        y = integrated(self, times)
         kept = {name: getattr(self, name) for name in _OF_THE_RUN}
-        return self._shared(kept | {"t": times}, integrated(self, times))
+        residual = lambda: self.energy_residual  # noqa: E731 computed if it is asked for
+        return Trajectory(
+            self.scene, times, y[:, :4], y[:, 4:7], y[:, 7:], energy_residual=residual, **kept
+        )
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with a row an instant and a column a number, units in its `attrs`."""
@@ -124,6 +132,6 @@ class Trajectory(SampledMotion):
 
     def _dense_enough(self) -> Trajectory:
         """Return a trajectory with samples enough for a picture."""
-        if not 2 <= len(self.t) < _FEW:
+        if not 2 <= len(self.t) < _FEW or isinstance(self.law, LostTorque):
             return self
         return self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))

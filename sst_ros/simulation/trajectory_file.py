@@ -15,7 +15,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import MissingDependency, require
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.sampled_motion import SampledMotion, T
+from sst_ros.simulation.sampled_motion import Law, SampledMotion, T
 from sst_ros.simulation.torque import profile_from
 from sst_ros.simulation.torque_profile import TorqueProfile
 
@@ -75,11 +75,10 @@ def save(trajectory: SampledMotion, path: Path, *, overwrite: bool) -> None:
 
     if path.exists() and not overwrite:
         raise InputError("save", [Problem("path", str(path), "exists; overwrite=True replaces it")])
-    law = trajectory.law
     metadata = {name: getattr(trajectory, name) for name in _FIGURES} | {
         "format": _FORMAT,
         "scene": dump(trajectory.scene),
-        "torque": law.record() if isinstance(law, TorqueProfile) else None,
+        "torque": _torque_record(trajectory.law),
     }
     fields = [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in UNITS.items()]
     schema = pa.schema(fields, metadata={_KEY: json.dumps(metadata).encode()})
@@ -92,6 +91,12 @@ def save(trajectory: SampledMotion, path: Path, *, overwrite: bool) -> None:
         unfinished.unlink(missing_ok=True)
         allowed = f"must be writable ({error})"
         raise InputError("save", [Problem("path", str(path), allowed)]) from None
+
+
+def _torque_record(law: Law | None) -> dict[str, Any] | None:
+    if law is None:
+        return None
+    return law.record() if isinstance(law, TorqueProfile) else {"kind": "function"}
 
 
 def load(cls: type[T], path: Path) -> T:

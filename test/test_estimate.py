@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error estimate of simulate() where a motion is not smooth, against far finer solutions."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sst_ros import TorqueTable, load_scene, simulate
+from sst_ros.scene.loads import SineTorque
+from sst_ros.simulation.torque_profile import PolynomialTorque
+
+EXAMPLE2 = load_scene("example2_heavy")
+SINE = SineTorque(amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0.1, 0.7, 2.0))
+STEPPED = ("rk4", "dopri5", "dop853", "rodas4")
+
+
+def angle(one, other):
+    near = min(math.dist(one, other), math.dist(one, -np.asarray(other)))
+    return 2.0 * near
+
+
+def check(truth, **arguments):
+    """The run meets its tolerance, and its estimate holds, is not far too large, and says so."""
+    found = simulate(**arguments)
+    error = angle(found.quaternion[-1], truth.quaternion[-1])
+    assert found.success, found.message
+    assert error <= arguments["tolerance"]
+    assert found.error_estimate <= arguments["tolerance"]
+    assert error <= 3.0 * found.error_estimate + truth.error_estimate
+    return found, error
+
+
+def jumping(t):
+    return (0.3, -0.2, 0.1) if t < 0.3217 else (-0.3, 0.4, 0.2)
+
+
+def square(t):
+    sign = 1.0 if (1000.0 * t) % 1.0 < 0.5 else -1.0
+    return sign, -0.5 * sign, 0.7 * sign
+
+
+@pytest.mark.parametrize("method", STEPPED)
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-9])
+def test_a_sine_that_the_actuators_clamp(method, tolerance):
+    scene = EXAMPLE2.with_values({"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"})
+    arguments = {"scene": scene, "torque": SINE, "duration": 0.4, "t_eval": [0.4]}
+    truth = simulate(method="dop853", tolerance=1e-12, **arguments)
+    check(truth, method=method, tolerance=tolerance, **arguments)
+
+
+def test_a_polynomial_that_the_actuators_clamp():
+    scene = EXAMPLE2.with_values({"actuators.torque_limit": 0.5})
+    torque = PolynomialTorque([[[30.0, 9.0, -20.0]], [[-4.0, 2.0, 3.0]]], [0.0, 0.2])
+    arguments = {"scene": scene, "torque": torque, "duration": 0.2, "t_eval": [0.2]}
+    truth = simulate(method="dop853", tolerance=1e-13, **arguments)
+    found, _ = check(truth, method="dop853", tolerance=1e-8, **arguments)
+    assert found.evaluations < 3000
+
+
+@pytest.mark.parametrize("method", STEPPED)
+def test_a_jump_that_is_not_declared(method):
+    table = TorqueTable([0.0, 0.3217], [jumping(0.0), jumping(1.0)])
+    arguments = {"scene": EXAMPLE2, "duration": 0.6, "t_eval": [0.6]}
+    truth = simulate(torque=table, method="dop853", tolerance=1e-13, **arguments)
+    check(truth, torque=jumping, method=method, tolerance=1e-8, **arguments)
+
+
+@pytest.mark.parametrize("declared", [False, True])
+def test_a_square_wave(declared):
+    duration, halves = 0.05, np.arange(100) / 2000
+    table = TorqueTable(halves, [square(t + 1e-4) for t in halves])
+    arguments = {"scene": EXAMPLE2, "duration": duration, "t_eval": [duration]}
+    truth = simulate(torque=table, method="dop853", tolerance=1e-13, **arguments)
+    breaks = halves if declared else ()
+    _, error = check(
+        truth, torque=square, breaks=breaks, method="dop853", tolerance=1e-7, **arguments
+    )
+    assert error < 1e-12
+
+
+def test_sharp_friction():
+    arguments = {"scene": "friction", "t_eval": [0.5], "duration": 0.5}
+    truth = simulate(method="dop853", tolerance=1e-12, **arguments)
+    check(truth, method="dop853", tolerance=1e-4, **arguments)
+    check(truth, method="auto", tolerance=1e-6, **arguments)
+
+
+def test_breakpoints_of_a_table_are_not_rounded_to_nanoseconds():
+    """A torque of 1 N m that acts for 1e-10 s longer turns the star by 1e-10 of a radian."""
+    times = np.array([0.0, 0.1 + 3.3e-10, 0.2 + 4.4e-10])
+    torques = [[5.0, 0.0, 0.0], [-5.0, 4.0, 0.0], [0.0, -4.0, 5.0]]
+    arguments = {"scene": EXAMPLE2, "duration": 0.4, "t_eval": [0.4], "tolerance": 1e-12}
+    found = simulate(torque=TorqueTable(times, torques), method="dop853", **arguments)
+
+    def same(t):
+        return torques[int(np.searchsorted(times, t, side="right")) - 1]
+
+    other = simulate(torque=same, breaks=times[1:], method="dopri5", **arguments)
+    rounded = simulate(torque=TorqueTable(times.round(9), torques), method="dop853", **arguments)
+    assert angle(found.quaternion[-1], other.quaternion[-1]) < 1e-12
+    assert angle(found.quaternion[-1], rounded.quaternion[-1]) > 1e-10
+
+
+def test_a_tolerance_that_is_not_met_is_said():
+    found = simulate(EXAMPLE2, jumping, 0.1, control_period=0.01, tolerance=1e-15)
+    assert (found.status, found.success) == (2, False)
+    assert "exceeds the tolerance 1e-15 rad" in found.message
+
+
+@pytest.mark.parametrize("method", STEPPED)
+def test_samples_do_not_change_the_motion(method):
+    ends = [
+        simulate(EXAMPLE2, jumping, 0.4, method=method, t_eval=times, tolerance=1e-7)
+        for times in (None, [0.4], np.linspace(0.0, 0.4, 9), [1e-9, 0.1234, 0.4])
+    ]
+    for one in ends:
+        assert one.quaternion[-1].tobytes() == ends[0].quaternion[-1].tobytes()
+        assert one.error_estimate == ends[0].error_estimate
+    few, finer = ends[3], simulate(EXAMPLE2, jumping, 0.4, t_eval=ends[3].t, tolerance=1e-11)
+    assert max(map(angle, few.quaternion, finer.quaternion)) < 1e-7
+
+
+def test_nine_samples_cost_little_more_than_none():
+    counts = [
+        simulate("example2_heavy", method="dop853", t_eval=times, tolerance=1e-8).evaluations
+        for times in ([1.0], np.linspace(0.0, 1.0, 9))
+    ]
+    assert counts[1] <= counts[0]
+
+
+def test_the_longest_step_is_obeyed():
+    seen = []
+
+    def torque(t):
+        seen.append(t)
+        return (0.0, 0.0, 0.0)
+
+    simulate(EXAMPLE2, torque, 1.0, max_step=0.01, tolerance=1e-3, method="dopri5", t_eval=[1.0])
+    assert np.diff(np.unique(seen)).max() <= 0.01
+
+
+def test_trial_states_that_are_not_finite_are_not_shown_to_a_feedback():
+    def feedback(t, state):
+        assert np.all(np.isfinite([*state.quaternion, *state.body_rate]))
+        return [-1e4 * rate for rate in state.joints.gamma_dot]
+
+    found = simulate("example1", feedback, 0.2, tolerance=1e-6, t_eval=[0.2])
+    assert found.success, found.message
+
+
+def damped(t, state):
+    return [-2e3 * rate for rate in state.joints.gamma_dot]
+
+
+def test_auto_is_implicit_under_a_stiff_feedback():
+    scene = load_scene("example1")
+    found = simulate(scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5])
+    assert "rodas4" in found.method
+    explicit = simulate(scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5], method="dopri5")
+    assert found.evaluations < 0.5 * explicit.evaluations
+    assert angle(found.quaternion[-1], explicit.quaternion[-1]) < 2e-6
+
+
+@pytest.mark.parametrize("torque", [jumping, lambda t, state: jumping(t)], ids=["f(t)", "f(t, x)"])
+def test_rodas4_is_what_runs_when_it_is_asked_for(torque):
+    found = simulate(EXAMPLE2, torque, 0.1, method="rodas4", tolerance=1e-6, t_eval=[0.1])
+    other = simulate(EXAMPLE2, torque, 0.1, method="dopri5", tolerance=1e-6, t_eval=[0.1])
+    assert found.method == "rodas4"
+    assert found.evaluations != other.evaluations
+
+
+def test_a_control_period_that_takes_for_ever_is_refused_at_once():
+    from sst_ros import InputError
+
+    with pytest.raises(InputError, match=r"control_period = 1e-09: must be at least .* s for this"):
+        simulate(EXAMPLE2, jumping, 1.0, control_period=1e-9)
