@@ -7,13 +7,13 @@ import numpy as np
 
 from benchmark.peers.study import Run, Series, Setting, make_ladder
 from benchmark.peers.task import DURATION, Moving, Pose, Task
-from sst_ros import Trajectory, simulate
+from sst_ros import prepare
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, Tableau
 
 ENGINE, PACKAGE = "sst_ros", "numba"
-PUBLIC = "simulate()"
+PUBLIC = "prepare().run()"
 """Name of the series of the public call, from which all ratios to other engines are."""
 
 # Ladders end where rounding begins: below 2e-14 rad the doubles of the reference are seen.
@@ -38,29 +38,27 @@ def series(task: Task, quick: bool) -> list[Series]:
 
 
 def _public(task: Task) -> Series:
-    """The call of a user, arguments checked and a `Trajectory` returned, from the second call on.
+    """What a user calls again and again, with a `Trajectory` returned.
 
-    The first call prepares the motion, as other engines have their data laid out before.
+    The motion is prepared before, as other engines have their data laid out.
     """
 
     def acceleration(at: Moving) -> np.ndarray:
         return task.kernel_answer(at.y, at.torque)
 
     def setting(tolerance: float) -> Setting:
-        def prepare() -> Run:
-            def whole() -> Trajectory:
-                return simulate(task.scene, duration=DURATION, method="gauss", tolerance=tolerance)
+        def setup() -> Run:
+            run = prepare(task.scene, duration=DURATION, method="gauss", tolerance=tolerance).run
 
             def poses(pieces: int) -> list[Pose]:
-                motion = whole()
+                motion = run()
                 return [task.pose_of([*motion.quaternion[-1], *motion.body_rate[-1]])]
 
-            whole()
-            return Run(whole, poses)
+            run()
+            return Run(run, poses)
 
-        return Setting(f"tolerance {tolerance:.1e} rad", 0, prepare, samples=False)
+        return Setting(f"tolerance {tolerance:.1e} rad", 0, setup, samples=False)
 
-    # At most the number of motions that `simulate` remembers.
     settings = [setting(10.0**-power) for power in np.arange(3.0, 13.1, 0.5)]
     name = f"{PUBLIC}, Gauss collocation of order 16, numba"
     return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)

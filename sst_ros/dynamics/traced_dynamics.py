@@ -250,9 +250,9 @@ def ode_with_work(dynamics: Dynamics) -> ODE:
 
 
 @lru_cache(maxsize=32)
-def ode_under(dynamics: Dynamics, torque: SineTorque) -> ODE:
+def ode_under(dynamics: Dynamics, torque: SineTorque, limit: float | None) -> ODE:
     """Give the system under a sine whose phases are its drive, which counts work."""
-    return ODE(dynamics, torque, work=True, phases=True)
+    return ODE(dynamics, torque, limit=limit, work=True, phases=True)
 
 
 def compile_program(program: Program) -> Function:

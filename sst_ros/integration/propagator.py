@@ -250,7 +250,7 @@ class Propagator:
                     find_jump=self.torque.jump,
                 )  # fmt: skip
             else:
-                new = self._new_stepper(ode_under(self.dynamics, sine))
+                new = self._new_stepper(ode_under(self.dynamics, sine, self.torque.limit_of(sine)))
             self._others[sine] = new
         return self._others[sine]
 

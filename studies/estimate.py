@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration of the error estimate of `simulate`: estimate over true error in random scenes.
+
+`python -m studies.estimate --count 200 --seed 1` runs that many random scenes of each class, each
+by a random method and tolerance, and compares the end with two solutions by other methods whose
+tolerance is a thousandth. Where these two do not agree to a tenth of the error, or the error is
+within rounding, the run is not resolved, and only counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sst_ros import SineTorque, load_scene, simulate
+from sst_ros.errors import AssemblyError, SstError
+from sst_ros.host.output import Bar
+from sst_ros.mechanism.frames import angle_between
+from sst_ros.plot.style import free_figure
+from sst_ros.report.results import markdown, provenance, table, write
+from sst_ros.scene.scene import Scene
+from studies import DOCS, parser, run
+
+METHODS = ("dopri5", "dop853", "rk4", "rodas4", "auto")
+TIGHTER = 1e-3
+FINEST, ROUNDING = 1e-13, 2e-14
+"""Least tolerance of a reference, and error below which rounding decides [rad]."""
+QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 0.99, 1.0)
+
+
+class Case(NamedTuple):
+    """A motion to be simulated."""
+
+    scene: Scene
+    torque: Any
+    period: float | None
+    duration: float
+
+
+def _torques(rng: np.random.Generator, size: float) -> SineTorque:
+    rows = (rng.uniform(-size, size, 3), rng.uniform(2.0, 20.0, 3), rng.uniform(0.0, 6.28, 3))
+    amplitude, frequency, phase = (tuple(row.tolist()) for row in rows)
+    return SineTorque(amplitude=amplitude, frequency=frequency, phase=phase)
+
+
+def _log(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(10.0 ** rng.uniform(math.log10(low), math.log10(high)))
+
+
+def _scene(rng: np.random.Generator, **values: Any) -> Scene:
+    """Return a random scene without limits, and with the values given."""
+    name = rng.choice(["example2_heavy", "general", "gravity_payload"])
+    gamma = tuple(rng.uniform(0.65, 0.95, 3).tolist())
+    rates = tuple(rng.uniform(-1.0, 1.0, 3).tolist())
+    free = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
+    start = {"initial.gamma": gamma, "initial.gamma_dot": rates, "initial.orientation": None}
+    return load_scene(str(name)).with_values({**free, **start, **values})
+
+
+def smooth(rng: np.random.Generator) -> Case:
+    """Draw sines on a scene without kinks."""
+    return Case(_scene(rng), _torques(rng, 2.0), None, 0.4)
+
+
+def sharp_friction(rng: np.random.Generator) -> Case:
+    """Draw Coulomb friction that changes sign within a thousandth of the usual rates."""
+    joint = {"coulomb": _log(rng, 0.01, 0.3), "smoothing": _log(rng, 1e-3, 1e-1)}
+    return Case(_scene(rng, friction={"gamma": joint}), _torques(rng, 2.0), None, 0.3)
+
+
+def elastic_stops(rng: np.random.Generator) -> Case:
+    """Draw contact at stops that give way."""
+    stroke = {"at_end": "elastic", "stiffness": _log(rng, 1e2, 1e5)}
+    stroke["restitution"], stroke["impact_rate"] = float(rng.uniform(0.3, 0.95)), 1.0
+    gamma = [*rng.uniform(0.7, 0.85, 2).tolist(), float(rng.uniform(0.15, 0.25))]
+    start = {"initial.gamma": tuple(gamma), "initial.gamma_dot": (0.0, 0.0, -2.0)}
+    return Case(_scene(rng, stroke=stroke, **start), (0.0, 0.0, -0.5), None, 0.3)
+
+
+def torque_clamp(rng: np.random.Generator) -> Case:
+    """Draw a sine that the limit of the actuators cuts."""
+    limit = {"actuators": {"torque_limit": float(rng.uniform(0.2, 1.5))}}
+    return Case(_scene(rng, **limit), _torques(rng, 2.0), None, 0.4)
+
+
+def jump(rng: np.random.Generator) -> Case:
+    """Draw a function of time that jumps, which nobody says beforehand."""
+    at, before, after = rng.uniform(0.1, 0.3), rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3)
+    first, second = tuple(before.tolist()), tuple(after.tolist())
+    return Case(_scene(rng), lambda t: first if t < at else second, None, 0.4)
+
+
+def held(rng: np.random.Generator) -> Case:
+    """Draw a controller whose torques are held."""
+    gain = float(rng.uniform(1.0, 10.0))
+    return Case(_scene(rng), partial(_feedback, gain), float(rng.choice([1e-3, 5e-3])), 0.2)
+
+
+def feedback(rng: np.random.Generator) -> Case:
+    """Draw a function of the state inside of the differential equation."""
+    return Case(_scene(rng), partial(_feedback, _log(rng, 1.0, 100.0)), None, 0.3)
+
+
+def _feedback(gain: float, t: float, state: Any) -> list[float]:
+    rows = zip(state.joints.gamma, state.joints.gamma_dot, strict=True)
+    return [-gain * (angle - 0.8) - 0.2 * gain * rate for angle, rate in rows]
+
+
+def lag(rng: np.random.Generator) -> Case:
+    """Draw actuators with a time constant."""
+    constant = {"actuators": {"time_constant": _log(rng, 1e-4, 1e-1)}}
+    return Case(_scene(rng, **constant), _torques(rng, 2.0), None, 0.3)
+
+
+def rotor(rng: np.random.Generator) -> Case:
+    """Draw rotors behind gears, and stiff springs."""
+    joint = f"{rng.choice(['gamma', 'mu', 'beta'])}_{rng.integers(1, 4)}"
+    spring = {"joint": joint, "stiffness": _log(rng, 10.0, 1e4), "rest": 0.8}
+    gears = {"rotor_inertia": _log(rng, 1e-5, 1e-3), "gear_ratio": 10.0}
+    return Case(_scene(rng, springs=[spring], actuators=gears), _torques(rng, 1.0), None, 0.2)
+
+
+CLASSES: dict[str, Callable[[np.random.Generator], Case]] = {
+    function.__name__: function
+    for function in (
+        smooth, sharp_friction, elastic_stops, torque_clamp, jump, held, feedback, lag, rotor,
+    )
+}  # fmt: skip
+
+
+def measure(job: tuple[str, int, int]) -> dict[str, Any]:
+    """Run one case; the row has its estimate and, where it can be resolved, its true error."""
+    name, seed, number = job
+    rng = np.random.default_rng([seed, number, *name.encode()])
+    method, tolerance = str(rng.choice(METHODS)), _log(rng, 1e-11, 1e-4)
+    row = {"class": name, "seed": seed, "number": number, "method": method, "tolerance": tolerance}
+    try:
+        case = CLASSES[name](rng)
+        solve = partial(
+            simulate, case.scene, case.torque, case.duration,
+            control_period=case.period, t_eval=[case.duration],
+        )  # fmt: skip
+        found = solve(method=method, tolerance=tolerance)
+        tighter = max(TIGHTER * tolerance, FINEST)
+        one, other = (solve(method=m, tolerance=tighter) for m in ("dop853", "dopri5"))
+    except AssemblyError:
+        return row | {"state": "no assembly"}
+    except SstError as error:
+        return row | {"state": f"error: {error}"}
+    row |= {"status": found.status, "estimate": found.error_estimate}
+    if {found.status, one.status, other.status} - {0, 2}:
+        return row | {"state": "stopped"}
+    error, apart = (
+        float(angle_between(a.quaternion[-1], b.quaternion[-1]))
+        for a, b in ((found, one), (one, other))
+    )
+    row |= {"error": error, "agreement": apart, "evaluations": found.evaluations}
+    resolved = apart <= 0.1 * error and error > ROUNDING
+    return row | {"state": "resolved" if resolved else "not resolved"}
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """Return the table of the page: quantiles of estimate over true error, by class."""
+    found = []
+    for name in (*CLASSES, "all"):
+        mine = [row for row in rows if name in (row["class"], "all")]
+        resolved = [row for row in mine if row["state"] == "resolved"]
+        ratios = np.array([row["estimate"] / row["error"] for row in resolved])
+        beyond = sum(row["status"] == 0 and row["error"] > 3 * row["tolerance"] for row in resolved)
+        cells = {"class": name, "runs": str(len(mine)), "resolved": str(len(resolved))}
+        values = np.quantile(ratios, QUANTILES) if len(ratios) else [math.nan] * len(QUANTILES)
+        heads = ("least", *(f"{100 * q:g} %" for q in QUANTILES[1:-1]), "largest")
+        cells |= {head: f"{value:.2g}" for head, value in zip(heads, values, strict=True)}
+        low = [str(int(np.sum(ratios < bound))) for bound in (1 / 3, 1 / 10)]
+        cells |= {"below 1/3": low[0], "below 1/10": low[1], "beyond 3 tolerances": str(beyond)}
+        found.append(cells)
+    return found
+
+
+def report(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
+    """Write docs/estimate.md, its table and its picture."""
+    frame = table(rows)
+    summary = markdown(table(summarise(rows)))
+    figure = free_figure(8.0, 4.5)
+    axes = figure.subplots()
+    for name in CLASSES:
+        mine = [r["estimate"] / r["error"] for r in rows
+                if r["class"] == name and r["state"] == "resolved"]  # fmt: skip
+        axes.plot(np.sort(mine), np.linspace(0.0, 1.0, len(mine)), label=name.replace("_", " "))
+    axes.axvspan(1.0 / 3.0, 30.0, color="0.93")
+    axes.set(xscale="log", xlabel="estimate over true error", ylabel="share of the runs")
+    axes.legend(fontsize=8)
+    page = PAGE.format(
+        count=options.count,
+        seed=options.seed,
+        methods=", ".join(METHODS),
+        table=summary,
+        provenance=provenance(),
+    )
+    write(options.out, "estimate", csv=frame, document={}, page=page, figures={"estimate": figure})
+
+
+PAGE = """# How far the error estimate can be trusted
+
+`Trajectory.error_estimate` is twice the distance to a second solution by steps of half the
+length ([explicit methods](methods/runge_kutta.md)). This page compares it with the true error of
+the orientation at the end: random scenes of nine classes, each by a random method ({methods}) and
+a random tolerance from 1e-4 to 1e-11 rad. The truth is a solution by DOP853 at a thousandth of the
+tolerance; a run counts as resolved where a solution by Dormand-Prince 5 agrees with it to a tenth
+of the error. `python -m studies.estimate --count {count} --seed {seed}` writes this page.
+
+![Estimate over true error](estimate.png)
+
+{table}
+
+An estimate over the error below 1 is too small. "Beyond 3 tolerances" counts runs with status 0
+whose true error is more than three times the tolerance that was asked for.
+
+{provenance}
+"""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Calibrate from the command line."""
+    arguments = parser("estimate", "Estimate over true error in random scenes.", DOCS)
+    arguments.add_argument("--count", type=int, default=200, help="scenes of each class")
+    arguments.add_argument("--seed", type=int, default=1, help="of the random numbers")
+
+    def study(options: argparse.Namespace) -> bool:
+        jobs = [(name, options.seed, k) for k in range(options.count) for name in CLASSES]
+        bar, rows = Bar("estimate", True), []
+        with ProcessPoolExecutor() as pool:
+            for row in pool.map(measure, jobs):
+                rows.append(row)
+                bar.draw(len(rows) / len(jobs))
+        report(rows, options)
+        return True
+
+    return run(study, arguments, words)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
