@@ -151,8 +151,8 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
         one, other = (solve(method=m, tolerance=tighter) for m in ("dop853", "dopri5"))
     except AssemblyError:
         return row | {"state": "no assembly"}
-    except SstError as error:
-        return row | {"state": f"error: {error}"}
+    except SstError as refused:
+        return row | {"state": f"error: {refused}"}
     row |= {"status": found.status, "estimate": found.error_estimate}
     if {found.status, one.status, other.status} - {0, 2}:
         return row | {"state": "stopped"}

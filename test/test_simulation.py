@@ -13,7 +13,7 @@ import yaml
 from models import seeded_samples
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.kernel import kinetic
+from sst_ros.dynamics.kernel import kinetic_energy
 from sst_ros.errors import (
     AmbiguousAssembly,
     Diverged,
@@ -37,7 +37,7 @@ IGNORE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ign
 
 def energy(simulation):
     model, state = kernel.model_of(simulation.scene), simulation.state
-    return kinetic(model, (*state.quaternion, *state.body_rate))
+    return kinetic_energy(model, (*state.quaternion, *state.body_rate))
 
 
 def started(sample, gamma_dot):
