@@ -292,7 +292,7 @@ def fill_readme(text: str, results: dict[str, Any]) -> str:
     lines.append("| --- | ---: | ---: |")
     for engine, name in README_ROWS.items():
         cells = " | ".join(cell(best.get((engine, target))) for target in (1e-6, 1e-9))
-        lines.append(f"| {name.format('a call of `simulate`')} | {cells} |")
+        lines.append(f"| {name.format('a run of `prepare`')} | {cells} |")
     return fill(text, {"speed": "\n".join(lines)})
 
 
