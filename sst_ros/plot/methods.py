@@ -108,14 +108,17 @@ def draw_summary(rows: DataFrame, footnote: str) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("wall time of the integration per time of the motion [%]")
-    axes.set_title("Fastest setting for an error of the orientation")
+    figure.suptitle(
+        "Fastest setting for an error of the orientation", fontsize=11, x=0.02, ha="left"
+    )
     handles = [Line2D([], [], color=colour, marker=marker, linestyle="none", label=name,
                       markerfacecolor="none") for name, (colour, marker) in MARKERS.items()
                if name in set(rows.method)]  # fmt: skip
     handles += [Line2D([], [], color=INK, marker="o", linestyle="none", markerfacecolor="none",
                        markersize=5.5 + 3.0 * k, label=f"{target:.0e} rad")
                 for k, target in enumerate(targets)]  # fmt: skip
-    axes.legend(handles=handles, fontsize=8, loc="lower right", framealpha=0.9)
+    axes.legend(handles=handles, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0),
+                ncol=5, frameon=False, borderaxespad=0.1)  # fmt: skip
     note(figure, footnote, 150)
     return figure
 

@@ -128,8 +128,8 @@ class WorkPrecision:
 
         So it is with scenes that a controller drives along a reference motion.
         """
-        errors = self.rows[ERROR].astype(float)
-        return bool((errors < ROUNDING).all())
+        states = self.reference.states[:, :7]
+        return bool(np.abs(states - states[0]).max() < ROUNDING)
 
     def best(self, target: float) -> Series[Any] | None:
         """Return the fastest setting with an orientation error of at most `target` [rad].
