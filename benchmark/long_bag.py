@@ -26,7 +26,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmark.measure import describe_machine, join_line
+from benchmark.measure import describe_machine, join_line, write_json
 from sst_ros.host.output import slices
 from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
@@ -128,15 +128,9 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
         angles = by_columns(motion.dynamics.joints_program, state)
         effort = np.zeros((len(state), 9))
         effort[:, :3] = held * (number > 0)[:, None]
-        yield (
-            rows,
-            {
-                "joints": np.hstack([angles, effort]),
-                "quaternion": state[:, :4],
-                "euler": zyz_angles(rotation_matrix(state[:, :4])),
-                "torque": np.tile(held, TICKS_A_SAMPLE),
-            },
-        )
+        numbers = {"joints": np.hstack([angles, effort]), "quaternion": state[:, :4]}
+        numbers["euler"] = zyz_angles(rotation_matrix(state[:, :4]))
+        yield rows, numbers | {"torque": np.tile(held, TICKS_A_SAMPLE)}
 
 
 def _patched(raw: bytes, stamps: Any, numbers: Array) -> np.ndarray:
@@ -238,9 +232,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
     host = describe_machine("numpy", "numba", "rosbags", "matplotlib")
     print(join_line(host))
-    if options.json:
-        text = json.dumps({"found": found, "machine": host}, indent=2)
-        options.json.write_text(text + "\n", encoding="utf-8")
+    write_json(options.json, {"found": found, "machine": host})
     return 0
 
 

@@ -60,8 +60,8 @@ def _orders() -> None:
     def show(name: str, order: int, n: int, errors: list[float]) -> None:
         found = math.log(errors[0] / errors[1]) / math.log(2.0)
         met = "met" if abs(found - order) <= WITHIN else "MISSED"
-        print(f"{name:8}{n:6} steps {errors[0]:9.1e} {errors[1]:9.1e}  order {found:.3f} of {order}"
-              f", target +-{WITHIN}: {met}")  # fmt: skip
+        sizes = f"{n:6} steps {errors[0]:9.1e} {errors[1]:9.1e}"
+        print(f"{name:8}{sizes}  order {found:.3f} of {order}, target +-{WITHIN}: {met}")
 
     for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4):
         runner, n = CompiledMethod(system, method, compiled=False), STEPS[method.name]

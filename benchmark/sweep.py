@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.measure import describe_machine, join_line
+from benchmark.measure import describe_machine, join_line, write_json
 from sst_ros import load_scene, simulate, sweep
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_chunk, run_local
@@ -79,8 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
         if name != "machine":
             print(f"{name:>44}: {value:.6g}")
     print(join_line(found["machine"]))
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, found)
     return 0
 
 
@@ -163,7 +162,7 @@ def _mujoco(ours_us: float) -> dict[str, float]:
     """
     from mujoco import rollout
 
-    from benchmark.peers.mujoco_model import Model
+    from benchmark.peers.mujoco_peer import Model
     from benchmark.peers.task import Task
 
     task, threads, copies = Task(), len(os.sched_getaffinity(0)), 8
@@ -275,12 +274,11 @@ def _workers(folder: Path, count: int) -> Any:
     try:
         for name, *more in words:
             command = [sys.executable, "-m", f"distributed.cli.{name}", *more]
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            folder_of_code = Path(__file__).parents[1]
             processes.append(
-                subprocess.Popen(
-                    command, env=environment, stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL, cwd=Path(__file__).parents[1],
-                )
-            )  # fmt: skip
+                subprocess.Popen(command, env=environment, cwd=folder_of_code, **quiet)
+            )
             end = time.monotonic() + 60.0
             while not (file.exists() and file.stat().st_size):
                 if time.monotonic() > end:

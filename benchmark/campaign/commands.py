@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from benchmark.campaign.ledger import Budget, Ledger
 from benchmark.nodes import own_domain
@@ -61,47 +62,50 @@ def sst_ros(
     return done
 
 
-VERBS = ("compile", "demo", "describe", "export", "plan", "plot", "report", "recover", "scene",
-         "study", "view", "simulator", "torque_player", "inverse_dynamics", "recorder", "viewer",
-         "simulate", "workspace")  # fmt: skip
+VERBS = "compile demo describe export plan plot report recover scene study view".split()  # noqa: SIM905
 
-WRONG = (
-    ["nosuchverb"],
-    ["simulatr"],
-    ["--nosuchoption"],
-    ["scene", "show"],
-    ["scene", "show", "nosuchscene"],
-    ["scene", "show", "/"],
-    ["scene", "show", "/dev/null"],
-    ["scene", "check", "/proc/self/mem"],
+WRONG = [
+    line.split()
+    for line in """
+nosuchverb
+simulatr
+--nosuchoption
+scene show
+scene show nosuchscene
+scene show /
+scene show /dev/null
+scene check /proc/self/mem
+compile example2 --integrator nope
+demo --out /etc/passwd
+demo --scene reach
+plan check reach --csv /proc/x
+plan check reach --csv /tmp
+report run /nonexistent
+report run /etc
+report accuracy --scene nosuchscene
+export /nonexistent
+plot /nonexistent
+recover /nonexistent
+view /nonexistent --port -1
+view --scene swing --port 99999
+describe nosuchscene
+simulator --scene nosuchscene
+simulator --bogus
+simulator --ros-args -p nonexist:=1
+simulator --ros-args -p rate:=0
+simulator --ros-args -p rate:=nan
+simulator --ros-args -p real_time_factor:=5e-324
+simulator --ros-args --params-file /etc/passwd
+recorder --ros-args -p output:=/proc/bag
+torque_player --ros-args -p scene:=nosuchscene
+inverse_dynamics --ros-args -p mode:=nosuchmode
+""".splitlines()[1:]
+]
+WRONG += [
     ["scene", "check", "\udcff"],
-    ["compile", "example2", "--integrator", "nope"],
-    ["demo", "--out", "/etc/passwd"],
-    ["demo", "--scene", "reach"],
-    ["plan", "check", "reach", "--csv", "/proc/x"],
-    ["plan", "check", "reach", "--csv", "/tmp"],
-    ["report", "run", "/nonexistent"],
-    ["report", "run", "/etc"],
-    ["report", "accuracy", "--scene", "nosuchscene"],
-    ["export", "/nonexistent"],
-    ["plot", "/nonexistent"],
-    ["recover", "/nonexistent"],
-    ["view", "/nonexistent", "--port", "-1"],
-    ["view", "--scene", "swing", "--port", "99999"],
-    ["describe", "nosuchscene"],
-    ["simulator", "--scene", "nosuchscene"],
-    ["simulator", "--bogus"],
-    ["simulator", "--ros-args", "-p", "nonexist:=1"],
-    ["simulator", "--ros-args", "-p", "rate:=0"],
-    ["simulator", "--ros-args", "-p", "rate:=nan"],
-    ["simulator", "--ros-args", "-p", "real_time_factor:=5e-324"],
     ["simulator", "--ros-args", "-r", "__node:=not a name"],
-    ["simulator", "--ros-args", "--params-file", "/etc/passwd"],
     ["recorder", "--ros-args", "-p", "topics:=['a b']"],
-    ["recorder", "--ros-args", "-p", "output:=/proc/bag"],
-    ["torque_player", "--ros-args", "-p", "scene:=nosuchscene"],
-    ["inverse_dynamics", "--ros-args", "-p", "mode:=nosuchmode"],
-)
+]
 
 
 def command_lines(budget: Budget, seed: int) -> Ledger:
@@ -119,7 +123,7 @@ def command_lines(budget: Budget, seed: int) -> Ledger:
         words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]
         words_of += ["--out", "--force", "--scene", "\x1b[31m", "a" * 300, "../..", "~", "'"]
         for _ in range(len(count) - ledger.tried):
-            verb = rng.choice(VERBS[:11])
+            verb = rng.choice(VERBS)
             words = [verb, "--nosuchoption", *rng.choices(words_of, k=rng.randint(0, 3))]
             sst_ros(ledger, words, folder=folder, fails=True)
     return ledger
@@ -134,46 +138,33 @@ def surroundings(budget: Budget, seed: int) -> Ledger:
         folder.chmod(0o777)
         readonly = folder / "readonly"
         readonly.mkdir(mode=0o555)
-        cases: dict[str, tuple[list[str], dict[str, str], int | None]] = {
-            "no HOME": (["scene", "list"], {"HOME": ""}, None),
-            "HOME that is not there": (
-                ["scene", "show", "example2"],
-                {"HOME": "/nonexistent"},
-                None,
-            ),
-            "read-only HOME": (["compile", "example2"], {"HOME": str(readonly)}, nobody),
-            "TMPDIR that is not there": (["scene", "list"], {"TMPDIR": "/nonexistent"}, None),
-            "plain ASCII": (["scene", "show", "example2"], {"LANG": "C", "LC_ALL": "C"}, None),
-            "ASCII output": (["scene", "list"], {"PYTHONIOENCODING": "ascii"}, None),
-            "cache in a full disk": (
-                ["compile", "example2"],
-                {"XDG_CACHE_HOME": "/dev/full"},
-                None,
-            ),
-            "cache that is a file": (
-                ["compile", "example2"],
-                {"XDG_CACHE_HOME": "/etc/passwd"},
-                None,
-            ),
-            "another user": (["scene", "list"], {"HOME": str(folder)}, nobody),
-            "no columns": (["scene", "list"], {"COLUMNS": "0", "TERM": "dumb"}, None),
+        show, compiled, full = "scene show example2", "compile example2", "XDG_CACHE_HOME"
+        cases: dict[str, tuple[str, dict[str, str], int | None]] = {
+            "no HOME": ("scene list", {"HOME": ""}, None),
+            "HOME that is not there": (show, {"HOME": "/nonexistent"}, None),
+            "read-only HOME": (compiled, {"HOME": str(readonly)}, nobody),
+            "TMPDIR that is not there": ("scene list", {"TMPDIR": "/nonexistent"}, None),
+            "plain ASCII": (show, {"LANG": "C", "LC_ALL": "C"}, None),
+            "ASCII output": ("scene list", {"PYTHONIOENCODING": "ascii"}, None),
+            "cache in a full disk": (compiled, {full: "/dev/full"}, None),
+            "cache that is a file": (compiled, {full: "/etc/passwd"}, None),
+            "another user": ("scene list", {"HOME": str(folder)}, nobody),
+            "no columns": ("scene list", {"COLUMNS": "0", "TERM": "dumb"}, None),
         }
         labels = [*cases]
         random.Random(seed).shuffle(labels)
         for label in labels[: len(budget.cases(len(cases), least=4))]:
             words, env, user = cases[label]
             before = len(ledger.notes)
-            sst_ros(ledger, words, folder=folder, env=env, user=user, bound=60.0)
+            sst_ros(ledger, words.split(), folder=folder, env=env, user=user, bound=60.0)
             ledger.notes[before:] = [f"{label}: {note}" for note in ledger.notes[before:]]
         for verb in (["scene", "list"], ["scene", "keys"], ["--help"]):
             ledger.tried += 1
-            with Path("/dev/full").open("w") as full:
-                done = subprocess.run(
-                    [sys.executable, "-m", "sst_ros", *verb], stdout=full, stderr=subprocess.PIPE,
-                    text=True, timeout=COMMAND_BOUND_S, cwd=folder,
-                )  # fmt: skip
+            with Path("/dev/full").open("w") as disk:
+                command = [sys.executable, "-m", "sst_ros", *verb]
+                pipes: dict[str, Any] = {"stdout": disk, "stderr": subprocess.PIPE, "text": True}
+                done = subprocess.run(command, cwd=folder, timeout=COMMAND_BOUND_S, **pipes)
             if "Traceback" in done.stderr:
-                ledger.found(
-                    "tracebacks", f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
-                )
+                note = f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
+                ledger.found("tracebacks", note)
     return ledger

@@ -53,8 +53,9 @@ class Ledger:
         return not any(getattr(self, kind) for kind in KINDS)
 
     @contextlib.contextmanager
-    def case(self, name: str, allowed: tuple[type[BaseException], ...], bound: float = HANG_S
-             ) -> Iterator[None]:  # fmt: skip
+    def case(
+        self, name: str, allowed: tuple[type[BaseException], ...], bound: float = HANG_S
+    ) -> Iterator[None]:
         """Try one case in this process: errors of `allowed` are answers, others are findings.
 
         Its time is that of the processor: other work on the machine does not count.

@@ -132,8 +132,9 @@ def services(budget: Budget, seed: int) -> Ledger:
 
         def work(index: int) -> None:
             rng, caller = random.Random(seed + index), Client(number)
-            kinds = [(SetBool, "pause", {"data": True}), (SetBool, "pause", {"data": False}),
-                     (Trigger, "step", {}), (Trigger, "reset", {})]  # fmt: skip
+            kinds: list[tuple[Any, str, dict[str, bool]]]
+            kinds = [(SetBool, "pause", {"data": data}) for data in (True, False)]
+            kinds += [(Trigger, "step", {}), (Trigger, "reset", {})]
             clients: dict[str, Any] = {}
             for kind, name, _ in kinds:
                 service = f"{NODE}/{name}"
@@ -203,10 +204,8 @@ def node_kills(budget: Budget, seed: int) -> Ledger:
         with running(wait_for_command=True) as (process, client), TemporaryDirectory() as folder:
             table = Path(folder) / "torques.csv"
             table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
-            kind, given = (
-                ("torque_player", {"csv": table}), ("inverse_dynamics", {"scene": "reach"})
-            )[number % 2]  # fmt: skip
-            other = start(kind, **given)
+            kind = ("torque_player", "inverse_dynamics")[number % 2]
+            other = start(kind, **({"scene": "reach"} if number % 2 else {"csv": table}))
             client.until(lambda: client.node.count_subscribers("/joint_states"))
             # The wait is the experiment: the moment of the kill is random.
             time.sleep(rng.uniform(0.0, 1.5))
@@ -287,8 +286,8 @@ def starts(budget: Budget, seed: int) -> Ledger:
         ledger.tried += 1
         with own_domain(compiled=False):
             kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[number % 4]
-            process = start(kind, **({"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
-                                     if kind == "recorder" else {}))  # fmt: skip
+            bag = {"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
+            process = start(kind, **(bag if kind == "recorder" else {}))
             # The wait is the experiment: the moment of the signal is random.
             time.sleep(rng.uniform(0.0, 2.0))
             number_sent = rng.choice((signal.SIGINT, signal.SIGTERM))

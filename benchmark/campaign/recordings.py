@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,10 +34,8 @@ def _recorded(seconds: float) -> Iterator[Path]:
         bag = Path(name) / "bag"
         recorder = start("recorder", output=bag)
         heard = ["joint_states", "~/orientation", "~/applied_torques", "~/scene"]
-        simulator = start(
-            "simulator", scene="swing", duration=seconds, wait_for_subscribers=heard,
-            subscriber_timeout=30.0,
-        )  # fmt: skip
+        given: dict[str, Any] = {"wait_for_subscribers": heard, "subscriber_timeout": 30.0}
+        simulator = start("simulator", scene="swing", duration=seconds, **given)
         try:
             simulator.wait(timeout=60)
             recorder.end(signal.SIGINT, 20.0)

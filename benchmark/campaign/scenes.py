@@ -102,40 +102,26 @@ def _read(ledger: Ledger, name: str, source: str) -> None:
 def _extremes() -> dict[str, Changes]:
     """Changes of scene `swing` that make it as stiff, light or sharp as possible."""
     star = ("star", "inertia")
-    sharp: dict[str, Changes] = {
-        f"Coulomb {c:g} N m, smoothing {s:g} rad/s": {
-            ("friction",): {"gamma": {"coulomb": c, "smoothing": s}}
-        }
-        for c in (0.1, 5.0, 1e9)
-        for s in (1e-2, 1e-6, 1e-9, 1e-12)
-    }
-    needles: dict[str, Changes] = {
-        f"star diag(1, 1, {z:g})": {
-            star: {"xx": 1.0, "yy": 1.0, "zz": z},
-            ("actuated_links",): [{}],
-            ("intermediate_links",): [{}],
-        }
-        for z in (1e-3, 1e-6, 1e-9, 1e-12)
-    }
-    light: dict[str, Changes] = {
-        f"star diag({a:g}, {a:g}, {z:g})": {star: {"xx": a, "yy": a, "zz": z}}
-        for a, z in ((1e-6, 1e-12), (1e-12, 1e-12), (1e6, 1e6), (1e-6, 1e-6))
-    }
-    stiff: dict[str, Changes] = {
-        f"viscous {v:g} N m s/rad": {("friction",): {"beta": {"viscous": v}}}
-        for v in (1e2, 1e5, 1e9)
-    }
-    springs: dict[str, Changes] = {
-        f"spring {k:g} N m/rad": {("springs",): [{"joint": "gamma_1", "stiffness": k, "rest": 0.8}]}
-        for k in (1e3, 1e6, 1e9)
-    }
-    fast: dict[str, Changes] = {
-        f"gamma_dot {w:g} rad/s": {("initial", "gamma_dot"): [w, -w, w]} for w in (1e2, 1e5, 1e8)
-    }
-    lag: dict[str, Changes] = {
-        f"actuator lag {t:g} s": {("actuators",): {"time_constant": t}} for t in (1e-2, 1e-6, 1e-9)
-    }
-    return {**sharp, **needles, **light, **stiff, **springs, **fast, **lag}
+    alone: Changes = {("actuated_links",): [{}], ("intermediate_links",): [{}]}
+    found: dict[str, Changes] = {}
+    for c in (0.1, 5.0, 1e9):
+        for s in (1e-2, 1e-6, 1e-9, 1e-12):
+            sharp = {"gamma": {"coulomb": c, "smoothing": s}}
+            found[f"Coulomb {c:g} N m, smoothing {s:g} rad/s"] = {("friction",): sharp}
+    for z in (1e-3, 1e-6, 1e-9, 1e-12):
+        found[f"star diag(1, 1, {z:g})"] = {star: {"xx": 1.0, "yy": 1.0, "zz": z}, **alone}
+    for a, z in ((1e-6, 1e-12), (1e-12, 1e-12), (1e6, 1e6), (1e-6, 1e-6)):
+        found[f"star diag({a:g}, {a:g}, {z:g})"] = {star: {"xx": a, "yy": a, "zz": z}}
+    for v in (1e2, 1e5, 1e9):
+        found[f"viscous {v:g} N m s/rad"] = {("friction",): {"beta": {"viscous": v}}}
+    for k in (1e3, 1e6, 1e9):
+        spring = {"joint": "gamma_1", "stiffness": k, "rest": 0.8}
+        found[f"spring {k:g} N m/rad"] = {("springs",): [spring]}
+    for w in (1e2, 1e5, 1e8):
+        found[f"gamma_dot {w:g} rad/s"] = {("initial", "gamma_dot"): [w, -w, w]}
+    for lag in (1e-2, 1e-6, 1e-9):
+        found[f"actuator lag {lag:g} s"] = {("actuators",): {"time_constant": lag}}
+    return found
 
 
 def needle() -> str:
@@ -195,11 +181,8 @@ def random_scene(rng: random.Random) -> Scene:
         tree.pop(key, None)
     scale = 10 ** rng.uniform(-1, 1)
     x, y = (rng.uniform(0.5, 1.5) * scale for _ in range(2))
-    tree["star"]["inertia"] = {
-        "xx": x,
-        "yy": y,
-        "zz": rng.uniform(abs(x - y) + 0.01 * scale, x + y),
-    }
+    z = rng.uniform(abs(x - y) + 0.01 * scale, x + y)
+    tree["star"]["inertia"] = {"xx": x, "yy": y, "zz": z}
     if rng.random() < 0.5:
         tree["gravity"] = {"acceleration": [rng.uniform(-9.81, 9.81) for _ in range(3)]}
         tree["payload"] = {"mass": rng.uniform(0.1, 3), "centre": [0, 0, rng.uniform(0, 0.3)]}
@@ -234,9 +217,8 @@ def invariants(budget: Budget, seed: int) -> Ledger:
                 ledger.found("silent", f"{name}: energy residual {plain.energy_residual:.1e} J")
             error = float(angle_between(plain.state.quaternion, fine.state.quaternion))
             if error > 1e-12 and error > 30 * plain.error_estimate + 30 * fine.error_estimate:
-                ledger.found(
-                    "silent", f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
-                )
+                note = f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
+                ledger.found("silent", note)
     return ledger
 
 
@@ -246,10 +228,8 @@ def _energy(simulation: Simulation) -> float:
 
 def bits(budget: Budget, seed: int) -> Ledger:
     """Simulate random scenes interpreted and compiled: not one bit may differ."""
-    ledger, rng = (
-        budget.ledger("random scenes: compiled against interpreted"),
-        random.Random(seed + 1),
-    )
+    ledger = budget.ledger("random scenes: compiled against interpreted")
+    rng = random.Random(seed + 1)
     for number in budget.cases(200, least=1):
         name = f"scene {number} (seed {seed + 1})"
         # Compiling takes seconds, for `auto` that of three methods.

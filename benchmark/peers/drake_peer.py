@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.peers import tree
 from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
-from benchmark.peers.task import DURATION, Moving, Pose, Task
+from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
 
 ENGINE, PACKAGE = "Drake", "drake"
 GATE_STEP, SETTLED, TOLERANCE = 1e-6, 300, 1e-3
@@ -49,9 +48,9 @@ class _Model:
         self.plant = plant = builder.AddSystem(MultibodyPlant(1.0 / steps))
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
-        at_body = {tree.BASE: plant.world_body()}
+        at_body = {BASE: plant.world_body()}
         self.joints, drives = {}, []
-        for body in tree.bodies(task):
+        for body in list_bodies(task):
             unit = UnitInertia()
             about = body.about_o / body.mass
             unit.SetFromRotationalInertia(
@@ -64,7 +63,7 @@ class _Model:
             self.joints[body.joint] = joint = plant.AddJoint(hinge)
             if body.joint.startswith("g"):
                 drives.append(plant.AddJointActuator(body.joint, joint))
-        for name, point in tree.ties(task):
+        for name, point in list_ties(task):
             plant.AddBallConstraint(at_body["s"], point, at_body[name], point)
         plant.Finalize()
         amplitude, frequency, phase = (np.array(row) for row in zip(*task.sines(), strict=True))

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.peers import tree
 from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
-from benchmark.peers.task import DURATION, Moving, Pose, Task
+from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
 
 ENGINE, PACKAGE = "Exudyn", "exudyn"
 TOLERANCE = 1e-4
@@ -61,9 +60,9 @@ class _Model:
         from exudyn.rigidBodyUtilities import RotationMatrix2EulerParameters as parameters_of
 
         ground = self.mbs.AddObject(items.ObjectGround())
-        self.ground, self.bodies = ground, {tree.BASE: ground}
-        placed = {tree.BASE: (np.eye(3), np.zeros(3))}
-        for body in tree.bodies(self.task):
+        self.ground, self.bodies = ground, {BASE: ground}
+        placed = {BASE: (np.eye(3), np.zeros(3))}
+        for body in list_bodies(self.task):
             above, spin = placed[body.parent]
             angle = at.position[body.joint] if at else 0.0
             rate = at.velocity[body.joint] if at else 0.0
@@ -99,9 +98,9 @@ class _Model:
                 rotationMarker1=across,
             ))  # fmt: skip
 
-        for body in tree.bodies(self.task):
+        for body in list_bodies(self.task):
             tie(body.parent, body.name, body.axis, [1, 1, 1, 1, 1, 0], np.zeros(3))
-        for name, point in tree.ties(self.task):
+        for name, point in list_ties(self.task):
             tie("s", name, point, [1, 1, 0, 0, 0, 0], point)
 
     def _add_torques(self) -> None:

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.peers import tree
 from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
-from benchmark.peers.task import DURATION, Moving, Pose, Task
+from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
 from sst_ros.integration.methods import DOP853, RK4, Tableau
 
 ENGINE, PACKAGE = "Pinocchio", "pin"
@@ -48,15 +47,15 @@ class Model:
         model.gravity = pin.Motion.Zero()
         still = pin.SE3.Identity()
         self.joints: dict[str, int] = {}
-        at_body = {tree.BASE: 0}
-        for body in tree.bodies(task):
+        at_body = {BASE: 0}
+        for body in list_bodies(task):
             hinge = pin.JointModelRevoluteUnaligned(body.axis)
             index = model.addJoint(at_body[body.parent], hinge, still, body.joint)
             inertia = pin.Inertia(body.mass, body.centre, body.about_centre)
             model.appendBodyToJoint(index, inertia, still)
             at_body[body.name] = self.joints[body.joint] = index
         self.ties, self.tied = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
-        for name, point in tree.ties(task):
+        for name, point in list_ties(task):
             place = pin.SE3(np.eye(3), point)
             tie = pin.RigidConstraintModel(
                 pin.ContactType.CONTACT_3D, model, at_body["s"], place, at_body[name], place
