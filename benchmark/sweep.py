@@ -274,11 +274,9 @@ def _workers(folder: Path, count: int) -> Any:
     try:
         for name, *more in words:
             command = [sys.executable, "-m", f"distributed.cli.{name}", *more]
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            folder_of_code = Path(__file__).parents[1]
-            processes.append(
-                subprocess.Popen(command, env=environment, cwd=folder_of_code, **quiet)
-            )
+            null, code = subprocess.DEVNULL, Path(__file__).parents[1]
+            process = subprocess.Popen(command, env=environment, stdout=null, stderr=null, cwd=code)
+            processes.append(process)
             end = time.monotonic() + 60.0
             while not (file.exists() and file.stat().st_size):
                 if time.monotonic() > end:
