@@ -46,37 +46,37 @@ class Subcommand:
         self.needs, self.description = needs, description
 
 
-def arg(name: str, what: str | None = None, **options: Any) -> Argument:
+def _arg(name: str, what: str | None = None, **options: Any) -> Argument:
     """Describe an argument or an option."""
     return Argument(name, options | {"help": what})
 
 
-def flag(name: str, what: str) -> Argument:
+def _flag(name: str, what: str) -> Argument:
     """Describe an option without a value."""
-    return arg(name, what, action="store_true")
+    return _arg(name, what, action="store_true")
 
 
-def number(name: str, what: str, **options: Any) -> Argument:
+def _number(name: str, what: str, **options: Any) -> Argument:
     """Describe an option that is a number."""
-    return arg(name, what, type=float, **options)
+    return _arg(name, what, type=float, **options)
 
 
-def path(name: str, what: str | None = None, **options: Any) -> Argument:
+def _path(name: str, what: str | None = None, **options: Any) -> Argument:
     """Describe an argument or an option that is a path."""
-    return arg(name, what, type=Path, **options)
+    return _arg(name, what, type=Path, **options)
 
 
-def scene(
+def _scene(
     name: str, what: str = "name of a scene, or path of a .yaml file", **options: Any
 ) -> Argument:
     """Describe an argument that is a scene, which shells complete by argcomplete."""
     return Argument(name, options | {"help": what}, "scene.scene:names")
 
 
-def out(what: str, default: str) -> tuple[Argument, Argument]:
+def _out(what: str, default: str) -> tuple[Argument, Argument]:
     """Describe `--out` and `--force`, which `free_out` obeys."""
-    force = flag("--force", "overwrite earlier results in --out")
-    return path("--out", f"{what}; default: {default}"), force
+    force = _flag("--force", "overwrite earlier results in --out")
+    return _path("--out", f"{what}; default: {default}"), force
 
 
 def integer_from(least: int, most: int) -> Any:
@@ -95,20 +95,20 @@ def integer_from(least: int, most: int) -> Any:
     return convert
 
 
-SCENE = scene("scene", metavar="SCENE")
-BAG = path("bag", "folder of the bag", metavar="BAG")
+SCENE = _scene("scene", metavar="SCENE")
+BAG = _path("bag", "folder of the bag", metavar="BAG")
 COMMANDS: dict[str, Subcommand | str] = {
     "simulate": Subcommand(
         "simulate a scene under its own torques",
         "cli.runs:run_simulation",
         SCENE,
-        number("--duration", "length [s]; default: that of the scene"),
-        arg("--method", "integrator; default: auto", default="auto"),
-        number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
-        arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
-        path("--out", "trajectory, .parquet or .csv", metavar="FILE"),
-        flag("--plot", "draw it; beside FILE, or as SCENE.png"),
-        flag("--force", "overwrite earlier results"),
+        _number("--duration", "length [s]; default: that of the scene"),
+        _arg("--method", "integrator; default: auto", default="auto"),
+        _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
+        _arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
+        _path("--out", "trajectory, .parquet or .csv", metavar="FILE"),
+        _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
+        _flag("--force", "overwrite earlier results"),
         description="Simulate a scene under its own torques. Exit status 1 if the motion ended "
         "before the duration, at a limit of the scene for example.",
     ),
@@ -116,7 +116,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "map the workspace of a scene: reach, condition, singular poses",
         "cli.runs:map_workspace",
         SCENE,
-        *out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
+        *_out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
     ),
     "scene": "list, show and check scenes",
     "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
@@ -126,24 +126,24 @@ COMMANDS: dict[str, Subcommand | str] = {
     "scene check": Subcommand(
         "check scene files and report all faults",
         "cli.scenes:check_files",
-        path("files", nargs="+", metavar="FILE"),
+        _path("files", nargs="+", metavar="FILE"),
     ),
     "scene schema": Subcommand("print the JSON schema, for editors", "cli.scenes:print_schema"),
     "plan": "check a reference motion: torques, limits, shortest duration",
     "plan check": Subcommand(
         "check feasibility and the shortest duration; exit status 0 if feasible",
         "cli.motions:check_plan",
-        scene("scene", "scene with a motion: name, or .yaml file", metavar="SCENE"),
-        flag("--json", "print JSON instead of a table"),
-        path("--csv", "write the torques to play", metavar="OUT"),
-        flag("--force", "overwrite the file of --csv"),
-        number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
+        _scene("scene", "scene with a motion: name, or .yaml file", metavar="SCENE"),
+        _flag("--json", "print JSON instead of a table"),
+        _path("--csv", "write the torques to play", metavar="OUT"),
+        _flag("--force", "overwrite the file of --csv"),
+        _number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
     ),
     "describe": Subcommand(
         "write a scene as URDF",
         "cli.scenes:describe",
-        scene("--scene", default="example2", metavar="S"),
-        flag(
+        _scene("--scene", default="example2", metavar="S"),
+        _flag(
             "--ros2-control",
             "with the tag by which ros2_control drives the actuators of a running simulator",
         ),
@@ -151,39 +151,39 @@ COMMANDS: dict[str, Subcommand | str] = {
     "compile": Subcommand(
         "compile a scene before its first fast run",
         "cli.runs:compile_code",
-        scene("scene", nargs="?", default="example2", metavar="SCENE"),
-        arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
+        _scene("scene", nargs="?", default="example2", metavar="SCENE"),
+        _arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
     ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
         "cli.reports:run_demo",
-        arg(
+        _arg(
             "kind",
             "the paper's examples; or the node inverse_dynamics following a scene's motion",
             nargs="?",
             choices=("examples", "feedforward"),
             default="examples",
         ),
-        *out("folder of the results", "demo_out or demo_out/feedforward"),
-        scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
-        arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
+        *_out("folder of the results", "demo_out or demo_out/feedforward"),
+        _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
+        _arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
         needs=("rclpy", "rosbags", "matplotlib"),
     ),
     "view": Subcommand(
         "show the manipulator in a browser, live or from a bag",
         "cli.runs:view",
-        path("bag", "folder of a bag to play", nargs="?"),
-        scene("--scene", "start a simulator of this scene to look at", metavar="S"),
-        arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
-        arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
-        arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        arg(
+        _path("bag", "folder of a bag to play", nargs="?"),
+        _scene("--scene", "start a simulator of this scene to look at", metavar="S"),
+        _arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
+        _arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
+        _arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
+        _arg(
             "--port",
             "port; the next free one is taken",
             type=integer_from(1024, 65535),
             default=8080,
         ),
-        flag("--open", "open it, where there is a desktop"),
+        _flag("--open", "open it, where there is a desktop"),
         needs=("viser",),
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
     ),
@@ -192,35 +192,37 @@ COMMANDS: dict[str, Subcommand | str] = {
         "evaluate a recorded run",
         "cli.reports:report_run",
         BAG,
-        *out("folder of the results", "BAG_report, beside the bag"),
-        flag("--verbose", "print all figures"),
-        flag("--damaged", "evaluate the intact part of a damaged recording"),
+        *_out("folder of the results", "BAG_report, beside the bag"),
+        _flag("--verbose", "print all figures"),
+        _flag("--damaged", "evaluate the intact part of a damaged recording"),
     ),
     "report accuracy": Subcommand(
         "work-precision diagrams: error against cost of every method and step",
         "cli.reports:report_accuracy",
-        scene("scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"),
-        scene("--scene", "the same", nargs="+", default=[], metavar="S"),
-        flag("--all", "all shipped scenes, the default"),
-        *out("folder of the results", "accuracy_out"),
-        flag("--mpmath", "reference in 30 digits, slow"),
+        _scene(
+            "scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"
+        ),
+        _scene("--scene", "the same", nargs="+", default=[], metavar="S"),
+        _flag("--all", "all shipped scenes, the default"),
+        *_out("folder of the results", "accuracy_out"),
+        _flag("--mpmath", "reference in 30 digits, slow"),
     ),
     "report stability": Subcommand(
         "stable steps along the motion of a scene; runs at its limits and with other numbers",
         "cli.reports:report_stability",
-        scene("scene", metavar="SCENE"),
-        arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
-        *out("folder of the results", "stability_out"),
+        _scene("scene", metavar="SCENE"),
+        _arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
+        *_out("folder of the results", "stability_out"),
         needs=("pandas", "matplotlib"),
     ),
     "plot": Subcommand(
         "draw recorded runs, as PDF and PNG",
         "cli.reports:draw_pictures",
-        path("bags", "folder of the bag", nargs="*", metavar="BAG"),
-        *out("folder of the pictures", "BAG_plots, beside the first bag"),
-        arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
-        flag("--list", "list the pictures, and draw none"),
-        path(
+        _path("bags", "folder of the bag", nargs="*", metavar="BAG"),
+        *_out("folder of the pictures", "BAG_plots, beside the first bag"),
+        _arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
+        _flag("--list", "list the pictures, and draw none"),
+        _path(
             "--compare",
             "overlay runs and print their differences from the first",
             nargs="+",
@@ -232,42 +234,42 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a recorded run as CSV or Parquet",
         "cli.recordings:write_tables",
         BAG,
-        arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
-        *out("folder of the tables", "BAG_tables, beside the bag"),
+        _arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
+        *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
     "recover": Subcommand(
         "write a valid recording from a truncated or damaged one",
         "cli.recordings:write_recovered",
         BAG,
-        path("--out", "folder of the new bag; default: beside the old"),
+        _path("--out", "folder of the new bag; default: beside the old"),
     ),
     "sweep": Subcommand(
         "many runs of a scene with varied numbers",
         "cli.motions:run_sweep",
-        path("study", "study as a .yaml file; or the word plot", metavar="STUDY"),
-        path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
-        path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
-        arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
-        arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
-        flag("--resume", "compute only the chunks that are missing in --out"),
+        _path("study", "study as a .yaml file; or the word plot", metavar="STUDY"),
+        _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
+        _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
+        _arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
+        _arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
+        _flag("--resume", "compute only the chunks that are missing in --out"),
         description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation motions",
         "cli.motions:run_identification",
-        arg("bag", "folder of the bag, or the word design", metavar="BAG"),
-        scene(
+        _arg("bag", "folder of the bag, or the word design", metavar="BAG"),
+        _scene(
             "designed",
             "after design: the scene to make a motion for, about its initial pose",
             nargs="?",
             metavar="SCENE",
         ),
-        scene(
+        _scene(
             "--scene",
             "what is known, and the values to start from; default: the recorded scene",
             metavar="S",
         ),
-        arg(
+        _arg(
             "--parameters",
             "unknowns by the beginning of their names, as in: star friction.gamma offset; "
             "default: bodies, friction, springs and rotors of the scene; by simulation full names, "
@@ -275,18 +277,18 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="+",
             metavar="P",
         ),
-        arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
-        number(
+        _arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
+        _number(
             "--cutoff",
             "of the zero-phase filter of measured angles; default: none, rates as recorded",
             metavar="HZ",
         ),
-        number("--delay", "by which measured torques come late; default: 0", metavar="SECONDS"),
-        number("--duration", "of a designed motion [s]; default: 6"),
-        arg("--harmonics", "of a designed motion; default: 5", type=int),
-        arg("--seed", "of a designed motion; default: 0", type=int),
-        path("--out", "write the scene", metavar="SCENE.yaml"),
-        flag("--force", "overwrite the file of --out"),
+        _number("--delay", "by which measured torques come late; default: 0", metavar="SECONDS"),
+        _number("--duration", "of a designed motion [s]; default: 6"),
+        _arg("--harmonics", "of a designed motion; default: 5", type=int),
+        _arg("--seed", "of a designed motion; default: 0", type=int),
+        _path("--out", "write the scene", metavar="SCENE.yaml"),
+        _flag("--force", "overwrite the file of --out"),
         description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
         "what the motion determines, with standard deviations, and the nearest scene whose bodies "
         "can exist. With --method simulation the motion is integrated and fitted to the recorded "
