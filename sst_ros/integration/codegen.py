@@ -13,7 +13,8 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from types import CodeType, ModuleType
 from typing import Any
 
@@ -121,6 +122,27 @@ def _names(letter: str, count: int) -> list[str]:
     return [f"{letter}{i}" for i in range(count)]
 
 
+@dataclass(frozen=True)
+class Base:
+    """Functions that several modules call, one text each, and their constants."""
+
+    texts: tuple[str, ...]
+    constants: dict[str, Any]
+
+    @cached_property
+    def text(self) -> str:
+        """Text of their module for numba."""
+        return _for_numba(self.texts, self.constants)
+
+    @cached_property
+    def name(self) -> str:
+        """Name of that module."""
+        return _name_of(self.text)
+
+
+NO_BASE = Base((), {})
+
+
 def load(
     texts: list[str],
     constants: dict[str, Any],
@@ -128,20 +150,27 @@ def load(
     numba: bool,
     nogil: bool = False,
     rounding: bool = True,
+    base: Base = NO_BASE,
 ) -> ModuleType:
     """Turn function texts into a module, for the interpreter or compiled by numba.
+
+    They may call the functions of `base`, which are compiled once for all modules that have them.
 
     Without `rounding` as written, the compiler may multiply and add in one, and multiply by one
     reciprocal instead of dividing by the same number several times.
     """
     if not numba:
-        return _executed("\n".join([_PLAIN, _named(constants), *texts]), "sst_ros_plain")
+        everything = [_PLAIN, _named(base.constants | constants), *base.texts, *texts]
+        return _executed("\n".join(everything), "sst_ros_plain")
     more = "" if rounding else _FREE_ROUNDING
-    text = _for_numba(texts, constants, nogil=nogil, more=more)
-    module = import_text(_name_of(text), text)
-    if module is not None:
-        return module
-    return _executed(text.replace("cache=True", "cache=False", 1), "sst_ros_compiled")
+    text = _for_numba(texts, constants, nogil=nogil, more=more, base=base)
+    if not base.texts or import_text(base.name, base.text) is not None:
+        module = import_text(_name_of(text), text)
+        if module is not None:
+            return module
+    everything, known = [*base.texts, *texts], base.constants | constants
+    text = _for_numba(everything, known, nogil=nogil, more=more, cache=False)
+    return _executed(text, "sst_ros_compiled")
 
 
 def _executed(text: str, name: str) -> ModuleType:
@@ -161,10 +190,11 @@ def has_code(
     functions: Sequence[str],
     *,
     rounding: bool = True,
+    base: Base = NO_BASE,
 ) -> bool:
     """Return whether machine code of these functions of the module is there to be loaded."""
     more = "" if rounding else _FREE_ROUNDING
-    module = _name_of(_for_numba(texts, constants, more=more))
+    module = _name_of(_for_numba(texts, constants, more=more, base=base))
     try:
         cached = cache_folder() / "__pycache__"
     except OSError:
@@ -173,10 +203,22 @@ def has_code(
 
 
 def _for_numba(
-    texts: list[str], constants: dict[str, Any], *, nogil: bool = False, more: str = ""
+    texts: Sequence[str],
+    constants: dict[str, Any],
+    *,
+    nogil: bool = False,
+    more: str = "",
+    base: Base = NO_BASE,
+    cache: bool = True,
 ) -> str:
-    head = _NUMBA.format(cache=True, nogil=nogil, more=more)
-    return "\n".join([head + _named(constants), *(f"@jit\n{text}" for text in texts)])
+    head = _NUMBA.format(cache=cache, nogil=nogil, more=more) + _named(constants)
+    if base.texts:
+        head += f"from {base.name} import {', '.join(map(_function_name, base.texts))}\n"
+    return "\n".join([head, *(f"@jit\n{text}" for text in texts)])
+
+
+def _function_name(text: str) -> str:
+    return text.removeprefix("def ").split("(")[0]
 
 
 def _named(constants: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import is_
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,21 +31,26 @@ JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
 
-_EXPLICIT = (
-    step_loops.size_of,
-    step_loops.normalise,
+_SHARED = (step_loops.size_of, step_loops.normalise, step_loops.all_far)
+_LOOPS = (
     step_loops.step_pair,
     step_loops.step_fixed,
-    step_loops.all_far,
     step_loops.step_many,
     step_loops.step_sequence,
 )
-_IMPLICIT = (
-    step_loops.factorise,
-    step_loops.substitute,
-    step_loops.attempt_linearly_implicit,
-    *_EXPLICIT,
-)
+_IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
+
+
+class _Source(NamedTuple):
+    """Functions of a module, one text each, in the order of their calls; constants; numbers.
+
+    `base` has what the modules of all methods have in common.
+    """
+
+    base: codegen.Base
+    texts: list[str]
+    constants: dict[str, Any]
+    numbers: list[float]
 
 
 class CompiledMethod:
@@ -83,15 +88,17 @@ class CompiledMethod:
         self.pair_cost = 3 * (len(method.a) + (JACOBIAN_COST if implicit else 0))
         if derivative is not None and (compiled or (implicit and linearise is None)):
             raise ValueError("a derivative of its own needs plain Python and, if implicit, its own")
-        texts, constants, numbers = _source(system, method, by_structure=compiled)
-        self._module: ModuleType = codegen.load(texts, constants, numba=compiled)
+        source = _source(system, method, by_structure=compiled)
+        self._module: ModuleType = codegen.load(
+            source.texts, source.constants, numba=compiled, base=source.base
+        )
         if derivative is not None:
             self._module.__dict__["rhs"] = derivative
         if linearise is not None and implicit:
             self._module.__dict__["linearise"] = linearise
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
-        self._numbers = self._vector(numbers)
+        self._numbers = self._vector(source.numbers)
         self._error = self._vector([0.0] * len(system.state))
         self.sizes: Any = self._vector([])
         self._at: StepPoint = ([], [], ())
@@ -222,15 +229,14 @@ class CompiledMethod:
 
 def has_code(system: ODE, method: Method) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
-    texts, constants, _ = _source(system, method, by_structure=True)
-    return codegen.has_code(texts, constants, ("step_pair", "step_many"))
+    source = _source(system, method, by_structure=True)
+    functions = ("step_pair", "step_many")
+    return codegen.has_code(source.texts, source.constants, functions, base=source.base)
 
 
 @lru_cache(maxsize=64)
-def _source(
-    system: ODE, method: Method, *, by_structure: bool
-) -> tuple[list[str], dict[str, Any], list[float]]:
-    """Functions of a module, one text each, in the order of their calls; constants; numbers.
+def _source(system: ODE, method: Method, *, by_structure: bool) -> _Source:
+    """Return what the steps of a system by a method consist of.
 
     By structure the text has no number of the scene: they are in a vector p, an argument of all
     functions. Otherwise they are in the text, and p is empty.
@@ -239,16 +245,19 @@ def _source(
     y, d = [f"y[{i}]" for i in range(size)], [f"d[{i}]" for i in range(len(system.drive))]
     p = ["p"] if by_structure else []
     lag = 3 if set(LAG) <= set(system.state) else 0
-    constants: dict[str, Any] = {"SIZE": size, "LAG": lag, "SHARE": 0.5**method.error_order}
+    common = {"SIZE": size, "LAG": lag}
+    constants: dict[str, Any] = {"SIZE": size, "SHARE": 0.5**method.error_order}
     inputs = ", ".join(["t", *y, *d, *p])
     joints = _assign(
         [f"joints[{i}]" for i in range(18)], f"angles_and_rates({', '.join(y[:7] + p)})"
     )
-    texts = [
+    shared = [
         system.program.source("rhs", slots),
         system.joints.source("angles_and_rates", slots),
         f"def joints_of(y, p, joints):\n{joints}",
+        *(inspect.getsource(function) for function in _SHARED),
     ]
+    texts: list[str] = []
     if isinstance(method, Tableau):
         new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
         step = _assign(new, f"step({', '.join(['t', 'h', *y, *d, *p])})")
@@ -264,17 +273,20 @@ def _source(
         constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
         slope = [f"slope[{i}]" for i in range(size)]
         outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
-        outputs += [f"matrix[{i}][{j}]" for j in range(size) for i in range(size)]
+        outputs += [f"row{i}[{j}]" for j in range(size) for i in range(size)]
         texts.append(system.jacobian.source("jacobian", slots))
         linearise = _assign(outputs, f"jacobian({inputs})")
-        texts.append(f"def linearise(t, y, d, p, slope, by_time, matrix):\n{linearise}")
+        rows = "".join(f"    row{i} = matrix[{i}]\n" for i in range(size))
+        texts.append(f"def linearise(t, y, d, p, slope, by_time, matrix):\n{rows}{linearise}")
         evaluate = _assign(slope, f"rhs({inputs})")
         texts.append(f"def evaluate(t, y, d, p, slope):\n{evaluate}")
-    texts += [
-        inspect.getsource(function).replace("attempt_linearly_implicit", "attempt")
-        for function in (_EXPLICIT if isinstance(method, Tableau) else _IMPLICIT)
-    ]
-    return texts, constants, slots.values if slots else []
+        texts += [
+            inspect.getsource(function).replace("attempt_linearly_implicit", "attempt")
+            for function in _IMPLICIT
+        ]
+    texts += [inspect.getsource(function) for function in _LOOPS]
+    base = codegen.Base(tuple(shared), common)
+    return _Source(base, texts, constants, slots.values if slots else [])
 
 
 def _assign(places: list[str], call: str) -> str:

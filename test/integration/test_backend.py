@@ -61,7 +61,7 @@ def cache(tmp_path_factory, truth):
 @needs_numba
 @pytest.mark.slow
 def test_two_processes_that_start_at_once_share_one_cache(cache):
-    assert len(list(cache.glob("sst_*.py"))) == 1
+    assert len(list(cache.glob("sst_*.py"))) == 2  # what all methods call, and a method
     assert {path.suffix for path in cache.iterdir()} == {".py", ""}
     assert list((cache / "__pycache__").glob("*.nbc"))
 

@@ -173,7 +173,13 @@ def start():
 
 
 @needs_numba
-@pytest.mark.parametrize("method", [DORMAND_PRINCE, RODAS4], ids=["dopri5", "rodas4"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(DORMAND_PRINCE, id="dopri5"),
+        pytest.param(RODAS4, id="rodas4", marks=pytest.mark.slow),
+    ],
+)
 def test_one_code_gives_the_bits_of_plain_python_for_each_scene(method, start):
     machines = [machine_of(scene, method, compiled=True) for scene in like_loaded()]
     assert len({machine._module.__name__ for machine in machines}) == 1
