@@ -123,7 +123,7 @@ def _names(letter: str, count: int) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Base:
+class SharedFunctions:
     """Functions that several modules call, one text each, and their constants."""
 
     texts: tuple[str, ...]
@@ -140,7 +140,7 @@ class Base:
         return _name_of(self.text)
 
 
-NO_BASE = Base((), {})
+NOTHING_SHARED = SharedFunctions((), {})
 
 
 def load(
@@ -150,7 +150,7 @@ def load(
     numba: bool,
     nogil: bool = False,
     rounding: bool = True,
-    base: Base = NO_BASE,
+    base: SharedFunctions = NOTHING_SHARED,
 ) -> ModuleType:
     """Turn function texts into a module, for the interpreter or compiled by numba.
 
@@ -190,7 +190,7 @@ def has_code(
     functions: Sequence[str],
     *,
     rounding: bool = True,
-    base: Base = NO_BASE,
+    base: SharedFunctions = NOTHING_SHARED,
 ) -> bool:
     """Return whether machine code of these functions of the module is there to be loaded."""
     more = "" if rounding else _FREE_ROUNDING
@@ -208,7 +208,7 @@ def _for_numba(
     *,
     nogil: bool = False,
     more: str = "",
-    base: Base = NO_BASE,
+    base: SharedFunctions = NOTHING_SHARED,
     cache: bool = True,
 ) -> str:
     head = _NUMBA.format(cache=cache, nogil=nogil, more=more) + _named(constants)

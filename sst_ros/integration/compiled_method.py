@@ -41,13 +41,13 @@ _LOOPS = (
 _IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
 
 
-class _Source(NamedTuple):
+class _MethodSource(NamedTuple):
     """Functions of a module, one text each, in the order of their calls; constants; numbers.
 
     `base` has what the modules of all methods have in common.
     """
 
-    base: codegen.Base
+    base: codegen.SharedFunctions
     texts: list[str]
     constants: dict[str, Any]
     numbers: list[float]
@@ -235,7 +235,7 @@ def has_code(system: ODE, method: Method) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _source(system: ODE, method: Method, *, by_structure: bool) -> _Source:
+def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource:
     """Return what the steps of a system by a method consist of.
 
     By structure the text has no number of the scene: they are in a vector p, an argument of all
@@ -285,8 +285,8 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _Source:
             for function in _IMPLICIT
         ]
     texts += [inspect.getsource(function) for function in _LOOPS]
-    base = codegen.Base(tuple(shared), common)
-    return _Source(base, texts, constants, slots.values if slots else [])
+    base = codegen.SharedFunctions(tuple(shared), common)
+    return _MethodSource(base, texts, constants, slots.values if slots else [])
 
 
 def _assign(places: list[str], call: str) -> str:
