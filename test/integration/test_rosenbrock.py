@@ -48,10 +48,10 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
         "__builtins__": builtins,
     }
 
-    def linearise(t, y, d, slope, by_t, matrix):
+    def linearise(t, y, d, p, slope, by_t, matrix):
         slope[0], by_t[0], matrix[0][0] = slope_of(t, y[0]), by_time(t), matrix_of(y[0])
 
-    def evaluate(t, y, d, slope):
+    def evaluate(t, y, d, p, slope):
         slope[0] = slope_of(t, y[0])
 
     names |= {"linearise": linearise, "evaluate": evaluate}
@@ -60,7 +60,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
     attempt = names["attempt_linearly_implicit"]
     y, new, error = [y0], [0.0], [0.0]
     for k in range(count):
-        attempt(k * h, h, y, y, (), new, error)
+        attempt(k * h, h, y, y, (), (), new, error)
         y[0] = new[0]
     return y[0], error[0]
 
