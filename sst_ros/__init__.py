@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from sst_ros.simulation.simulate import prepare as prepare
     from sst_ros.simulation.simulate import simulate as simulate
     from sst_ros.simulation.simulation import Simulation as Simulation
-    from sst_ros.simulation.torque import TorqueTable as TorqueTable
     from sst_ros.simulation.torque_profile import PolynomialTorque as PolynomialTorque
+    from sst_ros.simulation.torque_profile import TorqueTable as TorqueTable
     from sst_ros.simulation.trajectory import Trajectory as Trajectory
     from sst_ros.state import State as State
     from sst_ros.sweeps.sweep import sweep as sweep
@@ -71,7 +71,7 @@ _MODULES = {
     "SingularConfiguration": "errors",
     "SstError": "errors",
     "State": "state",
-    "TorqueTable": "simulation.torque",
+    "TorqueTable": "simulation.torque_profile",
     "Trajectory": "simulation.trajectory",
     "arc_inertia": "scene.bodies",
     "direct_kinematics": "mechanism.kinematics:direct",

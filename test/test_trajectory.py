@@ -11,8 +11,7 @@ from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.simulation.torque import TorqueTable
-from sst_ros.simulation.torque_profile import PolynomialTorque
+from sst_ros.simulation.torque_profile import PolynomialTorque, TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 
 EXAMPLE2 = load("example2_heavy")

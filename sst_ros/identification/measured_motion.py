@@ -24,12 +24,12 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import TorqueTable
 from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     PolynomialTorque,
     SineProfile,
     TorqueProfile,
+    TorqueTable,
 )
 from sst_ros.simulation.trajectory import Trajectory
 

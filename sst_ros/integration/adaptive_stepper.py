@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
-from sst_ros.integration.coarse_solution import Point, rescaled
 from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
@@ -20,7 +19,7 @@ from sst_ros.integration.compiled_method import (
     StepPoint,
     Vector,
 )
-from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
+from sst_ros.integration.global_error import Point, rescaled
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -29,8 +28,90 @@ from sst_ros.integration.methods import (
     RODAS4,
     Rosenbrock,
 )
-from sst_ros.integration.step_control import GROW, better_method, step_factor
 from sst_ros.mechanism.geometry import Array
+
+GROW = 5.0
+"""Largest factor by which a step grows."""
+
+_SAFETY, _SHRINK = 0.9, 0.2
+_STIFF, _EASY = 2.0, 0.5
+"""Step times fastest decay above which an explicit method is left, and step times fastest rate
+below which an implicit one is; explicit methods are stable to about 3."""
+
+
+def step_factor(error: float, error_order: int) -> float:
+    """Factor for the next step after one with a local error, relative to the tolerance."""
+    if error == 0.0:
+        return GROW
+    if not error < float("inf"):
+        return _SHRINK
+    return float(min(max(_SAFETY * error ** (-1.0 / (error_order + 1)), _SHRINK), GROW))
+
+
+def better_method(
+    method: Method, tolerance: float, steps: Array, *, only_stiff: bool
+) -> tuple[Method, str]:
+    """Choose the method that would take longer steps, and state why.
+
+    Args:
+        method: the one in use, which is the choice where none is better.
+        tolerance: largest local error estimate of a step.
+        steps: length of a step times the eigenvalues of the Jacobian.
+        only_stiff: look for stiffness alone.
+
+    """
+    radius, decay = abs(steps).max(), -steps.real.min()
+    implicit = isinstance(method, Rosenbrock)
+    if not implicit and decay > _STIFF and decay > 0.5 * radius:
+        return RODAS4, f"stiff: step times fastest decay is {decay:.2g}"
+    if only_stiff:
+        return method, ""
+    if implicit and radius < _EASY:
+        return DORMAND_PRINCE, f"no longer stiff: step times rate is {radius:.2g}"
+    if method is DORMAND_PRINCE and tolerance < 1e-7 and decay <= _STIFF:
+        return DOP853, "many small steps that accuracy asks for"
+    return method, ""
+
+
+class CannotStep(ArithmeticError):
+    """No step is small enough to resolve the motion."""
+
+
+class BudgetSpent(CannotStep):
+    """The evaluations that a period may take are used up."""
+
+
+class EvaluationBudget:
+    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
+
+    Args:
+        per_period: how many; None for no bound.
+        whole_run: they are those of a run, whatever its periods.
+
+    """
+
+    def __init__(self, per_period: int | None = None, *, whole_run: bool = False) -> None:
+        self.per_period, self._whole_run = per_period, whole_run
+        self.spent = 0
+        self._end: float = float("inf")
+
+    def begin(self) -> None:
+        """Begin a period."""
+        if self.per_period is not None:
+            self._end = self.per_period + (0 if self._whole_run else self.spent)
+
+    def charge(self, evaluations: int) -> None:
+        """Count evaluations before they are made.
+
+        Raises:
+            BudgetSpent: the period has none left.
+
+        """
+        if self.spent + evaluations > self._end:
+            what = "motion" if self._whole_run else "step"
+            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the {what}")
+        self.spent += evaluations
+
 
 _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3

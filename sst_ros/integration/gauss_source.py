@@ -13,8 +13,7 @@ import re
 
 from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.traced_dynamics import ODE
-from sst_ros.integration.simd_source import Layout, evaluated, indented, loop, split
-from sst_ros.integration.sine_source import flat_sin
+from sst_ros.integration.simd_source import Layout, evaluated, flat_sin, indented, loop, split
 
 HEAD = 3
 """Numbers before all: count of steps, count of iterations, length of a step."""

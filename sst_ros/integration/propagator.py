@@ -15,13 +15,11 @@ from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AcceptedStep,
     AdaptiveStepper,
+    EvaluationBudget,
     MethodChange,
     StepperCheckpoint,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
-from sst_ros.integration.coarse_solution import ErrorGrowth, Point, coulomb_joints
-from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.evaluation_budget import EvaluationBudget
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,
@@ -30,6 +28,7 @@ from sst_ros.integration.events import (
     load_root_finder,
     may_occur,
 )
+from sst_ros.integration.global_error import ErrorGrowth, Passage, Point, coulomb_joints
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
@@ -51,30 +50,6 @@ class Checkpoint(NamedTuple):
     in_use: AdaptiveStepper
     stepper: AdaptiveStepper
     kept: StepperCheckpoint
-
-
-class Passage(NamedTuple):
-    """An accepted step, or the part of it before an event.
-
-    Attributes:
-        time: when it begins [s].
-        t: the same since the period began, as `method` takes it [s].
-        h: its length [s].
-        begin, end: solutions.
-        drive: what acts.
-        method: the steps that were taken.
-        last: whether it ends with the period.
-
-    """
-
-    time: float
-    t: float
-    h: float
-    begin: Point
-    end: Point
-    drive: tuple[float, ...]
-    method: CompiledMethod
-    last: bool
 
 
 class Propagator:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array

@@ -20,7 +20,7 @@ from sst_ros.nodes.process import every
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
-from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import TorqueTable
 from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 

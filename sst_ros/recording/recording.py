@@ -28,7 +28,7 @@ from sst_ros.recording.topic_tables import (
     TopicTable,
 )
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS
 

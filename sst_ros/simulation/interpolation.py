@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sst_ros.integration.adaptive_stepper import EvaluationBudget
 from sst_ros.integration.applied_torque import StateFeedback, Torque
-from sst_ros.integration.evaluation_budget import EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import Propagator
 from sst_ros.simulation.sampled_motion import Array, SampledMotion

@@ -18,13 +18,13 @@ from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
 from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
-from sst_ros.simulation.torque import profile_of
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
     SineProfile,
     TorqueFunction,
     TorqueProfile,
+    profile_of,
 )
 from sst_ros.simulation.trajectory import Array, Trajectory
 

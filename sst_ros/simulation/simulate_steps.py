@@ -12,21 +12,20 @@ from typing import Any
 import numpy as np
 
 from sst_ros.host.output import Bar
+from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.applied_torque import StateFeedback, Torque
-from sst_ros.integration.coarse_solution import Point
-from sst_ros.integration.evaluation_budget import CannotStep, EvaluationBudget
-from sst_ros.integration.halved_steps import HalvedSteps
+from sst_ros.integration.global_error import HalvedSteps, Passage, Point
 from sst_ros.integration.methods import DORMAND_PRINCE
-from sst_ros.integration.propagator import LimitReached, Passage, Propagator
+from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, begin, unresolved
-from sst_ros.simulation.torque import TorqueTable
 from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     FeedbackFunction,
     SineProfile,
     TorqueProfile,
+    TorqueTable,
     three,
 )
 from sst_ros.simulation.trajectory import Trajectory
@@ -128,7 +127,7 @@ class SteppedMotion:
         )
         self._method = self._propagator.method
         self._start = self._at = begin(task.scene, self._propagator)
-        self._check = HalvedSteps(self._at, self._budget)
+        self._check = HalvedSteps(self._at)
         self._bar = Bar(f"{self._scene.name}, simulating", progress)
         self._held: list[tuple[float, Vector3]] = []
         self._samples: list[tuple[float, Point, Vector3]] = []
@@ -206,6 +205,7 @@ class SteppedMotion:
 
     def _pass(self, step: Passage) -> None:
         """Go with the second solution through a step of the run, and take samples in it."""
+        self._budget.charge(4 * step.method.pair_cost // 3)
         self._check.add(step)
         end = self._period_end if step.last else step.time + step.h
         self._last = step

@@ -16,8 +16,7 @@ from sst_ros.extras import MissingDependency, require
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.sampled_motion import Law, SampledMotion, T
-from sst_ros.simulation.torque import profile_from
-from sst_ros.simulation.torque_profile import TorqueProfile
+from sst_ros.simulation.torque_profile import TorqueProfile, profile_from
 
 if TYPE_CHECKING:
     import pandas as pd

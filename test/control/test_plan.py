@@ -38,7 +38,7 @@ from sst_ros.scene.scene import (
     text_of,
 )
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.simulation.torque import TorqueTable
+from sst_ros.simulation.torque_profile import TorqueTable
 
 HOME = (math.pi / 4,) * 3
 EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))

@@ -21,7 +21,7 @@ from sst_ros.identification.parameters import value_of
 from sst_ros.identification.simulation_fit import Sensitivities, differentiate_damping
 from sst_ros.mechanism.generic_math import ZERO, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.simulation.torque import SineProfile
+from sst_ros.simulation.torque_profile import SineProfile
 
 END, STEPS, COLUMNS = 0.08, 2, 10
 TINY = mp.mpf(10) ** -18

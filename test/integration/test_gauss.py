@@ -15,7 +15,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.gauss import Collocation, tables
-from sst_ros.integration.sine_source import flat_sin
+from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
