@@ -69,7 +69,7 @@ Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 
 
 class StressRun(NamedTuple):
-    """What became of a run.
+    """How a run ended.
 
     Attributes:
         name: of the row.
@@ -183,7 +183,7 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
 
 
 def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRun:
-    """Run a scene at two tolerances, and judge how it ended."""
+    """Run a scene at two tolerances, and say how it ended."""
     if isinstance(changed, str):
         return StressRun(name, what, None, changed)
     began = time.perf_counter()

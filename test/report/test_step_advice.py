@@ -66,7 +66,7 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
 
 def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
     advice, rates = step_advice(load("stiff")), eigenvalues(load("stiff"))
-    assert "then rodas4 from" in advice.method and advice.text.count("stiff") == 1
+    assert "then rodas4 from" in advice.method and "stiff: step times fastest decay" in advice.text
     assert f"rate at the start is {np.abs(rates).max():.3g} 1/s" in advice.text
 
 
