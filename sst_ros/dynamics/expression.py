@@ -134,8 +134,8 @@ class Number(float):
     """A constant that another scene of the same structure may have another value of.
 
     Arithmetic folds it as any float, but it never counts as 0 or 1, and it is the same as another
-    one only if both come from the same numbers by the same operations: so what is traced depends on no
-    value. `origin` says where it comes from.
+    one only if both come from the same numbers by the same operations: so what is traced depends on
+    no value. `origin` says where it comes from.
     """
 
     origin: Any
