@@ -272,12 +272,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
         constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
         constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
         slope = [f"slope[{i}]" for i in range(size)]
-        outputs = [*slope, *(f"by_time[{i}]" for i in range(size))]
-        outputs += [f"row{i}[{j}]" for j in range(size) for i in range(size)]
-        texts.append(system.jacobian.source("jacobian", slots))
-        linearise = _assign(outputs, f"jacobian({inputs})")
-        rows = "".join(f"    row{i} = matrix[{i}]\n" for i in range(size))
-        texts.append(f"def linearise(t, y, d, p, slope, by_time, matrix):\n{rows}{linearise}")
+        texts.append(_linearise(system, slots))
         evaluate = _assign(slope, f"rhs({inputs})")
         texts.append(f"def evaluate(t, y, d, p, slope):\n{evaluate}")
         texts += [
@@ -287,6 +282,37 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     texts += [inspect.getsource(function) for function in _LOOPS]
     base = codegen.SharedFunctions(tuple(shared), common)
     return _MethodSource(base, texts, constants, slots.values if slots else [])
+
+
+def _linearise(system: ODE, slots: Slots | None) -> str:
+    """Source of `linearise`, which puts a derivative and its derivatives into arrays.
+
+    One function: to hand eighty numbers from one to another costs numba seconds.
+
+        def linearise(t, state, d, p, slope, by_time, matrix):
+            x = state[0]
+            t1 = d[0]
+            row0 = matrix[0]
+            c0 = p[0]
+            v0 = x * x
+            slope[0] = v7
+            by_time[0] = 0.0
+            row0[0] = v19
+    """
+    size = len(system.state)
+    lines, results = system.jacobian.body(slots)
+    places = [f"{array}[{i}]" for array in ("slope", "by_time") for i in range(size)]
+    places += [f"row{i}[{j}]" for j in range(size) for i in range(size)]
+    body = [
+        *(f"{name} = state[{i}]" for i, name in enumerate(system.state)),
+        *(f"{name} = d[{i}]" for i, name in enumerate(system.drive)),
+        *(f"row{i} = matrix[{i}]" for i in range(size)),
+        *(slots.reads([*lines, *results]) if slots else ()),
+        *lines,
+        *(f"{place} = {result}" for place, result in zip(places, results, strict=True)),
+    ]
+    head = "def linearise(t, state, d, p, slope, by_time, matrix):"
+    return "\n    ".join([head, *body]) + "\n"
 
 
 def _assign(places: list[str], call: str) -> str:
