@@ -2,7 +2,7 @@
 """Rates and accelerations of every joint and link, and the moments that their joints transmit.
 
 From the actuators or from the star, one leg equation serves both, Eqs. 9 and 24 to 27. Written with
-c_k = (r x t).w = (w x r).t:
+c_k = (r x t).w = (w x r).t::
 
     omega     = w gamma_dot - r mu_dot - t beta_dot
     omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot
@@ -18,7 +18,7 @@ a revolute about an axis through O: w_k (base to actuated link), r_k (to the int
 two components, both across its axis. The 9 x 2 components and 3 torques (or accelerations) are as
 many as the 7 x 3 moment balances, so the moments about O are determinate, and each leg gives them
 in closed form: with the rates of change of angular momentum D_1k and D_2k of its links, the moment
-m on the star obeys
+m on the star obeys::
 
     t.m = 0,   r.m = -r.D_2k,   w.m = tau_k - w.(D_1k + D_2k),
 
