@@ -50,7 +50,9 @@ def test_bare_loops():
             assert len(measured) == 8 and all(float(cells[0]) > 0.0 for cells in measured)
 
 
+@pytest.mark.timeout(400)
 def test_soak():
+    """Growth counts after the first minute: until then the heap of the recorder still settles."""
     pytest.importorskip("viser", reason="what is soaked has a viewer")
-    said = printed("soak", "--minutes", "0.3")
+    said = printed("soak", "--minutes", "1.5")
     assert "missing 0\n" in said and "WRONG" not in said
