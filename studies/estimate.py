@@ -220,7 +220,8 @@ of the error. `python -m studies.estimate --count {count} --seed {seed}` writes 
 {table}
 
 An estimate over the error below 1 is too small. "Beyond 3 tolerances" counts runs with status 0
-whose true error is more than three times the tolerance that was asked for.
+whose true error is more than three times the tolerance that was asked for. The grey band of the
+picture reaches from 1/3 to 30.
 
 {provenance}
 """

@@ -7,7 +7,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 GENERATED = (
-    "accuracy.md", "control_rate.md", "feedforward.md", "peers.md", "realtime.md", "stability.md",
+    "accuracy.md", "control_rate.md", "estimate.md", "feedforward.md", "peers.md", "realtime.md",
+    "stability.md",
 )  # fmt: skip
 """Reports, whose words are not instructions."""
 
