@@ -154,7 +154,7 @@ def _own(value: ArrayLike) -> Array:
 
 def _refuse_misfits(arrays: dict[str, Array]) -> None:
     t, problems = arrays["t"], []
-    if t.ndim != 1 or not np.all(np.isfinite(t)) or np.any(t[1:] <= t[:-1]):
+    if t.ndim != 1 or not np.isfinite(t).all() or (t[1:] <= t[:-1]).any():
         problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
     wanted = {"quaternion": 4, "body_rate": 3, "torque": 3, "joints": 18}
     for name, array in arrays.items():

@@ -58,7 +58,9 @@ class CollocatedMotion:
             status = 1
             message = f"stopped at t = {self._end:.12f} s: {self._ending.limit.reason}"
         chosen = "" if asked else " (auto: a smooth motion under a profile)"
-        self._times = motion.grid.copy()
+        # Read-only, so that all trajectories share them.
+        self._times, self._torques = motion.grid.copy(), motion.torque(motion.grid)
+        self._times.flags.writeable = self._torques.flags.writeable = False
         self._of_the_run: dict[str, Any] = {
             "status": status,
             "message": message,
@@ -81,7 +83,9 @@ class CollocatedMotion:
             if self._ending is not None:
                 t = np.append(t[t < self._end], self._end)
             y = self._motion.at(t)
-        torque = y[:, 7:10] if self._lag else self._motion.torque(t)
+        torque = y[:, 7:10]
+        if not self._lag:
+            torque = self._torques if t is self._times else self._motion.torque(t)
         return Trajectory(self._scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
 
 
