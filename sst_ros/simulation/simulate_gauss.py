@@ -49,7 +49,7 @@ class CollocatedMotion:
         self._motion = motion = GaussMotion(
             scene, torque, start, duration, tolerance, compiled=asked or None, finest=finest
         )
-        self._scene, self._law, self._lag = scene, law, lag
+        self._scene, self._lag = scene, lag
         self._start = np.array([start])
         self._end, self._ending = duration, motion.ending
         status, message = 0, "reached the end"
