@@ -173,15 +173,19 @@ def test_recordings_without_checksums_are_read_and_counted(written, example2):
     assert recording.read(written(example2)).signals.unverified > 0
 
 
-def test_a_recording_keeps_one_index_entry_a_flush(tmp_path, monkeypatch):
-    monkeypatch.setattr(bag_writer, "FLUSH_PERIOD_S", 0.0)
+def test_a_late_flush_makes_no_large_chunk_and_the_index_of_messages_is_not_kept(
+    tmp_path, monkeypatch
+):
+    """What is held in memory is bounded: a chunk, and an entry of the index for each chunk."""
     bag = BagWriter(tmp_path / "bag")
     topics = [bag.connect(f"/topic_{k}", "sensor_msgs/msg/JointState") for k in range(8)]
-    for _ in range(3):
-        for k in range(1000):  # a second of 1 kHz
-            for topic in topics:
-                bag.write(topic, k, bytes(300))
-        bag.save()
-    kept = [type(one) for one in gc.get_objects() if isinstance(one, ChunkIndex | MessageIndex)]
+    for k in range(3000):  # three seconds of 1 kHz without a flush
+        for topic in topics:
+            bag.write(topic, k, bytes(300))
+    monkeypatch.setattr(bag_writer, "FLUSH_PERIOD_S", 0.0)
+    bag.save()
+    kept = [one for one in gc.get_objects() if isinstance(one, ChunkIndex | MessageIndex)]
+    assert {type(one) for one in kept} == {ChunkIndex}
+    sizes = [one.uncompressed_size for one in kept[:-1]]
     bag.close()
-    assert kept == [ChunkIndex] * 3
+    assert min(sizes) > 500_000 and max(sizes) < 530_000 and 13 < len(sizes) < 16
