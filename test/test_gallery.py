@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.cli.scenes import check
+from sst_ros.cli.runs import check
 from sst_ros.errors import RunStopped, StrokeExceeded
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.scene.scene import load, names

@@ -16,20 +16,32 @@ LIST = """
 from sst_ros.__main__ import main
 main(["scene", "list"])
 """
+SCHEMA = """
+from sst_ros.__main__ import main
+main(["scene", "schema"])
+"""
 LOADED = """
 import sys
-print(*{name.split(".")[0] for name in sys.modules})
+print(*sys.modules)
 """
+DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "scene"}
+"""Rooms that a command needs which prints documents; of `nodes` the handler of signals."""
 
 
-@pytest.mark.parametrize("program", [RUN, LIST])
+@pytest.mark.parametrize("program", [RUN, LIST, SCHEMA])
 def test_numpy_and_yaml_are_all_that_is_loaded(program):
     done = subprocess.run(
         [sys.executable, "-c", program + LOADED],
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
-    loaded = set(done.stdout.splitlines()[-1].split())
-    assert "sst_ros" in loaded and not loaded & HEAVY
+    loaded = done.stdout.splitlines()[-1].split()
+    libraries = {name.split(".")[0] for name in loaded}
+    assert "sst_ros" in libraries and not libraries & HEAVY
+    if program is not RUN:
+        rooms = {
+            name.split(".")[1] for name in loaded if name.count(".") == 2 and "sst_ros." in name
+        }
+        assert rooms <= DOCUMENTS and "sst_ros.dynamics.kernel" not in loaded
 
 
 STEPS = """

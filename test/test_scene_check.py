@@ -4,7 +4,7 @@
 import pytest
 
 from sst_ros.__main__ import main
-from sst_ros.cli.scenes import implausible
+from sst_ros.cli.runs import implausible
 from sst_ros.scene.scene import load, names
 from sst_ros.scene.yaml_document import dump
 

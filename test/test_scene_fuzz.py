@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from models import FAST
 from trees import changed
 
-from sst_ros.cli.scenes import check
+from sst_ros.cli.runs import check
 from sst_ros.errors import InputError
 from sst_ros.report.scene_summary import summary
 from sst_ros.scene.scene import Scene, names

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.cli.scenes import check
+from sst_ros.cli.runs import check
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import Scene, load

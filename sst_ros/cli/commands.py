@@ -121,11 +121,11 @@ COMMANDS: dict[str, Subcommand | str] = {
     "scene": "list, show and check scenes",
     "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
     "scene show": Subcommand(
-        "show contents, cost of a step and advice on the method", "cli.scenes:show", SCENE
+        "show contents, cost of a step and advice on the method", "cli.runs:show", SCENE
     ),
     "scene check": Subcommand(
         "check scene files and report all faults",
-        "cli.scenes:check_files",
+        "cli.runs:check_files",
         _path("files", nargs="+", metavar="FILE"),
     ),
     "scene schema": Subcommand("print the JSON schema, for editors", "cli.scenes:print_schema"),
@@ -256,7 +256,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation motions",
-        "cli.motions:run_identification",
+        "cli.identification:run_identification",
         _arg("bag", "folder of the bag, or the word design", metavar="BAG"),
         _scene(
             "designed",

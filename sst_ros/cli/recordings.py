@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that turn a recording into tables or into a valid recording."""
+"""Commands on recordings that compute nothing: tables of one, a valid one of a damaged one."""
 
 from __future__ import annotations
 

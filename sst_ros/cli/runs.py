@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that run a scene or map it: motion, compiled code, workspace, view in the browser.
+"""Commands that assemble a scene: contents, faults, motion, compiled code, workspace, view.
 
 Matplotlib and the page are imported by name where they are asked for: the rest runs without them.
 """
@@ -7,6 +7,7 @@ Matplotlib and the page are imported by name where they are asked for: the rest 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import signal
 import threading
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from sst_ros.cli.commands import free_out, function, refuse
-from sst_ros.errors import SstError, suggestion
+from sst_ros.errors import InputError, Problem, SstError, suggestion
 from sst_ros.extras import require
 from sst_ros.host import child_process
 from sst_ros.host.cache_folder import cache_folder, configured_folder
@@ -22,14 +23,75 @@ from sst_ros.host.output import require_free
 from sst_ros.integration import code_cache, codegen
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import load
+from sst_ros.report.scene_summary import summary
+from sst_ros.scene.scene import Scene, load, text_of
+from sst_ros.scene.yaml_document import line_of, read
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulation import INTEGRATORS
+from sst_ros.simulation.simulation import INTEGRATORS, Simulation
 from sst_ros.view.source import Replay, simulator
 
 PICTURES = (".png", ".pdf", ".svg")
 TABLES = (".parquet", ".csv")
 MOST_SAMPLES = 10_000_000
+ROUNDING = 1e-6
+"""Relative rounding of inertias that a person has typed."""
+
+
+def show(options: argparse.Namespace) -> None:
+    """Print the summary of a scene."""
+    print(summary(load(options.scene)), end="")
+
+
+def check_files(options: argparse.Namespace) -> int:
+    """Check files of scenes; print their faults and warnings."""
+    failed = 0
+    for path in options.files:
+        try:
+            warnings = implausible(check(path))
+            print(f"{path}: valid" + (", with warnings" if warnings else ""))
+            for text in warnings:
+                print(f"{path}: warning: {text}")
+        except SstError as error:
+            failed = 1
+            print(error)
+    return failed
+
+
+def check(name_or_path: str | Path) -> Scene:
+    """Read a scene and assemble it at its initial state, which `load` does not; faults have lines.
+
+    Raises:
+        InputError: it cannot be read, is refused, or cannot start; lists every fault.
+
+    """
+    source, origin = text_of(name_or_path)
+    scene = read(Scene, source, origin)
+    problems: list[Problem]
+    try:
+        Simulation(scene)
+    except InputError as error:
+        problems = list(error.problems)
+    except SstError as error:
+        problems = [Problem("initial.gamma", scene.initial.gamma, f"cannot start here: {error}")]
+    else:
+        return scene
+    placed = [dataclasses.replace(p, line=line_of(source, p.key)) for p in problems]
+    raise InputError(origin, placed)
+
+
+def implausible(scene: Scene) -> list[str]:
+    """Describe numbers that no body can have though each alone is allowed.
+
+    A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O, whatever its shape.
+    """
+    star = scene.star
+    trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
+    if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
+        return []
+    return [
+        f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass = {star.mass:g} kg "
+        f"within star.radius = {star.radius:g} m has at most 2 m r^2 = {most:g} kg m^2"
+    ]
 
 
 def compile_code(options: argparse.Namespace) -> None:
