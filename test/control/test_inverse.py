@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanism.loaded_lagrange import LoadedLagrange
-from mechanism.test_loads import loaded
-from mechanism.test_terms_truth import laden
+from lagrange import Lagrange
+from mechanism.test_loads import laden, loaded
 from models import FAST, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
@@ -85,7 +84,7 @@ def test_torques_are_those_of_the_paper(sample, gamma_ddot):
 @pytest.mark.parametrize("sample", seeded_samples(83, 3), ids=range(3))
 def test_torques_are_lagranges_with_gravity_springs_and_friction(sample):
     scene, at = laden(sample), sample.posture
-    truth = LoadedLagrange(scene, sample.rotation)
+    truth = Lagrange(scene, sample.rotation)
     loads = truth.loads(sample.gamma, sample.gamma_dot)
     gamma_ddot = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque + loads)
     bias = virtual_work.bias(at, sample.gamma_dot).omega_dot
@@ -98,7 +97,7 @@ def test_torques_are_lagranges_with_gravity_springs_and_friction(sample):
 @pytest.mark.parametrize("sample", seeded_samples(84, 3), ids=range(3))
 def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
     scene = dataclasses.replace(laden(sample), friction=None)
-    truth = LoadedLagrange(laden(sample), sample.rotation)
+    truth = Lagrange(laden(sample), sample.rotation)
     expected = -np.array(truth.loads(sample.gamma, np.zeros(3)))
     found = InverseDynamics(scene).gravity_torque(sample.quaternion)
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()

@@ -5,16 +5,20 @@ Random manipulators and states; all assemblies as the eight complex zeros of thr
 """
 
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 
-import mpmath as mp
 import numpy as np
+from lagrange import exact, solve
+from models import Sample, rigid_body, scene_of
+from mpmath import mp
+from scipy.spatial.transform import Rotation
 
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.mechanism.virtual_work import Mechanism
 
 ISOTROPIC = Geometry.build(np.eye(3), np.radians([120.0, 120.0, 120.0]))
 FOLDING = Geometry.build(np.eye(3), np.radians([210.0, 75.0, 75.0]))
+SIZES = (0.3, *(0.1,) * 3, *(0.05,) * 3)
+"""Of the inertias of star, actuated and intermediate links."""
 
 
 def random_geometry(rng, roughness=1.0):
@@ -28,23 +32,18 @@ def random_geometry(rng, roughness=1.0):
     return Geometry.build(v, alpha)
 
 
-def random_tensor(rng, scale=1.0):
-    """An inertia tensor that some rigid body has: positive definite, triangle inequality."""
-    points = rng.normal(size=(6, 3))
-    second = scale * points.T @ points / 6
-    return np.trace(second) * np.eye(3) - second
-
-
-def random_mechanism(rng, geometry):
-    """Full tensors for all seven links."""
-    actuated = np.stack([random_tensor(rng, 0.1) for _ in range(3)])
-    intermediate = np.stack([random_tensor(rng, 0.05) for _ in range(3)])
-    return Mechanism(geometry, random_tensor(rng, 0.3), actuated, intermediate)
+def random_sample(rng, geometry=None) -> Sample:
+    """Full tensors for all seven links, in motion anywhere off the singularities."""
+    geometry = random_geometry(rng) if geometry is None else geometry
+    tensors = [rigid_body(rng.uniform(-1.0, 1.0, 6), size) for size in SIZES]
+    scene = scene_of(geometry.v, np.degrees(geometry.alpha), tensors[0], tensors[1:4], tensors[4:])
+    gamma, rotation = random_pose(rng, geometry)
+    rate, torque, moment = rng.normal(size=(3, 3)) * [[2.0], [1.0], [1.0]]
+    return Sample(scene, Geometry.of(scene), rotation, gamma, rate, torque, moment)
 
 
 def random_rotation(rng):
-    q = rng.normal(size=4)
-    return rotation_of(q / np.linalg.norm(q))
+    return rotation_of(rng.normal(size=4))
 
 
 def random_pose(rng, geometry, least=0.2):
@@ -65,14 +64,8 @@ def random_pose(rng, geometry, least=0.2):
 
 
 def rotation_of(q):
-    """R of unit quaternions (w, x, y, z), any leading shape."""
-    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
-    rows = [
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    """R of quaternions (w, x, y, z), shape (4,) or (n, 4)."""
+    return Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix()
 
 
 # All assemblies: r_k . R(q) e_k = 0 are three quadrics in the homogeneous quaternion q. By Bezout
@@ -161,8 +154,7 @@ def complex_zeros(forms, seed=7):
 def real_rotations(q, near=1e-9):
     """Rotations (m, 3, 3) of those of the zeros (8, 4) that are real to `near`."""
     real = np.abs(q.imag).max(axis=1) < near
-    unit = q.real[real]
-    return rotation_of(unit / np.linalg.norm(unit, axis=1)[:, None])
+    return rotation_of(q.real[real])
 
 
 def exact_rotations(r, e, q, digits=50):
@@ -172,63 +164,30 @@ def exact_rotations(r, e, q, digits=50):
     stay distinct, which proves that none is missing.
     """
     with mp.workdps(digits):
-        forms = [_exact_quadric(r[k], e[k]) for k in range(3)]
-        zeros = [_refined(forms, zero) for zero in q]
-        for i in range(8):
-            for j in range(i):
-                assert max(abs(a - b) for a, b in zip(*_aligned(zeros[i], zeros[j]), strict=True)) \
-                    > mp.mpf(10) ** -20  # fmt: skip
+        forms = quadrics(exact(r), exact(e))
+        zeros = [_refine(forms, zero) for zero in q]
+        for first, second in combinations(zeros, 2):
+            at = np.argmax(np.abs(first.astype(complex)))  # both scaled to 1 there, if they can be
+            other = second / second[at] if abs(second[at]) >= mp.mpf(10) ** -10 else second
+            assert np.abs(first / first[at] - other).max() > mp.mpf(10) ** -20
         small = mp.mpf(10) ** -25
-        real = [[z.real for z in zero] for zero in zeros if max(abs(z.imag) for z in zero) < small]
-        found = []
-        for zero in real:
-            length = mp.sqrt(sum(z * z for z in zero))
-            found.append(rotation_of([float(z / length) for z in zero]))
-    return np.array(found).reshape(-1, 3, 3)
+        real = [zero for zero in zeros if max(abs(z.imag) for z in zero) < small]
+        return rotation_of(np.reshape([[float(z.real) for z in zero] for zero in real], (-1, 4)))
 
 
-def _exact_quadric(r, e):
-    """Q_k in exact numbers: integer matrices times the doubles r_i e_j."""
-    entries = {}
-    for i in range(3):
-        for j in range(3):
-            pattern = quadrics(np.eye(3)[[i]][None], np.eye(3)[[j]][None])[0, 0]
-            for a in range(4):
-                for b in range(4):
-                    if pattern[a, b]:
-                        term = (
-                            mp.mpf(float(pattern[a, b])) * mp.mpf(float(r[i])) * mp.mpf(float(e[j]))
-                        )
-                        entries[a, b] = entries.get((a, b), mp.mpf(0)) + term
-    return entries
-
-
-def _refined(forms, zero):
-    q = [mp.mpc(complex(z)) for z in zero]
+def _refine(forms, zero):
+    """Newton's method with the largest entry held."""
+    q = np.frompyfunc(lambda z: mp.mpc(complex(z)), 1, 1)(zero)
     fixed = int(np.argmax(np.abs(zero)))
-    q = [z / q[fixed] for z in q]
+    q = q / q[fixed]
     free = [i for i in range(4) if i != fixed]
     for _ in range(60):
-        slope, value = mp.zeros(3, 3), mp.zeros(3, 1)
-        for k, form in enumerate(forms):
-            half = [sum(v * q[b] for (row, b), v in form.items() if row == a) for a in range(4)]
-            value[k] = sum(half[a] * q[a] for a in range(4))
-            for column, a in enumerate(free):
-                slope[k, column] = 2 * half[a]
-        step = mp.lu_solve(slope, -value)
-        for column, a in enumerate(free):
-            q[a] += step[column]
-        if max(abs(x) for x in step) < mp.mpf(10) ** (5 - mp.mp.dps):
+        half = forms @ q
+        step = solve(2 * half[:, free], -(half @ q))
+        q[free] += step
+        if np.abs(step).max() < mp.mpf(10) ** (5 - mp.dps):
             return q
     raise AssertionError("a zero does not settle")
-
-
-def _aligned(a, b):
-    """Both scaled to 1 where a is largest."""
-    at = max(range(4), key=lambda i: abs(a[i]))
-    if abs(b[at]) < mp.mpf(10) ** -10:
-        return a, b
-    return [x / a[at] for x in a], [x / b[at] for x in b]
 
 
 def same_rotations(found, expected, tolerance):

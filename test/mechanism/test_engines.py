@@ -7,7 +7,7 @@ the axis t_k on legs 2 and 3 is tied to the star. Each model is built at one pos
 
 import numpy as np
 import pytest
-from mechanism.closed_chains import ISOTROPIC, random_geometry, random_mechanism, random_pose
+from mechanism.closed_chains import ISOTROPIC, random_sample
 
 from sst_ros.mechanism import continuation, rates, virtual_work
 
@@ -21,20 +21,17 @@ class Case:
 
     def __init__(self, seed):
         rng = np.random.default_rng(seed)
-        geometry = ISOTROPIC if seed % 4 == 0 else random_geometry(rng)
-        self.mechanism = random_mechanism(rng, geometry)
-        gamma, rotation = random_pose(rng, geometry)
-        self.w, self.t = geometry.w, geometry.e @ rotation.T
-        across = np.cross(self.w, geometry.v)
-        self.r = np.cos(gamma)[:, None] * geometry.v + np.sin(gamma)[:, None] * across
-        first = [np.stack([r, np.cross(w, r), w], 1) for r, w in zip(self.r, self.w, strict=True)]
-        second = [np.stack([r, np.cross(t, r), t], 1) for r, t in zip(self.r, self.t, strict=True)]
-        self.frames = {"s": rotation}
+        sample = random_sample(rng, ISOTROPIC if seed % 4 == 0 else None)
+        self.mechanism, at = sample.mechanism, sample.posture
+        self.w, self.t, self.r = at.w, at.t, at.r
+        links = zip(*virtual_work.link_frames(at), strict=True)
+        self.frames = {"s": sample.rotation}
         self.tensors = {"s": self.mechanism.star}
-        for k in range(3):
-            self.frames[f"a{k}"], self.frames[f"i{k}"] = first[k], second[k]
+        for k, (first, second) in enumerate(links):
+            self.frames[f"a{k}"], self.frames[f"i{k}"] = first, second
             self.tensors[f"a{k}"] = self.mechanism.actuated[k]
             self.tensors[f"i{k}"] = self.mechanism.intermediate[k]
+        geometry, gamma, rotation = sample.geometry, sample.gamma, sample.rotation
         self.states = [self._state(rng, geometry, gamma, rotation) for _ in range(4)]
 
     def _state(self, rng, geometry, gamma, rotation):
@@ -51,11 +48,10 @@ class Case:
         at = virtual_work.posture(geometry, point, branch.rotation[1])
         answer = virtual_work.direct_dynamics(self.mechanism, at, rate, torque, moment)
         motion = rates.of_actuators(at, rate, answer)
-        moved = {name: getattr(branch, name)[1] - getattr(branch, name)[0]
-                 for name in ("gamma", "mu", "beta")}  # fmt: skip
         kinds = {"g": "gamma", "m": "mu", "b": "beta"}
-        q = {j: moved[kinds[j[0]]][int(j[1])] for j in JOINTS}
-        v = {j: getattr(motion, kinds[j[0]] + "_dot")[int(j[1])] for j in JOINTS}
+        angles = {kind: np.diff(getattr(branch, name), axis=0)[0] for kind, name in kinds.items()}
+        speeds = {kind: getattr(motion, f"{name}_dot") for kind, name in kinds.items()}
+        q, v = ({j: of[j[0]][int(j[1])] for j in JOINTS} for of in (angles, speeds))
         return q, v, torque, moment, answer
 
 

@@ -1,22 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Assemblies against the loop closure itself, against symmetry and against plain geometry."""
+"""Every assembly, none missing and none too many; the inverse; which assembly is meant."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from models import COUNT, FAST, sample_of, samples
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from mechanism.closed_chains import (
+    FOLDING,
+    ISOTROPIC,
+    census,
+    complex_zeros,
+    exact_rotations,
+    quadrics,
+    random_geometry,
+    random_pose,
+    random_rotation,
+    same_rotations,
+)
+from models import FAST, assembly_of, samples
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Geometry
 
-ISOTROPIC = Geometry.build(np.eye(3), np.radians([120.0] * 3))
 HOME = np.full(3, np.pi / 4)
-# Positions lose digits like 1 / det J2, which is above 0.05 on the samples.
-POSITION = 1e-12
+SEEDS = st.integers(0, 2**32 - 1)
 
 
 def turned(angle, axis, vector):
@@ -29,17 +41,103 @@ def closure(geometry, gamma, rotation):
     return np.array([r_k @ rotation @ e for r_k, e in zip(r, geometry.e, strict=True)])
 
 
-def gammas(count, seed=0):
-    return np.random.default_rng(seed).uniform(0.02, np.pi / 2 - 0.02, (count, 3))
+# All assemblies, against the zeros of quadrics by Bezout.
 
 
-def random_geometries(count, seed):
+def solve(geometry, gammas):
+    found = kinematics.direct_many(geometry, gammas)
+    r = kinematics.carriage_directions(geometry, gammas)[found.configuration]
+    t = geometry.e @ found.rotation.transpose(0, 2, 1)
+    assert np.abs(np.sum(r * t, axis=2)).max(initial=0.0) <= 1e-14
+    assert np.all(found.isolated)
+    return found.configuration, found.rotation, found.admissible
+
+
+def isotropic(count, rng):
+    return [ISOTROPIC] * (count // 100), list(rng.uniform(0, np.pi / 2, (count // 100, 100, 3)))
+
+
+def general(count, rng):
+    geometries = [random_geometry(rng) for _ in range(count // 10)]
+    return geometries, [rng.uniform(0, 1, (10, 3)) * geometry.arc for geometry in geometries]
+
+
+@pytest.mark.parametrize("kind", [isotropic, general])
+@pytest.mark.parametrize(
+    ("count", "hardest"), [(1000, 10), pytest.param(10_000, 200, marks=pytest.mark.slow)]
+)
+def test_the_assemblies_are_all_the_real_zeros(kind, count, hardest):
+    result = census(solve, *kind(count, np.random.default_rng(1)), hardest)
+    print(result)
+    assert result.configurations == count
+    assert result.nearest > 1e-6  # all eight complex zeros are known and distinct: none is missing
+    assert (result.missing, result.spurious) == (0, 0)
+
+
+def folds(count, seed):
+    """gamma at which two assemblies meet: det J2 = 0 on a random arc of rotations."""
     rng = np.random.default_rng(seed)
     while count:
-        sample = sample_of(rng.uniform(-1.0, 1.0, COUNT))
-        if sample is not None:
-            count -= 1
-            yield sample.geometry, rng.uniform(0.1, 0.9, 3) * sample.geometry.arc
+        geometry, start = random_geometry(rng), random_rotation(rng)
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+
+        def pose(x, axis=axis, start=start):
+            return turned(x, axis, start)
+
+        def volume(x, geometry=geometry, pose=pose):
+            t = geometry.e @ pose(x).T
+            p = np.cross(t, geometry.w)
+            return np.linalg.det(np.cross(p / np.linalg.norm(p, axis=1)[:, None], t))
+
+        values = [volume(x) for x in np.linspace(0, 3, 20)]
+        for i in range(19):
+            if values[i] * values[i + 1] < 0:
+                x = brentq(volume, 3 * i / 19, 3 * (i + 1) / 19, xtol=1e-16)
+                yield geometry, kinematics.inverse(geometry, pose(x))[0], rng.normal(size=3)
+                count -= 1
+                break
+
+
+@pytest.mark.parametrize("distance", [1e-4, 1e-8, 1e-11])
+def test_near_double_assemblies_on_both_sides_of_a_fold(distance):
+    for geometry, gamma, direction in folds(6, seed=3):
+        for sign in (-1, 1):
+            point = gamma + sign * distance * direction / np.linalg.norm(direction)
+            r = kinematics.carriage_directions(geometry, point)
+            zeros, _ = complex_zeros(quadrics(r[None], geometry.e[None]))
+            expected = exact_rotations(r, geometry.e, zeros[0])
+            _, found, _ = solve(geometry, point[None])
+            assert same_rotations(found, expected, 1e-9) == (0, 0)
+
+
+def test_assemblies_that_meet_do_not_vanish():
+    """In doubles the pair that meets is one, or two on either side of det J2 = 0."""
+    for geometry, gamma, _ in folds(20, seed=4):
+        found = kinematics.direct(geometry, gamma)
+        singular = [assembly for assembly in found if abs(assembly.det_j2) < 1e-6]
+        assert len(singular) in (2, 4)
+        if len(singular) == 4:
+            first, second = singular[0], singular[2]
+            side = np.sign(first.rotation[:, 1] @ second.rotation[:, 1])
+            assert side * first.det_j2 * second.det_j2 < 0
+            assert np.abs(first.rotation[:, 2] - second.rotation[:, 2]).max() < 1e-6
+
+
+def test_many_at_once_are_the_same_bits_and_in_the_same_order_as_one_by_one():
+    rng = np.random.default_rng(2)
+    for geometry in (ISOTROPIC, FOLDING, random_geometry(rng)):
+        gammas = rng.uniform(0, 1, (40, 3)) * geometry.arc
+        many = kinematics.direct_many(geometry, gammas)
+        for row, gamma in enumerate(gammas):
+            one = [assembly.rotation for assembly in kinematics.direct(geometry, gamma)]
+            mine = many.rotation[many.configuration == row]
+            assert len(one) == len(mine)
+            np.testing.assert_allclose(np.reshape(one, (-1, 3, 3)), mine, rtol=0, atol=1e-12)
+        again = kinematics.direct_many(geometry, gammas)
+        assert again.rotation.tobytes() == many.rotation.tobytes()
+        s = many.rotation[:, :, 2]
+        np.testing.assert_array_equal(s[::2], s[1::2])
 
 
 @FAST
@@ -58,6 +156,60 @@ def test_assemblies_close_the_loops_in_pairs_of_proper_rotations(sample):
         assert min(np.abs(other.rotation - twin).max() for other in found) < 1e-13
 
 
+# The inverse, and both ways together.
+
+
+@settings(max_examples=150)
+@given(SEEDS)
+def test_direct_of_inverse_is_the_orientation_again(seed):
+    rng = np.random.default_rng(seed)
+    geometry = random_geometry(rng)
+    _, rotation = random_pose(rng, geometry)
+    gamma, mu, beta = kinematics.inverse(geometry, rotation)
+    best = min(
+        kinematics.direct(geometry, gamma), key=lambda a: np.abs(a.rotation - rotation).max()
+    )
+    assert np.linalg.norm(best.rotation - rotation) <= 1e-12 * np.linalg.norm(rotation)
+    assume(np.all(np.abs(np.abs(beta) - np.pi) > 1e-6))
+    np.testing.assert_allclose([best.mu, best.beta], [mu, beta], rtol=1e-12, atol=1e-12)
+
+
+def same_angles(found, expected):
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected), atol=1e-12)
+
+
+@settings(max_examples=50)
+@given(SEEDS)
+def test_inverse_of_direct_is_gamma_again(seed):
+    rng = np.random.default_rng(seed)
+    geometry = random_geometry(rng)
+    gamma = rng.uniform(0, 1, 3) * geometry.arc
+    for assembly in kinematics.direct(geometry, gamma):
+        if min(abs(assembly.det_j2), np.abs(np.sin(assembly.mu)).min()) < 0.05:
+            continue
+        signs = np.where(np.sin(assembly.mu) > 0, 1, -1)
+        again, mu, beta = kinematics.inverse(geometry, assembly.rotation, signs)
+        np.testing.assert_allclose([again, mu], [gamma, assembly.mu], rtol=1e-12, atol=1e-12)
+        same_angles(beta, assembly.beta)
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, 1), (1, -1, -1), (-1, -1, -1)])
+def test_every_branch_of_the_inverse_closes_the_loops(signs):
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        geometry = random_geometry(rng)
+        _, rotation = random_pose(rng, geometry)
+        gamma, mu, beta = kinematics.inverse(geometry, rotation, signs)
+        described = assembly_of(geometry, gamma, rotation)
+        assert np.abs(kinematics.closure(geometry, gamma, rotation)).max() < 1e-14
+        np.testing.assert_allclose(described.mu, mu, atol=1e-12)
+        same_angles(described.beta, beta)
+        assert np.all(np.sign(mu) == signs)
+
+
+# The geometry itself.
+
+
 def test_home_of_the_isotropic_design():
     home = kinematics.admissible(ISOTROPIC, HOME)
     np.testing.assert_allclose(np.degrees(home.mu), 90.0, atol=1e-12)
@@ -65,12 +217,11 @@ def test_home_of_the_isotropic_design():
     assert beta == pytest.approx(35.2644, abs=1e-4)
     np.testing.assert_allclose(np.degrees(home.beta), beta, atol=1e-12)
     np.testing.assert_allclose(home.rotation[:, 2], np.full(3, 3.0**-0.5), atol=1e-14)
-
-
-def test_at_home_j_is_a_permutation():
+    # There J is a permutation.
     j = np.abs(virtual_work.posture(ISOTROPIC, HOME).j)
-    np.testing.assert_allclose(np.sort(j, axis=0), [[0] * 3, [0] * 3, [1] * 3], atol=1e-14)
-    np.testing.assert_allclose(np.sort(j, axis=1), [[0, 0, 1]] * 3, atol=1e-14)
+    for axis in (0, 1):
+        ordered = np.sort(j, axis=axis)
+        np.testing.assert_allclose(np.moveaxis(ordered, axis, 1), [[0, 0, 1]] * 3, atol=1e-14)
 
 
 def has_fermat_point(gamma):
@@ -84,17 +235,10 @@ def has_fermat_point(gamma):
     return True
 
 
-def is_admissible(gamma):
-    try:
-        kinematics.admissible(ISOTROPIC, gamma)
-    except NoAdmissibleAssembly:
-        return False
-    return True
-
-
 def test_isotropic_pose_exists_iff_the_carriages_have_a_fermat_point():
-    sweep = gammas(400, seed=5)
-    answers = [is_admissible(gamma) for gamma in sweep]
+    sweep = np.random.default_rng(5).uniform(0.02, np.pi / 2 - 0.02, (400, 3))
+    many = kinematics.direct_many(ISOTROPIC, sweep)
+    answers = np.isin(np.arange(400), many.configuration[many.admissible]).tolist()
     assert answers == [has_fermat_point(gamma) for gamma in sweep]
     # A quarter of the cube; sqrt(0.25 0.75 / 400) = 0.022, so 0.08 is more than three sigma.
     assert 1.0 - np.mean(answers) == pytest.approx(0.25, abs=0.08)
@@ -102,29 +246,33 @@ def test_isotropic_pose_exists_iff_the_carriages_have_a_fermat_point():
 
 @FAST
 @given(samples())
-def test_carriages_are_v_turned_about_w(sample):
-    r = kinematics.carriage_directions(sample.geometry, sample.gamma)
+def test_carriages_are_v_turned_about_w_up_to_the_next_corner(sample):
+    geometry = sample.geometry
+    r = kinematics.carriage_directions(geometry, sample.gamma)
     for k in range(3):
-        expected = turned(sample.gamma[k], sample.geometry.w[k], sample.geometry.v[k])
+        expected = turned(sample.gamma[k], geometry.w[k], geometry.v[k])
         np.testing.assert_allclose(r[k], expected, atol=1e-15, rtol=0)
+    ends = kinematics.carriage_directions(geometry, geometry.arc)
+    np.testing.assert_allclose(ends, np.roll(geometry.v, -1, axis=0), atol=1e-15)
 
 
-def test_full_stroke_brings_each_carriage_to_the_next_corner():
-    for geometry, _ in random_geometries(10, seed=7):
-        r = kinematics.carriage_directions(geometry, geometry.arc)
-        np.testing.assert_allclose(r, np.roll(geometry.v, -1, axis=0), atol=1e-15)
+@FAST
+@given(samples())
+def test_star_arcs_enclose_the_angles_alpha(sample):
+    geometry = sample.geometry
+    for k in range(3):
+        following = turned(geometry.alpha[k], [0.0, 0.0, 1.0], geometry.e[k])
+        np.testing.assert_allclose(following, geometry.e[(k + 1) % 3], atol=1e-15, rtol=0)
 
 
-def test_star_arcs_enclose_the_angles_alpha():
-    for geometry, _ in random_geometries(10, seed=8):
-        for k in range(3):
-            following = turned(geometry.alpha[k], [0.0, 0.0, 1.0], geometry.e[k])
-            np.testing.assert_allclose(following, geometry.e[(k + 1) % 3], atol=1e-15, rtol=0)
+def test_none_of_the_arrays_can_be_written_to():
+    assembly = kinematics.admissible(ISOTROPIC, [0.7, 0.8, 0.9])
+    for array in (ISOTROPIC.v, assembly.rotation, assembly.mu, assembly.beta):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
 
 
-def test_geometry_cannot_be_changed():
-    with pytest.raises(ValueError, match="read-only"):
-        ISOTROPIC.v[0, 0] = 2.0
+# Which assembly is meant, and what is refused.
 
 
 def test_no_admissible_assembly_says_where():
@@ -170,19 +318,18 @@ def test_ambiguity_is_told_with_all_candidates():
         kinematics.admissible(geometry, gamma, near=np.diag([-1.0, -1.0, 1.0]))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_gamma_that_is_not_finite_is_refused(bad):
-    with pytest.raises(AssemblyError, match="finite"):
-        kinematics.direct(ISOTROPIC, [0.7, bad, 0.7])
+# Carriages 1 and 2 meet at P2 and t_2 = -t_1: the star is free to turn about a line.
+LOOSE = Geometry.build(np.eye(3), np.radians([180.0, 90.0, 90.0]))
 
 
-def test_gamma_of_another_shape_is_refused():
-    with pytest.raises(AssemblyError, match="three"):
-        kinematics.direct(ISOTROPIC, [0.7, 0.7])
-
-
-def test_a_posture_with_a_family_of_assemblies_is_refused():
-    """Carriages 1 and 2 meet at P2 and t_2 = -t_1: the star is free to turn about a line."""
-    geometry = Geometry.build(np.eye(3), np.radians([180.0, 90.0, 90.0]))
-    with pytest.raises(AssemblyError, match="not isolated"):
-        kinematics.direct(geometry, [np.pi / 2, 0.0, 0.7])
+@pytest.mark.parametrize(
+    ("geometry", "gamma", "said"),
+    [
+        *((ISOTROPIC, [0.7, bad, 0.7], "finite") for bad in (np.nan, np.inf, -np.inf)),
+        (ISOTROPIC, [0.7, 0.7], "three"),
+        (LOOSE, [np.pi / 2, 0.0, 0.7], "not isolated"),
+    ],
+)
+def test_gamma_without_a_finite_number_of_assemblies_is_refused(geometry, gamma, said):
+    with pytest.raises(AssemblyError, match=said):
+        kinematics.direct(geometry, gamma)

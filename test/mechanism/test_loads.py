@@ -1,30 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every load against the geometry it comes from, and all of them against the balance of energy."""
+"""Every load against a truth of its own: geometry, Lagrange with potentials, energy, frequency."""
 
-import dataclasses
+from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lagrange import Lagrange, exact, partials
+from lagrange import friction_torque as documented_torque
 from models import FAST, inertia_of, samples, seeded_samples
+from mpmath import mpf
+from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
 
+from sst_ros import Simulation, load_scene
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import friction_torque, loads_of_leg, stop_torque
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import Inertia, Link, Payload
 from sst_ros.scene.loads import (
     Actuators,
     Friction,
     Gravity,
+    Initial,
     JointFriction,
     Moment,
     Spring,
     Stroke,
+    Workspace,
 )
 
 STEP = 1e-200
+REST = (0.0, 0.0, 0.0)
+FREE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+EXAMPLE2 = load_scene("example2_heavy")
 
 
 def loaded(sample, number):
@@ -38,9 +53,9 @@ def loaded(sample, number):
         for group in (scene.actuated_links, scene.intermediate_links)
     ]
     rub = Friction(viscous=0.3 + number, coulomb=0.2, static=0.3, stribeck=0.5, smoothing=0.1)
-    return dataclasses.replace(
+    return replace(
         scene,
-        star=dataclasses.replace(scene.star, mass=1.0, centre=(0.02, -0.01, 0.03 * number)),
+        star=replace(scene.star, mass=1.0, centre=(0.02, -0.01, 0.03 * number)),
         actuated_links=links[0],
         intermediate_links=links[1],
         payload=Payload(
@@ -80,7 +95,7 @@ def test_energy_changes_by_the_power_put_in(sample, number):
 @FAST
 @given(samples())
 def test_potential_energy_is_the_height_of_the_centres_of_mass(sample):
-    scene = dataclasses.replace(loaded(sample, 0.5), springs=(), stroke=Stroke(at_end="ignore"))
+    scene = replace(loaded(sample, 0.5), springs=(), stroke=Stroke(at_end="ignore"))
     first, second = virtual_work.link_frames(sample.posture)
     field = np.array(scene.gravity.acceleration)
     expected = 0.0
@@ -93,20 +108,37 @@ def test_potential_energy_is_the_height_of_the_centres_of_mass(sample):
     assert found == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
-def only(sample, **terms):
-    return dataclasses.replace(sample.scene, **terms)
+def laden(sample):
+    """Weight, springs of every kind and friction everywhere: what `Lagrange.loads` knows."""
+    return replace(loaded(sample, 0.5), payload=None, moment=None, actuators=None, **FREE)
+
+
+def gamma_ddot_of(sample, body_acceleration):
+    """The paper's way back: J^-1 (omega_dot - its bias)."""
+    at = sample.posture
+    bias = virtual_work.bias(at, sample.gamma_dot).omega_dot
+    return np.linalg.solve(at.j, sample.rotation @ np.array(body_acceleration) - bias)
+
+
+@pytest.mark.parametrize("sample", seeded_samples(71, 3), ids=range(3))
+def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
+    """Both lose some two digits of 1e-16 to M and J; the loads are of the size of the torques."""
+    scene = laden(sample)
+    truth = Lagrange(scene, sample.rotation)
+    loads = truth.loads(sample.gamma, sample.gamma_dot)
+    expected = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque + loads)
+    slope = Dynamics.of(scene).derivative(*sample.state, *sample.torque.tolist())
+    found = gamma_ddot_of(sample, slope[4:])
+    assert np.abs(loads).max() > 1.0
+    assert np.abs(found - expected).max() <= 1e-11 * np.abs(expected).max()
 
 
 def extra_torque(sample, **terms):
     """Torque at the actuators that has the effect of the terms, by the paper's Eq. 90."""
-    model = kernel.model_of(only(sample, **terms))
-    at = sample.posture
-    rate = np.array(
-        kernel.body_acceleration(model, sample.quaternion, sample.body_rate, (0.0,) * 3)
-    )
-    bias = virtual_work.bias(at, sample.gamma_dot)
-    gamma_ddot = np.linalg.solve(at.j, sample.rotation @ rate - bias.omega_dot)
-    return virtual_work.inverse_dynamics(sample.mechanism, at, sample.gamma_dot, gamma_ddot)
+    model = kernel.model_of(replace(sample.scene, **terms))
+    rate = kernel.body_acceleration(model, sample.quaternion, sample.body_rate, REST)
+    arguments = sample.mechanism, sample.posture, sample.gamma_dot
+    return virtual_work.inverse_dynamics(*arguments, gamma_ddot_of(sample, rate))
 
 
 @pytest.mark.parametrize("sample", seeded_samples(4, 4))
@@ -125,12 +157,12 @@ def test_a_constant_moment_works_through_j(sample):
 
 def test_rotor_and_gear_are_an_inertia_of_the_actuated_link():
     sample = seeded_samples(7, 1)[0]
-    with_rotor = only(sample, actuators=Actuators(rotor_inertia=2e-5, gear_ratio=50.0))
+    with_rotor = replace(sample.scene, actuators=Actuators(rotor_inertia=2e-5, gear_ratio=50.0))
     heavier = tuple(
-        Link(inertia=dataclasses.replace(link.inertia, xx=1.0, yy=1.0, zz=link.inertia.zz + 0.05))
+        Link(inertia=replace(link.inertia, xx=1.0, yy=1.0, zz=link.inertia.zz + 0.05))
         for link in sample.scene.actuated_links
     )
-    expected = Dynamics.of(only(sample, actuated_links=heavier)).derivative
+    expected = Dynamics.of(replace(sample.scene, actuated_links=heavier)).derivative
     found = Dynamics.of(with_rotor).derivative
     inputs = (*sample.state, *sample.torque)
     assert found(*inputs) == pytest.approx(expected(*inputs), rel=1e-13)
@@ -139,7 +171,7 @@ def test_rotor_and_gear_are_an_inertia_of_the_actuated_link():
 def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
     sample = seeded_samples(8, 1)[0]
     own = Inertia(xx=0.01, yy=0.02, zz=0.025, xy=0.001)
-    carried = only(sample, payload=Payload(mass=0.5, centre=(0.1, 0.2, 0.3), inertia=own))
+    carried = replace(sample.scene, payload=Payload(mass=0.5, centre=(0.1, 0.2, 0.3), inertia=own))
     x, y, z = 0.1, 0.2, 0.3
     steiner = 0.5 * np.array(
         [
@@ -149,17 +181,17 @@ def test_a_payload_is_an_inertia_of_the_star_by_parallel_axes():
         ]
     )
     total = sample.scene.star.inertia.matrix + own.matrix + steiner
-    star = dataclasses.replace(sample.scene.star, inertia=inertia_of(total))
+    star = replace(sample.scene.star, inertia=inertia_of(total))
     inputs = (*sample.state, *sample.torque)
     found = Dynamics.of(carried).derivative(*inputs)
     assert found == pytest.approx(
-        Dynamics.of(only(sample, star=star)).derivative(*inputs), rel=1e-13
+        Dynamics.of(replace(sample.scene, star=star)).derivative(*inputs), rel=1e-13
     )
 
 
 def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
-    scene = only(sample, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
+    scene = replace(sample.scene, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
     stops = loads_of_leg(scene, sample.geometry, 0).stops
     assert stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
     assert stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
@@ -171,8 +203,7 @@ def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
 @pytest.mark.parametrize("v", [-2.0, -0.05, 0.0, 0.003, 0.4])
 def test_friction_is_the_documented_torque_of_its_rate(v):
     friction = Friction(viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01)
-    fading = 0.2 + 0.3 * np.exp(-((v / 0.1) ** 2))
-    expected = 0.3 * v + fading * np.tanh(v / 0.01)
+    expected = float(documented_torque(friction, mpf(v)))
     assert friction_torque(friction, v) == pytest.approx(expected, rel=1e-14)
     assert friction_torque(friction, -v) == -friction_torque(friction, v)
     assert friction_torque(friction, v) * v >= 0.0
@@ -187,10 +218,166 @@ def test_springs_at_one_joint_add_up():
 
 
 def test_lagging_actuators_follow_the_command_with_their_time_constant():
-    scene = only(seeded_samples(10, 1)[0], actuators=Actuators(time_constant=0.05))
     sample = seeded_samples(10, 1)[0]
+    scene = replace(sample.scene, actuators=Actuators(time_constant=0.05))
     dynamics = Dynamics.of(scene)
     has, asked = (0.1, 0.2, 0.3), (1.0, -1.0, 0.5)
     found = dynamics.derivative(*sample.state, *has, *asked)
     assert found[7:] == pytest.approx([18.0, -24.0, 4.0], rel=1e-14)
     assert found[:7] == Dynamics.of(sample.scene).derivative(*sample.state, *has)
+
+
+def kinetic_energy(simulation):
+    state = simulation.state
+    return simulation.dynamics.energies(*state.quaternion, *state.body_rate, *REST)[0]
+
+
+def test_work_becomes_kinetic_energy_and_heat_by_scipys_integrator():
+    """Work and heat are integrated beside the motion; 1e-9 of the work is asked for."""
+    scene = load_scene("friction")
+    torque = scene.torque.at
+    dynamics = Dynamics.of(scene)
+    kinds = (scene.friction.gamma, scene.friction.mu, scene.friction.beta)
+
+    def rates(t, y):
+        tau, joints = torque(t), dynamics.joints(*y[:7])
+        speeds = np.reshape(joints[9:], (3, 3))
+        heat = sum(
+            friction_torque(kind, v) * v
+            for kind, row in zip(kinds, speeds, strict=True)
+            for v in row
+        )
+        return (*dynamics.derivative(*y[:7], *tau), float(np.dot(tau, speeds[0])), heat)
+
+    state = Simulation(scene).state
+    start = (*state.quaternion, *state.body_rate, 0.0, 0.0)
+    run = solve_ivp(rates, (0.0, 0.5), start, method="DOP853", rtol=1e-12, atol=1e-13)
+    *end, work, heat = run.y[:, -1].tolist()
+    kinetic = dynamics.energies(*end, *REST)[0]
+    assert min(work, heat, kinetic) > 0.01
+    assert heat + kinetic == pytest.approx(work, abs=1e-9 * work)
+
+
+def test_friction_alone_never_speeds_anything_up():
+    scene = replace(load_scene("friction"), torque=None, **FREE)
+    scene = replace(scene, initial=Initial(gamma=scene.initial.gamma, gamma_dot=(3.0, -2.0, 1.0)))
+    simulation = Simulation(scene, "dop853")
+    energies = [kinetic_energy(simulation)]
+    for _ in range(60):
+        simulation.step(REST, 10_000_000)
+        energies.append(kinetic_energy(simulation))
+    assert np.all(np.diff(energies) < 0.0)
+    assert energies[-1] < 0.5 * energies[0]
+
+
+def start_of(scene):
+    """State, posture and mass matrix at the start of a scene."""
+    state, gamma = Simulation(scene).state, scene.initial.gamma
+    at = virtual_work.posture(Geometry.of(scene), gamma, rotation_matrix(state.quaternion))
+    mechanism = virtual_work.Mechanism.of(scene)
+    return state, at, -virtual_work.equation_of_motion(mechanism, at, np.zeros(3))[0]
+
+
+def period(scene, direction):
+    """Time between the first and the last of some zeros of the motion along a direction [s]."""
+    dynamics, state = Dynamics.of(scene), Simulation(scene).state
+
+    def crossing(_, y):
+        return float(np.dot(np.subtract(dynamics.joints(*y)[:3], scene.initial.gamma), direction))
+
+    run = solve_ivp(
+        lambda _, y: dynamics.derivative(*y, *REST),
+        (0.0, 3.0),
+        (*state.quaternion, *state.body_rate),
+        method="DOP853",
+        rtol=1e-11,
+        atol=1e-14,
+        events=crossing,
+    )
+    times = run.t_events[0]
+    times = times[times > 1e-6]
+    return 2.0 * (times[-1] - times[0]) / (len(times) - 1)
+
+
+def check_period(scene, stiffness, mode):
+    """Small swings have the period of T1 and stiffness; errors go with the amplitude, 1e-5."""
+    mass = start_of(scene)[2]
+    squares, modes = eigh(stiffness, mass)
+    omega = np.sqrt(squares[mode])
+    moving = Initial(gamma=scene.initial.gamma, gamma_dot=1e-5 * omega * modes[:, mode])
+    found = period(replace(scene, initial=moving), mass @ modes[:, mode])
+    assert found == pytest.approx(2.0 * np.pi / omega, rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", range(3))
+@pytest.mark.parametrize("name", ["example2_stroke", "general"])
+def test_small_swings_between_springs_have_the_periods_of_t1_and_stiffness(name, mode):
+    """Springs at all kinds of joints, relaxed at the start."""
+    scene = load_scene(name)
+    moving = replace(scene.initial, gamma_dot=REST)
+    state, at, _ = start_of(replace(scene, initial=moving))
+    springs, stiffness = [], np.zeros((3, 3))
+    for kind, slopes in (("gamma", np.eye(3)), ("mu", at.a), ("beta", at.b)):
+        for k, rest in enumerate(getattr(state.joints, kind)):
+            value = 20.0 + 7.0 * k if kind == "gamma" else 3.0 + 2.0 * k
+            springs.append(Spring(joint=f"{kind}_{k + 1}", stiffness=value, rest=float(rest)))
+            stiffness += value * np.outer(slopes[k], slopes[k])
+    check_period(replace(scene, springs=tuple(springs), torque=None, **FREE), stiffness, mode)
+
+
+@pytest.mark.parametrize("mode", range(3))
+def test_a_tool_that_hangs_in_springs_swings_with_the_periods_of_its_height(mode):
+    """Gravity towards E makes the centre stable; the fast mode turns E about itself."""
+    home = (np.pi / 4,) * 3
+    scene = replace(
+        load_scene("gravity_payload"),
+        gravity=Gravity(acceleration=(5.0, 5.0, 5.0)),
+        initial=Initial(gamma=home),
+        **FREE,
+    )
+    truth = Lagrange(scene, start_of(scene)[1].rotation)
+    truth.weights[0] = truth.weights[0] + scene.payload.mass * exact(scene.payload.centre)
+    stiffness = partials(lambda gamma: partials(truth.potential, gamma), exact(home)).astype(float)
+    assert abs(stiffness[0, 1]) > 0.1
+    check_period(scene, stiffness, mode)
+
+
+def test_commands_beyond_the_torque_limit_are_clamped_to_it():
+    scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=2.0))
+    limited, free = Simulation(scene), Simulation(EXAMPLE2)
+    for _ in range(20):
+        state = limited.step((9.0, -3.0, 1.5), 1_000_000)
+        expected = free.step((2.0, -2.0, 1.5), 1_000_000)
+    assert state == expected
+    assert state.torque == (2.0, -2.0, 1.5)
+
+
+def test_a_command_is_clamped_before_it_lags():
+    actuators = Actuators(torque_limit=2.0, time_constant=0.01)
+    simulation = Simulation(replace(EXAMPLE2, actuators=actuators))
+    for _ in range(30):
+        state = simulation.step((9.0, 0.0, 0.0), 1_000_000)
+    assert state.torque[0] == pytest.approx(2.0 * (1.0 - np.exp(-3.0)), rel=1e-9)
+
+
+def test_a_moment_from_a_topic_is_the_constant_one():
+    value = (0.3, -0.2, 0.1)
+    given = Simulation(replace(EXAMPLE2, moment=Moment(value=value)))
+    told = Simulation(replace(EXAMPLE2, moment=Moment(topic=True)))
+    deaf = Simulation(EXAMPLE2)
+    for _ in range(20):
+        one = given.step(REST, 1_000_000)
+        other = told.step(REST, 1_000_000, value)
+        without = deaf.step(REST, 1_000_000, value)
+    assert other.body_rate == pytest.approx(one.body_rate, rel=1e-12)
+    assert abs(without.body_rate[0] - one.body_rate[0]) > 1e-4
+
+
+def test_a_link_without_inertia_is_one_of_vanishing_inertia():
+    scene = EXAMPLE2
+    tiny = replace(scene.intermediate_links[0].inertia, xx=1e-12, yy=1e-12, zz=1e-12)
+    inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
+    bare = replace(scene, intermediate_links=(Link(),) * 3)
+    light = replace(scene, intermediate_links=(Link(inertia=tiny),) * 3)
+    found, expected = (Dynamics.of(s).derivative(*inputs) for s in (bare, light))
+    assert found == pytest.approx(expected, rel=1e-9)

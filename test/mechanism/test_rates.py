@@ -1,182 +1,202 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every Jacobian, rate and acceleration against differentiation in 60 digits.
+"""Rates of every joint and link against differences, and the constraint moments between them.
 
-R(t) is prescribed, so that gamma, mu, beta and all link frames follow in closed form in mpmath.
+The moments are held against the multipliers of a maximal-coordinate Newton-Euler model, which knows
+bodies, axes and inertias only: 21 angular accelerations, 18 multipliers.
 """
 
-import mpmath as mp
 import numpy as np
 import pytest
-from mechanism.closed_chains import ISOTROPIC, random_geometry, random_pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lagrange import Lagrange, Motion
+from mechanism.closed_chains import ISOTROPIC, random_rotation, random_sample
 
 from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import rates, virtual_work
+from sst_ros.mechanism import kinematics, rates, virtual_work
 
-RELATIVE = 1e-12
-STEP = mp.mpf(10) ** -14
-
-
-def vector(values):
-    return [mp.mpf(float(x)) for x in values]
-
-
-def cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def dot(a, b):
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def times(matrix, v):
-    return [dot(row, v) for row in matrix]
-
-
-def rodrigues(phi):
-    """Exp of a rotation vector."""
-    angle = mp.sqrt(dot(phi, phi))
-    x, y, z = (p / angle for p in phi) if angle else (0, 0, 0)
-    k = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    sine, versine = mp.sin(angle), 1 - mp.cos(angle)
-    square = [[dot(row, [k[i][j] for i in range(3)]) for j in range(3)] for row in k]
-    return [
-        [(i == j) + sine * k[i][j] + versine * square[i][j] for j in range(3)] for i in range(3)
-    ]
-
-
-class Motion:
-    """R(t) = Exp(first t + second t^2 / 2) R_0 and all that it moves, in {B}, exactly."""
-
-    def __init__(self, geometry, rotation, first, second, signs):
-        self.start = [vector(row) for row in rotation]
-        self.first, self.second, self.signs = vector(first), vector(second), signs
-        self.v, self.w, self.e = (
-            [vector(x) for x in y] for y in (geometry.v, geometry.w, geometry.e)
-        )
-
-    def rotation(self, t):
-        turn = rodrigues(
-            [a * t + b * t * t / 2 for a, b in zip(self.first, self.second, strict=True)]
-        )
-        columns = [[row[j] for row in self.start] for j in range(3)]
-        turned = [times(turn, column) for column in columns]
-        return [[turned[j][i] for j in range(3)] for i in range(3)]
-
-    def leg(self, t, k):
-        """gamma, mu, beta and the frames {1k}, {2k} as lists of columns."""
-        matrix = self.rotation(t)
-        axis, s, w = times(matrix, self.e[k]), [row[2] for row in matrix], self.w[k]
-        p = [self.signs[k] * x for x in cross(axis, w)]
-        length = mp.sqrt(dot(p, p))
-        r = [x / length for x in p]
-        gamma = mp.atan2(dot(r, cross(w, self.v[k])), dot(r, self.v[k]))
-        mu = mp.atan2(dot(cross(axis, w), r), dot(axis, w))
-        beta = mp.atan2(dot(r, cross(axis, s)), dot(r, s))
-        return gamma, mu, beta, [r, cross(w, r), w], [r, cross(axis, r), axis]
-
-
-def derivative(f, order, h=STEP):
-    """Sixth-order central differences in 60 digits: good for 1e-30 and better."""
-    values = [f(i * h) for i in range(-3, 4)]
-    weights = {1: [-1, 9, -45, 0, 45, -9, 1], 2: [2, -27, 270, -490, 270, -27, 2]}[order]
-    scale = {1: 60 * h, 2: 180 * h * h}[order]
-    return [sum(c * x[i] for c, x in zip(weights, values, strict=True)) / scale
-            for i in range(len(values[0]))]  # fmt: skip
-
-
-def spin(frame, order):
-    """Angular velocity (order 1) or acceleration (2), in {B}, of t -> list of three columns."""
-
-    def omega(t):
-        here = frame(t)
-        moved = [derivative(lambda x, i=i: frame(t + x)[i], 1) for i in range(3)]
-        total = [cross(c, d) for c, d in zip(here, moved, strict=True)]
-        return [sum(parts) / 2 for parts in zip(*total, strict=True)]
-
-    if order == 1:
-        return omega(0)
-    return derivative(omega, 1)
+EXACT = 1e-12
+RELATIVE = 1e-10
+BODIES = 7  # actuated 0 to 2, intermediate 3 to 5, star 6; the base is None
 
 
 def relative(found, expected):
-    expected = np.array([float(x) for x in expected])
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
-def samples():
+def states():
     rng = np.random.default_rng(11)
     for index in range(6):
-        geometry = ISOTROPIC if index == 0 else random_geometry(rng)
-        signs = [1, 1, 1] if index < 4 else [1, -1, -1]
-        gamma, rotation = random_pose(rng, geometry)
-        gamma = gamma + np.pi * (np.array(signs) < 0)
-        yield geometry, gamma, rotation, rng.normal(size=3), rng.normal(size=3), signs
+        sample = random_sample(rng, ISOTROPIC if index == 0 else None)
+        branch = [1, 1, 1] if index < 4 else [1, -1, -1]
+        yield sample, sample.gamma + np.pi * (np.array(branch) < 0)
 
 
-@pytest.mark.parametrize("sample", list(samples()), ids=range(6))
-def test_rates_and_accelerations_of_every_joint_and_link(sample):
-    geometry, gamma, rotation, first, second, signs = sample
-    with mp.workdps(60):
-        exact = Motion(geometry, rotation, first, second, signs)
-        legs = [exact.leg(mp.mpf(0), k) for k in range(3)]
-        joints = {}
-        for order in (1, 2):
-            values = [derivative(lambda t, k=k: exact.leg(t, k)[:3], order) for k in range(3)]
-            joints[order] = [[leg[i] for leg in values] for i in range(3)]
-        star = [spin(lambda t: [list(c) for c in zip(*exact.rotation(t), strict=True)], order)
-                for order in (1, 2)]  # fmt: skip
-        links = {}
-        for order in (1, 2):
-            for frame in (3, 4):
-                seen = [spin(lambda t, k=k, frame=frame: exact.leg(t, k)[frame], order)
-                        for k in range(3)]  # fmt: skip
-                links[order, frame] = np.array(
-                    [[float(dot(axis, seen[k])) for axis in legs[k][frame]] for k in range(3)]
-                )
-        joints = {o: np.array([[float(x) for x in row] for row in v]) for o, v in joints.items()}
-    star = np.array([[float(x) for x in row] for row in star])
-    at = virtual_work.posture(geometry, gamma, rotation)
-    from_star = rates.of_star(geometry, rotation, star[0], star[1], gamma)
-    from_actuators = rates.of_actuators(at, joints[1][0], joints[2][0])
+@pytest.mark.parametrize(("sample", "gamma"), list(states()), ids=range(6))
+def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
+    rate, acceleration = sample.gamma_dot, sample.torque
+    exact = Motion(Lagrange(sample.scene, sample.rotation), gamma, rate, acceleration)
+    here = exact.here
+    omega, omega_dot, of_links, links_dot, joints, joints_dot = (
+        x.astype(float)
+        for x in (
+            exact.omega[0],
+            exact.omega_dot[0],
+            here.own(exact.omega)[1:],
+            here.own(exact.omega_dot)[1:],
+            exact.rates,
+            exact.accelerations,
+        )
+    )
+    at = virtual_work.posture(sample.geometry, gamma, here.rotation.astype(float))
+    from_star = rates.of_star(sample.geometry, at.rotation, omega, omega_dot, gamma)
+    from_actuators = rates.of_actuators(at, rate, acceleration)
     assert not from_actuators.omega.flags.writeable
     for motion in (from_star, from_actuators):
         pairs = [
-            (motion.omega, star[0]),
-            (motion.omega_dot, star[1]),
-            (motion.gamma_dot, joints[1][0]),
-            (motion.mu_dot, joints[1][1]),
-            (motion.beta_dot, joints[1][2]),
-            (motion.gamma_ddot, joints[2][0]),
-            (motion.mu_ddot, joints[2][1]),
-            (motion.beta_ddot, joints[2][2]),
-            (motion.omega_a, links[1, 3]),
-            (motion.omega_a_dot, links[2, 3]),
-            (motion.omega_ipl, links[1, 4]),
-            (motion.omega_ipl_dot, links[2, 4]),
+            (motion.omega, omega),
+            (motion.omega_dot, omega_dot),
+            ([motion.gamma_dot, motion.mu_dot, motion.beta_dot], joints),
+            ([motion.gamma_ddot, motion.mu_ddot, motion.beta_ddot], joints_dot),
+            (motion.omega_a, of_links[:3]),
+            (motion.omega_a_dot, links_dot[:3]),
+            (motion.omega_ipl, of_links[3:]),
+            (motion.omega_ipl_dot, links_dot[3:]),
         ]
-        assert max(relative(f.ravel(), e.ravel()) for f, e in pairs) <= RELATIVE
+        assert max(relative(np.ravel(f), np.ravel(e)) for f, e in pairs) <= EXACT
     # The paper's rows, one by one.
-    bias = virtual_work.bias(at, joints[1][0])
+    bias = virtual_work.bias(at, rate)
     ja, jipl = virtual_work.link_jacobians(at)
-    rate, acceleration = joints[1][0], joints[2][0]
     pairs = [
-        (at.j @ rate, star[0]),
-        (at.a @ rate, joints[1][1]),
-        (at.b @ rate, joints[1][2]),
-        (bias.omega, star[0]),
-        (at.j @ acceleration + bias.omega_dot, star[1]),
-        (at.a @ acceleration + bias.mu_ddot, joints[2][1]),
-        (at.b @ acceleration + bias.beta_ddot, joints[2][2]),
-        (at.u @ acceleration + bias.beta_ddot, joints[2][2]),
-        (ja @ rate, links[1, 3]),
-        (jipl @ rate, links[1, 4]),
+        (at.j @ rate, omega),
+        (at.a @ rate, joints[1]),
+        (at.b @ rate, joints[2]),
+        (bias.omega, omega),
+        (at.j @ acceleration + bias.omega_dot, omega_dot),
+        (at.a @ acceleration + bias.mu_ddot, joints_dot[1]),
+        (at.b @ acceleration + bias.beta_ddot, joints_dot[2]),
+        (at.u @ acceleration + bias.beta_ddot, joints_dot[2]),
+        (ja @ rate, of_links[:3]),
+        (jipl @ rate, of_links[3:]),
     ]
-    assert max(relative(f.ravel(), e.ravel()) for f, e in pairs) <= RELATIVE
+    assert max(relative(np.ravel(f), np.ravel(e)) for f, e in pairs) <= EXACT
 
 
-def test_a_serial_singularity_is_refused():
-    axis = ISOTROPIC.w[0]  # t_1 = R e_1 = w_1
-    s = np.cross(axis, [1.0, 1.0, 0.0]) / np.linalg.norm(np.cross(axis, [1.0, 1.0, 0.0]))
-    rotation = np.stack([np.cross(axis, s), axis, s], axis=1)
+def newton_euler(sample):
+    """Accelerations (7, 3) and joint moments (9, 3) in {B}; joints by kind, then by leg."""
+    geometry, scene, rotation = sample.geometry, sample.scene, sample.rotation
+    w = geometry.w
+    t = geometry.e @ rotation.T
+    across = np.cross(w, geometry.v)
+    r = np.cos(sample.gamma)[:, None] * geometry.v + np.sin(sample.gamma)[:, None] * across
+    joints = [(None, k, w[k]) for k in range(3)]
+    joints += [(k, 3 + k, r[k]) for k in range(3)] + [(3 + k, 6, t[k]) for k in range(3)]
+    frames = [np.stack([r[k], np.cross(w[k], r[k]), w[k]], axis=1) for k in range(3)]
+    frames += [np.stack([r[k], np.cross(t[k], r[k]), t[k]], axis=1) for k in range(3)]
+    frames.append(rotation)
+    links = [*scene.actuated_links, *scene.intermediate_links, scene.star]
+    inertia = [f @ body.inertia.matrix @ f.T for f, body in zip(frames, links, strict=True)]
+
+    # Two directions across each axis, fixed in the parent, which all of the axis is too.
+    pairs = [np.linalg.svd(axis[None])[2][1:] for _, _, axis in joints]
+    rows = np.zeros((18, 3 * BODIES))
+    for index, ((parent, child, _), pair) in enumerate(zip(joints, pairs, strict=True)):
+        rows[2 * index : 2 * index + 2, 3 * child : 3 * child + 3] = pair
+        if parent is not None:
+            rows[2 * index : 2 * index + 2, 3 * parent : 3 * parent + 3] = -pair
+    # Velocities: 18 constraints and three actuator rates.
+    drive = np.zeros((3, 3 * BODIES))
+    for k in range(3):
+        drive[k, 3 * k : 3 * k + 3] = w[k]
+    known = np.concatenate([np.zeros(18), sample.gamma_dot])
+    omega = np.linalg.solve(np.vstack([rows, drive]), known).reshape(BODIES, 3)
+
+    bias, force = np.zeros(18), drive.T @ sample.torque
+    for index, ((parent, child, _), pair) in enumerate(zip(joints, pairs, strict=True)):
+        if parent is not None:
+            turning = np.cross(omega[parent], pair)
+            bias[2 * index : 2 * index + 2] = turning @ (omega[child] - omega[parent])
+    mass = np.zeros((3 * BODIES, 3 * BODIES))
+    for body in range(BODIES):
+        at = slice(3 * body, 3 * body + 3)
+        mass[at, at] = inertia[body]
+        force[at] -= np.cross(omega[body], inertia[body] @ omega[body])
+    force[18:] += sample.moment
+    system = np.block([[mass, -rows.T], [rows, np.zeros((18, 18))]])
+    solved = np.linalg.solve(system, np.concatenate([force, -bias]))
+    multipliers = solved[21:].reshape(9, 2)
+    moments = np.array([m @ pair for m, pair in zip(multipliers, pairs, strict=True)])
+    return solved[:21].reshape(BODIES, 3), moments, frames
+
+
+def sample_of(seed):
+    return random_sample(np.random.default_rng(seed))
+
+
+@settings(max_examples=120)
+@given(st.integers(0, 2**32 - 1))
+def test_accelerations_and_constraint_moments_are_those_of_the_model(seed):
+    sample = sample_of(seed)
+    moving, expected, frames = newton_euler(sample)
+    given_motion = sample.mechanism, sample.posture, sample.gamma_dot
+    answer = virtual_work.direct_dynamics(*given_motion, sample.torque, sample.moment)
+    truth = np.sum(moving[:3] * sample.geometry.w, axis=1)
+    assert relative(answer, truth) <= RELATIVE
+    found = rates.of_torque(*given_motion, sample.torque, sample.moment)
+    moments = np.concatenate([found.actuated, found.revolute, found.prismatic])
+    assert relative(moments, expected) <= RELATIVE
+    local = [found.actuated_local, found.revolute_local, found.prismatic_local]
+    turned = [frames[0:3], frames[3:6], frames[3:6]]
+    for kind in range(3):
+        seen = [turned[kind][k].T @ expected[3 * kind + k] for k in range(3)]
+        assert np.linalg.norm(local[kind] - seen) <= RELATIVE * np.linalg.norm(expected)
+    assert not np.any(found.actuated_local[:, 2])
+    assert not np.any(found.revolute_local[:, 0])
+    assert not np.any(found.prismatic_local[:, 2])
+    assert not found.actuated.flags.writeable
+    # Torque and motion are two ways to ask for the same.
+    other = rates.of_motion(*given_motion, answer, sample.moment)
+    for name in ("actuated", "revolute", "prismatic", "torque"):
+        one, two = getattr(found, name), getattr(other, name)
+        assert np.linalg.norm(one - two) <= RELATIVE * max(np.linalg.norm(one), 1.0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_star_is_in_balance(seed):
+    sample = sample_of(seed)
+    at, arguments = sample.posture, (sample.gamma_dot, sample.torque, sample.moment)
+    acceleration = virtual_work.direct_dynamics(sample.mechanism, at, *arguments)
+    bias = virtual_work.bias(at, sample.gamma_dot)
+    tensor = sample.rotation @ sample.scene.star.inertia.matrix @ sample.rotation.T
+    total = rates.of_torque(sample.mechanism, at, *arguments).prismatic.sum(axis=0) + sample.moment
+    change = tensor @ (at.j @ acceleration + bias.omega_dot)
+    spin = np.cross(bias.omega, tensor @ bias.omega)
+    np.testing.assert_allclose(total, change + spin, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_static_moment_goes_through_the_legs_to_the_base(seed):
+    """At rest with tau = -J^T n_ext all moments on the base add up to n_ext; without load, none."""
+    sample, moment = sample_of(seed), random_rotation(np.random.default_rng(seed))[0]
+    at_rest = sample.mechanism, sample.posture, np.zeros(3), np.zeros(3)
+    found = rates.of_motion(*at_rest, moment)
+    base = found.actuated + found.torque[:, None] * sample.geometry.w
+    np.testing.assert_allclose(base.sum(axis=0), -moment, atol=1e-12)
+    idle = rates.of_torque(*at_rest)
+    assert not np.any(idle.actuated) and not np.any(idle.prismatic)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda rotation, gamma: rates.of_star(ISOTROPIC, rotation, [1.0, 0.0, 0.0]),
+        lambda rotation, gamma: virtual_work.posture(ISOTROPIC, gamma, rotation),
+    ],
+)
+def test_a_serial_singularity_is_told(ask):
+    t, x = ISOTROPIC.w[0], np.array([1.0, 0.0, 0.0])  # t_1 = R e_1 = w_1
+    assert t @ x == 0.0
+    s = np.cos(0.7) * x + np.sin(0.7) * np.cross(t, x)
+    rotation = np.stack([np.cross(t, s), t, s], axis=1)
     with pytest.raises(SingularConfiguration, match="serial"):
-        rates.of_star(ISOTROPIC, rotation, [1.0, 0.0, 0.0])
+        ask(rotation, kinematics.inverse(ISOTROPIC, rotation)[0])

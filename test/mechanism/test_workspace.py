@@ -106,8 +106,9 @@ def test_parallel_singularities_of_the_folding_geometry(folding):
         assert abs(described.det_j2) < 1e-13
         tangents = np.tan(poses.beta[i])
         assert abs(tangents @ [np.sin(a2), np.sin(a3), np.sin(a1)]) < 1e-11
-        with pytest.raises(SingularConfiguration, match="parallel"):
+        with pytest.raises(SingularConfiguration, match="parallel") as caught:
             virtual_work.posture(FOLDING, poses.gamma[i], poses.rotation[i])
+        assert abs(caught.value.measure) < 1e-12
     assert "parallel: none" not in workspace.report_singularities(FOLDING, folding)
 
 
