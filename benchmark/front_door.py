@@ -16,7 +16,7 @@ from collections.abc import Callable
 from statistics import median
 
 from sst_ros import Simulation, Trajectory, load_scene, prepare, simulate
-from sst_ros.integration.gauss_motion import GaussMotion
+from sst_ros.simulation.simulate_gauss import GaussMotion
 
 ROUNDS, CALLS, STARTS = 50, 10, 9
 

@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 
 from sst_ros.errors import InputError
+from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.propagator import Propagator
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump, plain
+from sst_ros.simulation import simulate_steps
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
@@ -257,3 +260,21 @@ def test_rodas4_runs_under_a_sine_profile():
     }
     assert motions["rodas4"].evaluations != motions["dopri5"].evaluations
     np.testing.assert_allclose(motions["rodas4"].gamma, motions["dopri5"].gamma, atol=1e-7)
+
+
+@pytest.mark.skipif(numba_version() is None, reason="needs numba")
+@pytest.mark.parametrize(("scene", "method"), [("swing", "auto"), ("example2_heavy", "rk4")])
+def test_a_run_that_goes_on_in_compiled_code_has_the_same_digits(scene, method, monkeypatch):
+    plain = simulate(scene, duration=0.6, method=method, tolerance=1e-9)
+    monkeypatch.setattr(simulate_steps, "_WORTH_LOADING", 100)
+    monkeypatch.setattr(simulate_steps, "_WORTH_COMPILING", 200)
+    compiled = []
+    monkeypatch.setattr(
+        Propagator, "compile", lambda self, do=Propagator.compile: compiled.append(do(self))
+    )
+    found = simulate(scene, duration=0.6, method=method, tolerance=1e-9)
+    assert compiled
+    assert found.quaternion.tobytes() == plain.quaternion.tobytes()
+    assert found.gamma_dot.tobytes() == plain.gamma_dot.tobytes()
+    told = ("error_estimate", "evaluations", "method", "energy_residual", "step")
+    assert [getattr(found, name) for name in told] == [getattr(plain, name) for name in told]

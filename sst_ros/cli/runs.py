@@ -20,7 +20,7 @@ from sst_ros.extras import require
 from sst_ros.host import child_process
 from sst_ros.host.cache_folder import cache_folder, configured_folder
 from sst_ros.host.output import require_free
-from sst_ros.integration import code_cache, codegen
+from sst_ros.integration import codegen, compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.scene_summary import summary
@@ -106,9 +106,9 @@ def compile_code(options: argparse.Namespace) -> None:
     if (folder := cache_folder()) != configured_folder():
         raise SstError("compiled code would not be kept; see the warning above")
     simulated = load(options.scene)
-    for method in code_cache.make(simulated, options.integrator):
+    for method in compiled_method.make_code(simulated, options.integrator):
         print(f"{method}: compiled, in {folder}", flush=True)
-    if not code_cache.is_there(simulated, options.integrator):
+    if not compiled_method.code_is_there(simulated, options.integrator):
         raise SstError("another process is compiling: try again when it has ended")
 
 

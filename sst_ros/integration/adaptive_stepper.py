@@ -216,6 +216,13 @@ class AdaptiveStepper:
             with contextlib.suppress(ArithmeticError, ValueError):  # no finite Jacobian here
                 self._ode.eigenvalues(0.0, at[0], d)
 
+    def compile(self) -> None:
+        """Take compiled steps from now on, which have the same bits, but for a function."""
+        if self._derivative is None and not self._compiled:
+            self._compiled = True
+            self._methods.clear()
+            self._current = self._method_of(self.method)
+
     def checkpoint(self) -> StepperCheckpoint:
         """Return what the next steps depend on, to go back to."""
         return self._current, self._h, self._since_choice, len(self.history)

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from operator import is_
 from types import ModuleType
@@ -14,9 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.expression import Slots
-from sst_ros.dynamics.traced_dynamics import LAG, ODE
+from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, ode_with_work
+from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import codegen, step_loops
-from sst_ros.integration.methods import Rosenbrock, Tableau
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock, Tableau
+from sst_ros.scene.scene import Scene
 
 Method = Tableau | Rosenbrock
 Vector = Sequence[float]
@@ -227,10 +230,11 @@ class CompiledMethod:
         return self._listed(new)
 
 
-def has_code(system: ODE, method: Method) -> bool:
+def has_code(
+    system: ODE, method: Method, functions: Sequence[str] = ("step_pair", "step_many")
+) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
     source = _source(system, method, by_structure=True)
-    functions = ("step_pair", "step_many")
     return codegen.has_code(source.texts, source.constants, functions, base=source.base)
 
 
@@ -318,3 +322,38 @@ def _linearise(system: ODE, slots: Slots | None) -> str:
 def _assign(places: list[str], call: str) -> str:
     """Body of a function that puts what a call returns into places."""
     return f"    ({', '.join(places)},) = {call}\n"
+
+
+def code_is_there(scene: Scene, integrator: str) -> bool:
+    """Return whether all code of a run of the scene is there, for each method it may use."""
+    if codegen.numba_version() is None:
+        return False
+    system = ode_with_work(Dynamics.of(scene))
+    return all(has_code(system, method) for method in _methods(integrator))
+
+
+def make_code(scene: Scene, integrator: str) -> Iterator[str]:
+    """Make what is not there; yields the name of each method when its code is there.
+
+    Where another process makes code this does nothing: it would take the processor from it.
+    """
+    system = ode_with_work(Dynamics.of(scene))
+    folder = cache_folder()
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        for method in _methods(integrator):
+            if not has_code(system, method):
+                size, drive = len(system.state), (0.0,) * len(system.drive)
+                y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
+                machine = CompiledMethod(system, method, compiled=True)
+                # What comes out is of no interest: the calls have the code made.
+                machine.step_pair(0.0, 1e-3, y, y, drive)
+                machine.step_many(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
+            yield method.name
+
+
+def _methods(integrator: str) -> tuple[Method, ...]:
+    return (METHODS[integrator],) if integrator in METHODS else (DORMAND_PRINCE, DOP853, RODAS4)

@@ -199,6 +199,12 @@ class Propagator:
         load_root_finder()
         self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
 
+    def compile(self) -> None:
+        """Take compiled steps from now on; the bits are the same."""
+        self._new_stepper.keywords["compiled"] = True
+        for stepper in (self._constant, *self._others.values()):
+            stepper.compile()
+
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
         return self._growth.errors(at, self.accepted_steps)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,9 +61,7 @@ class Geometry:
     @classmethod
     def of(cls, scene: HasGeometry) -> Geometry:
         """Derive the geometry of a scene."""
-        return cls.build(
-            scene.base.v, np.radians(scene.star.alpha_deg), np.radians(scene.workspace.beta_max_deg)
-        )
+        return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 
     @classmethod
     def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: Any = np.pi / 2) -> Geometry:
@@ -101,3 +100,9 @@ class Geometry:
         if self.v.ndim == 2:
             return array[k].tolist()
         return np.ascontiguousarray(array[:, k].T)
+
+
+@lru_cache(maxsize=64)
+def _recent(v: Any, alpha_deg: Any, beta_max_deg: float) -> Geometry:
+    """Build a geometry, or give the one that was built before from the same numbers."""
+    return Geometry.build(v, np.radians(alpha_deg), np.radians(beta_max_deg))

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import scheduling
 from sst_ros.host.cache_folder import cache_folder
-from sst_ros.integration import code_cache, codegen
+from sst_ros.integration import codegen, compiled_method
 from sst_ros.nodes import parameters, simulation_interfaces, topics
 from sst_ros.nodes.process import every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
@@ -274,7 +274,7 @@ class CodeCompiler:
         log = node.get_logger()
         if codegen.numba_version() is None:
             log.info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
-        elif code_cache.is_there(scene, given.integrator):
+        elif compiled_method.code_is_there(scene, given.integrator):
             self.available = True
             log.info(f"compiled code from {cache_folder()}")
         else:
@@ -305,7 +305,7 @@ class CodeCompiler:
 
 
 def _is_compiling() -> bool:
-    """Whether a process has the lock of `code_cache.make`."""
+    """Whether a process has the lock of `compiled_method.make_code`."""
     try:
         with (cache_folder() / "lock").open("r") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -24,7 +24,6 @@ from sst_ros.host.output import slices
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, StepperCheckpoint
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod, Method
-from sst_ros.integration.gauss_motion import GaussMotion, NotSmooth
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report import states
@@ -38,6 +37,7 @@ from sst_ros.report.results import table
 from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import GAUSS, simulate
+from sst_ros.simulation.simulate_gauss import GaussMotion, NotSmooth
 from sst_ros.simulation.simulation import NANOSECONDS
 
 if TYPE_CHECKING:

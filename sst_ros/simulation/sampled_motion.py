@@ -65,6 +65,17 @@ class SampledMotion:
         self.dense = dense
         self._residual = energy_residual
 
+    def with_states(self: T, y: Array) -> T:
+        """Return the same run with other read-only states (n, 7 or 10), before anything is derived.
+
+        Nothing is checked again: a prepared run makes its results by it.
+        """
+        again = object.__new__(type(self))
+        again.__dict__.update(self.__dict__, quaternion=y[:, :4], body_rate=y[:, 4:7])
+        if y.shape[1] > 7:
+            again.torque = y[:, 7:10]
+        return again
+
     def __len__(self) -> int:
         return len(self.t)
 

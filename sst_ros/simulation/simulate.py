@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.gauss_motion import NotSmooth
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
-from sst_ros.simulation.simulate_gauss import CollocatedMotion
+from sst_ros.simulation.simulate_gauss import CollocatedMotion, NotSmooth
 from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
 from sst_ros.simulation.torque_profile import (

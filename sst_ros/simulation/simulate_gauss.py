@@ -3,19 +3,259 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+import math
+import threading
+from collections.abc import Sequence
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.integration.gauss import NODES
-from sst_ros.integration.gauss_motion import GaussMotion, NotSmooth
-from sst_ros.scene.loads import SineTorque
-from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import Simulation
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import Program, number_constants, trace
+from sst_ros.dynamics.limits import Limit, limits_of
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
+from sst_ros.integration.events import first_event
+from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
+from sst_ros.integration.limit_distances import limit_distances
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.simulation.simulation import start_of
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamp
+
+NEAR = 0.05
+"""Distance above which no limit is met between nodes that resolve the motion to the tolerance."""
+
+_ROUNDING = 1e-14
+_HOPELESS, _SLOW = 128, 4.0
+"""Steps from which on doubling them must bring two solutions nearer by this factor: a motion that
+is smooth enough gains far more, one with kinks a factor of two."""
+_ITERATIONS = (5, 6, 8)
+_MOST_ITERATIONS = 10
+
+
+class NotSmooth(ArithmeticError):
+    """Collocation does not reach the tolerance with steps worth taking."""
+
+
+class Ending(NamedTuple):
+    """Where a limit ends a motion: step in which, time in it [s], and the limit."""
+
+    step: int
+    time: float
+    limit: Limit
+
+
+class GaussMotion:
+    """A motion over a span of time, prepared for a tolerance.
+
+    Args:
+        scene: what moves, without contacts.
+        torque: the sine that acts, or three constant torques within the actuators' limit [N m].
+        y: state at t = 0.
+        duration: length of the motion [s].
+        tolerance: largest error estimate of the orientation at the end [rad].
+        compiled: by numba; None where its machine code is there already.
+        finest: most steps that are tried.
+
+    Attributes:
+        count: steps.
+        iterations: evaluations of all nodes in a step.
+        h: length of a step [s].
+        error: estimated error of the orientation at the end [rad]: the distance from a finer
+            solution.
+
+    Raises:
+        NotSmooth: the tolerance is not reached.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        torque: SineTorque | tuple[float, float, float],
+        y: Sequence[float],
+        duration: float,
+        tolerance: float,
+        *,
+        compiled: bool | None = True,
+        finest: int = 4096,
+    ) -> None:
+        self._torque = torque
+        self._dynamics = Dynamics.of(scene)
+        self._limits = tuple(limits_of(scene, Geometry.of(scene)))
+        sine = torque if isinstance(torque, SineTorque) else None
+        held = () if isinstance(torque, SineTorque) else torque
+        self._drive = (*held, *(0.0,) * (len(self._dynamics.drive) - 3))
+        self._method = _collocation(self._dynamics, sine, self._limits, compiled)
+        self._y, self._duration, self._finest = list(y), duration, finest
+        self.count, self.iterations, self.error = self._settings(tolerance)
+        self.h = duration / self.count
+        self._motion = self._prepared(self.count, self.iterations)
+        self._lock = threading.Lock()
+        self.run()
+
+    def run(self) -> Array:
+        """Compute the states at the times of `grid`, shape (count + 1, numbers of the state)."""
+        with self._lock:
+            self._motion.run()
+            return self._motion.states
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the derivative in a run."""
+        return self.count * self.iterations * NODES
+
+    @cached_property
+    def grid(self) -> Array:
+        """Times at which steps begin and the last one ends [s], shape (count + 1,)."""
+        times: Array = self.h * np.arange(self.count + 1.0)
+        times[-1] = self._duration
+        return times
+
+    @cached_property
+    def samples(self) -> Array:
+        """States at the times of `grid`."""
+        return self.run()
+
+    @cached_property
+    def ending(self) -> Ending | None:
+        """Where the first limit is met; None where none is."""
+        if not self._limits or self._motion.least_distances.min() > NEAR:
+            return None
+        for k in range(self.count):
+            met = first_event(self._limits, lambda x: self._joints(k, x), self.h)  # noqa: B023
+            if met is not None:
+                return Ending(k, *met)
+        return None
+
+    def at(self, times: Array) -> Array:
+        """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
+        steps = np.clip(np.searchsorted(self.grid, times, side="right") - 1, 0, self.count - 1)
+        _ = self.samples
+        with self._lock:  # all of them use the same arrays
+            ends = [
+                self._inside(int(k), float(t) - float(self.grid[k]))
+                for k, t in zip(steps, times, strict=True)
+            ]
+        return np.array(ends).reshape(len(times), -1)
+
+    def energy_residual(self, end: float) -> float:
+        """Energy at `end` [s], less that at 0, less the work done, by Gauss quadrature [J]."""
+        model, rows = self._dynamics.model, tables(NODES)
+        last = max(1, math.ceil(end / self.h - 1e-9))
+        begins = self.grid[:last]
+        lengths = np.minimum(self.grid[1 : last + 1], end) - begins
+        times = (begins[:, None] + lengths[:, None] * rows[0]).ravel()
+        weights = (lengths[:, None] * rows[1]).ravel()
+        y = tuple(self.at(times).T)
+        torque: Any = tuple(self.torque(times).T)
+        work = float(np.sum(weights * kernel.power(model, y, torque)))
+        start, stop = map(self._dynamics.total_energy, self.at(np.array([0.0, end])).tolist())
+        return stop - start - work
+
+    def torque(self, times: Array) -> Array:
+        """Torques that are commanded at times [s], shape (m, 3) [N m]."""
+        if isinstance(self._torque, SineTorque):
+            return self._torque.values(times)
+        return np.tile(self._torque, (len(times), 1))
+
+    @cached_property
+    def _single(self) -> PreparedMotion:
+        return self._prepared(1, self.iterations + 1)
+
+    def _inside(self, k: int, x: float) -> Sequence[float]:
+        """State x [s] after step k began."""
+        begin: list[float] = self.samples[k].tolist()
+        if x == 0.0:
+            return begin
+        self._single.begin(float(self.grid[k]), begin, self._drive)
+        self._single.set_step(x)
+        self._single.run()
+        return self._single.end
+
+    def _joints(self, k: int, x: float) -> tuple[float, ...]:
+        return self._dynamics.joints(*self._inside(k, x)[:7])
+
+    def _prepared(self, count: int, iterations: int) -> PreparedMotion:
+        return self._method.prepare(
+            0.0, self._duration / count, count, self._y, self._drive, iterations=iterations
+        )
+
+    def _settings(self, tolerance: float) -> tuple[int, int, float]:
+        """Choose steps and iterations that reach the tolerance at the least cost; their error."""
+        fine = max(_ROUNDING, 0.01 * tolerance)
+        count, end = self._converged(fine)
+        if not end:
+            raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
+        best: tuple[int, int, int, float] | None = None
+        for iterations in _ITERATIONS:
+            steps = count
+            while steps > 0:
+                if best is None or steps * iterations < best[0]:
+                    error = self._error(steps, iterations, end)
+                    if not error <= 0.5 * max(tolerance, 2.0 * _ROUNDING):
+                        break
+                    best = steps * iterations, steps, iterations, error
+                steps = min(steps - 1, int(0.82 * steps))
+        if best is None:
+            return count, _MOST_ITERATIONS, fine
+        return best[1], best[2], max(best[3], _ROUNDING)
+
+    def _converged(self, fine: float) -> tuple[int, list[float]]:
+        """Double the steps until two ends are the same to `fine`; no end where they never are."""
+        count, before, distance = 1, [math.nan] * 7, math.inf
+        while count <= self._finest:
+            motion = self._prepared(count, _MOST_ITERATIONS)
+            end = motion.end if math.isfinite(_change(motion)) else [math.nan] * 7
+            apart = _apart(before, end)
+            if apart < fine:
+                return count, end
+            if count > _HOPELESS and not _SLOW * apart < distance:
+                break
+            count, before, distance = 2 * count, end, apart
+        return count, []
+
+    def _error(self, count: int, iterations: int, reference: Sequence[float]) -> float:
+        motion = self._prepared(count, iterations)
+        return _apart(motion.end, reference) if math.isfinite(_change(motion)) else math.inf
+
+
+def _change(motion: PreparedMotion) -> float:
+    try:
+        return motion.run()
+    except (ArithmeticError, ValueError):
+        return math.inf
+
+
+def _apart(one: Sequence[float], other: Sequence[float]) -> float:
+    """Angle between two orientations, or the distance of the body rates where it is larger."""
+    first, second = one[:4], other[:4]
+    near = min(math.dist(first, second), math.dist(first, [-x for x in second]))
+    speed = max(1.0, math.hypot(*other[4:7]))
+    distance = max(2.0 * near, math.dist(one[4:7], other[4:7]) / speed)
+    return distance if math.isfinite(distance) else math.inf
+
+
+@lru_cache(maxsize=32)
+def _collocation(
+    dynamics: Dynamics, sine: SineTorque | None, limits: tuple[Limit, ...], compiled: bool | None
+) -> Collocation:
+    program: Program | None = None
+    if limits:
+        pairs = tuple((math.cos(limit.end), math.sin(limit.end)) for limit in limits)
+        ends = number_constants(pairs, ("ends",))
+        program = trace(
+            lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
+            (*QUATERNION, *RATE),
+        )
+    ode = ODE(dynamics, sine)
+    if compiled is None:
+        compiled = has_code(ode, limits=program)
+    return Collocation(ode, limits=program, compiled=compiled)
+
 
 _FINEST_PER_SECOND, _FINEST = 1024, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
@@ -41,16 +281,14 @@ class CollocatedMotion:
         self, scene: Scene, law: Any, span: int, period: int | None, tolerance: float, asked: bool
     ) -> None:
         torque = _traced(scene, law, period)
-        state = Simulation(scene).state
         lag = scene.actuators is not None and scene.actuators.time_constant is not None
-        start = [*state.quaternion, *state.body_rate, *((0.0,) * 3 if lag else ())]
+        start = [*start_of(scene), *((0.0,) * 3 if lag else ())]
         duration = span / NANOSECONDS
         finest = _FINEST if asked else min(_FINEST, round(16 + _FINEST_PER_SECOND * duration))
         self._motion = motion = GaussMotion(
             scene, torque, start, duration, tolerance, compiled=asked or None, finest=finest
         )
         self._scene, self._lag = scene, lag
-        self._start = np.array([start])
         self._end, self._ending = duration, motion.ending
         status, message = 0, "reached the end"
         if self._ending is not None:
@@ -58,9 +296,6 @@ class CollocatedMotion:
             status = 1
             message = f"stopped at t = {self._end:.12f} s: {self._ending.limit.reason}"
         chosen = "" if asked else " (auto: a smooth motion under a profile)"
-        # Read-only, so that all trajectories share them.
-        self._times, self._torques = motion.grid.copy(), motion.torque(motion.grid)
-        self._times.flags.writeable = self._torques.flags.writeable = False
         self._of_the_run: dict[str, Any] = {
             "status": status,
             "message": message,
@@ -73,19 +308,23 @@ class CollocatedMotion:
             "energy_residual": partial(motion.energy_residual, self._end),
             "dense": motion.at,
         }
+        self._whole = None
+        if self._ending is None:
+            self._whole = self._trajectory(motion.grid, motion.run())
 
     def trajectory(self, times: np.ndarray | None) -> Trajectory:
         """Compute the motion; times [ns] of the samples, None for the ends of the steps."""
-        t = self._times if times is None else times / NANOSECONDS
-        if times is None and self._ending is None:
-            y = np.concatenate([self._start, self._motion.run()])
-        else:
-            if self._ending is not None:
-                t = np.append(t[t < self._end], self._end)
-            y = self._motion.at(t)
-        torque = y[:, 7:10]
-        if not self._lag:
-            torque = self._torques if t is self._times else self._motion.torque(t)
+        if times is None and self._whole is not None:
+            y = self._motion.run()
+            y.flags.writeable = False
+            return self._whole.with_states(y)
+        t = self._motion.grid if times is None else times / NANOSECONDS
+        if self._ending is not None:
+            t = np.append(t[t < self._end], self._end)
+        return self._trajectory(t, self._motion.at(t))
+
+    def _trajectory(self, t: Array, y: Array) -> Trajectory:
+        torque = y[:, 7:10] if self._lag else self._motion.torque(t)
         return Trajectory(self._scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
 
 

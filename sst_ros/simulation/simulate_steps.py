@@ -14,12 +14,14 @@ import numpy as np
 from sst_ros.host.output import Bar
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.compiled_method import CompiledMethod, has_code
 from sst_ros.integration.global_error import HalvedSteps, Passage, Point
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, begin, unresolved
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, start_of, unresolved
 from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     FeedbackFunction,
@@ -39,6 +41,10 @@ MOST_PERIODS = WHOLE_MOTION_BUDGET // (7 * len(DORMAND_PRINCE.a))
 
 UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
+
+_WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
+"""Evaluations after which a run goes on with compiled code that is there, and makes it: in plain
+Python they take half a second and two to three; to compile the steps of a method takes four."""
 
 _ATTEMPTS, _FINEST = 4, 1e-14
 """Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
@@ -85,7 +91,7 @@ def integrate(task: Task, reason: str, times: np.ndarray | None, progress: bool)
     local = tolerance = task.tolerance
     spent = 0
     for _ in range(_ATTEMPTS):
-        motion = SteppedMotion(task, local, times, progress).run()
+        motion = SteppedMotion(task, local, times, progress, spent).run()
         motion.method += reason
         motion.evaluations = spent = spent + motion.evaluations
         excess = motion.error_estimate / tolerance
@@ -107,11 +113,12 @@ class SteppedMotion:
         tolerance: largest local error of a step.
         times: of the samples [ns], None for the control periods, or even ones.
         progress: draw a bar on a terminal.
+        spent: evaluations of runs before this one.
 
     """
 
     def __init__(
-        self, task: Task, tolerance: float, times: np.ndarray | None, progress: bool
+        self, task: Task, tolerance: float, times: np.ndarray | None, progress: bool, spent: int
     ) -> None:
         self._task, self._scene = task, task.scene
         self._end = task.span / NANOSECONDS
@@ -126,7 +133,7 @@ class SteppedMotion:
             observe=self._pass,
         )
         self._method = self._propagator.method
-        self._start = self._at = begin(task.scene, self._propagator)
+        self._start = self._at = self._propagator.begin(list(start_of(task.scene)))
         self._check = HalvedSteps(self._at)
         self._bar = Bar(f"{self._scene.name}, simulating", progress)
         self._held: list[tuple[float, Vector3]] = []
@@ -134,6 +141,8 @@ class SteppedMotion:
         self._wanted: list[float] = (self._times(times) / NANOSECONDS)[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
         self._time = self._period_end = 0.0
+        known = numba_version() is not None
+        self._spent, self._compile_after = spent, _WORTH_LOADING if known else math.inf
 
     def run(self) -> Trajectory:
         """Go to the end or a limit."""
@@ -207,6 +216,8 @@ class SteppedMotion:
         """Go with the second solution through a step of the run, and take samples in it."""
         self._budget.charge(4 * step.method.pair_cost // 3)
         self._check.add(step)
+        if self._spent + self._budget.spent > self._compile_after:
+            self._compile(step.method)
         end = self._period_end if step.last else step.time + step.h
         self._last = step
         while self._wanted and self._wanted[-1] < end:
@@ -215,6 +226,15 @@ class SteppedMotion:
             self._take(self._wanted.pop(), step.end)
         self._time, self._at = end, step.end
         self._bar.draw(end / self._end)
+
+    def _compile(self, method: CompiledMethod) -> None:
+        """Take compiled steps from now on, if their code is there or the run is long."""
+        there = has_code(method.system, method.method, ("step_pair", "step_fixed"))
+        if there or self._spent + self._budget.spent > _WORTH_COMPILING:
+            self._propagator.compile()
+            self._compile_after = math.inf
+        else:
+            self._compile_after = _WORTH_COMPILING
 
     def _sample(self, time: float) -> None:
         """Take a sample inside the last step, by a pair of shorter ones."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import operator
 import warnings
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -202,7 +203,7 @@ class Simulation:
             derivative=derivative,
         )
         self._warned = not self.compiled
-        self._start = begin(scene, self._propagator)
+        self._start = self._propagator.begin(list(start_of(scene)))
         self._now = self._before = _Instant(0, self._start)
         self.reset()
 
@@ -401,8 +402,9 @@ class Simulation:
         return self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
 
 
-def begin(scene: Scene, propagator: Propagator) -> Point:
-    """Return the initial state of a scene, for its propagator.
+@lru_cache(maxsize=64)
+def start_of(scene: Scene) -> tuple[float, ...]:
+    """Return quaternion and body rate [rad/s] with which a scene begins, seven numbers.
 
     Raises:
         AssemblyError, SingularConfiguration, InputError: as `Simulation`.
@@ -414,7 +416,7 @@ def begin(scene: Scene, propagator: Propagator) -> Point:
         ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
         allowed = f"must lie in the stroke, 0 to ({ends}) rad"
         raise InputError(scene.name, [Problem("initial.gamma", scene.initial.gamma, allowed)])
-    return propagator.begin(list(initial_state(scene, geometry)))
+    return initial_state(scene, geometry)
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:

@@ -17,12 +17,12 @@ from loaded_scenes import IGNORE, loaded
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Number, Slots, number_constants, trace
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, ode_with_work
-from sst_ros.integration import code_cache, codegen, gauss_source
+from sst_ros.integration import codegen, compiled_method, gauss
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.gauss_motion import GaussMotion
 from sst_ros.integration.methods import DORMAND_PRINCE, RODAS4
 from sst_ros.scene.scene import Friction, Inertia, JointFriction, load
 from sst_ros.scene.schema import Section
+from sst_ros.simulation.simulate_gauss import GaussMotion
 from sst_ros.simulation.simulation import Simulation
 
 needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
@@ -135,9 +135,9 @@ def test_another_inertia_needs_no_compilation(tmp_path, monkeypatch):
     heavier = replace(
         EXAMPLE2, star=replace(EXAMPLE2.star, inertia=Inertia(xx=0.03, yy=0.04, zz=0.05))
     )
-    list(code_cache.make(EXAMPLE2, "rk4"))
+    list(compiled_method.make_code(EXAMPLE2, "rk4"))
     made = files_of(tmp_path)
-    assert made and code_cache.is_there(heavier, "rk4")
+    assert made and compiled_method.code_is_there(heavier, "rk4")
     ends = []
     for scene in (EXAMPLE2, heavier):
         fast, plain = (Simulation(scene, "rk4", compiled=compiled) for compiled in (True, False))
@@ -213,8 +213,8 @@ def test_collocation_has_one_text_and_its_numbers_in_its_block():
     texts = set()
     for scene in scenes:
         ode = ode_of(scene, scene.torque)
-        slots = gauss_source.slots_of(ode, None)
-        texts.add("".join(gauss_source.source(ode, 4, None, slots)))
+        slots = gauss.slots_of(ode, None)
+        texts.add("".join(gauss.source(ode, 4, None, slots)))
     assert len(texts) == 1
 
 
