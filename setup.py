@@ -33,7 +33,7 @@ def wheels(distribution: str) -> list[str]:
 EXTRAS = {
     "ros": wheels("kilted"),
     "record": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
-    "plot": ["matplotlib>=3.5", "pandas>=2"],
+    "plot": ["jinja2>=3", "matplotlib>=3.5", "pandas>=2"],
     "fast": ["numba>=0.57"],
     "sweep": ["dask>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
@@ -101,7 +101,7 @@ setup(
     maintainer_email="sst-ros@example.org",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "nodes/*.xml"]},
+    package_data={NAME: ["py.typed", "nodes/*.xml", "report/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -18,8 +18,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.host import child_process
 from sst_ros.report import tracking
-from sst_ros.report.run import report
-from sst_ros.report.text import text
+from sst_ros.report.run import report, summary_text
 from sst_ros.scene import scene
 
 EXAMPLES = ("example1", "example2")
@@ -41,7 +40,7 @@ def demo(out: Path) -> int:
         bag = empty_bag(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
-        print(text(report(bag, folder), str(folder)), flush=True)
+        print(summary_text(report(bag, folder), str(folder)), flush=True)
     return 0
 
 

@@ -11,7 +11,7 @@ from sst_ros.errors import SstError
 EXTRAS = {
     "dask": "sweep",
     "distributed": "cluster",
-    "jinja2": "view",
+    "jinja2": "plot",
     "lz4": "record",
     "matplotlib": "plot",
     "mcap": "record",

@@ -14,8 +14,7 @@ from sst_ros.plot import compare, pictures
 from sst_ros.recording import signals
 from sst_ros.report import accuracy, stability
 from sst_ros.report.reference_solution import EXTENDED, MPMATH
-from sst_ros.report.run import report
-from sst_ros.report.text import table, text
+from sst_ros.report.run import report, summary_table, summary_text
 from sst_ros.scene.scene import load, names
 
 
@@ -24,8 +23,8 @@ def report_run(options: argparse.Namespace) -> None:
     out = free_out(options, results_folder(options.bag, "report"))
     summary = report(options.bag, out, damaged=options.damaged)
     if options.verbose:
-        print(table(summary))
-    print(text(summary, str(out)), end="")
+        print(summary_table(summary))
+    print(summary_text(summary, str(out)), end="")
 
 
 def report_accuracy(options: argparse.Namespace) -> None:

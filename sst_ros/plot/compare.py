@@ -7,9 +7,9 @@ that both have are compared, nothing is interpolated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import workspace
-from sst_ros.plot.motion import applied
-from sst_ros.plot.pictures import known, save
+from sst_ros.plot.pictures import DEGREES, applied, draw_legs, known, save
 from sst_ros.plot.style import LINES, legend, positive, stack, styled, three
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -27,82 +27,36 @@ from sst_ros.recording.topic_tables import SCENE
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
+"""Runs with their names and styles."""
+
 
 class Overlay(NamedTuple):
-    """A picture of several runs: title, topics needed, quantity, its letter and unit."""
+    """A picture of several runs: title, topics needed, and what draws it."""
 
     title: str
     needs: tuple[str, ...]
-    quantity: str = ""
-    letter: str = ""
-    unit: str = ""
-    scale: float = 1.0
+    make: Callable[[Drawn], Figure]
 
 
-JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
-PICTURES = {
-    "gamma": Overlay("Actuator angles", (JOINTS,), "gamma", "γ", "deg", 180.0 / np.pi),
-    "gamma_dot": Overlay("Actuator rates", (JOINTS,), "gamma_dot", "γ̇", "rad/s"),
-    "tracking_error": Overlay("Desired less measured angles", (ERROR,), "gamma_error", "Δγ", "rad"),
-    "torques": Overlay("Applied torques", (TICKS,), "tau", "τ", "N m"),
-    "difference": Overlay("Differences from the first run", (JOINTS,)),
-    "sphere": Overlay("Path of E in the workspace", (TURN, SCENE.key)),
-}
+def _overlay(
+    quantity: str, letter: str, unit: str, scale: float = 1.0
+) -> Callable[[Drawn], Figure]:
+    """Return what draws a quantity of the legs of all runs."""
+
+    def curve(run: Signals) -> tuple[Array, Array]:
+        if quantity == "tau":
+            return applied(run)
+        return run.seconds(), scale * run.legs(quantity)
+
+    def make(runs: Drawn) -> Figure:
+        labels = [f"{name} [{unit}]" for name in three(letter)]
+        return draw_legs(labels, ((name, *curve(run), style) for run, name, style in runs))
+
+    return make
 
 
-@styled
-def draw(
-    runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
-) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of several runs into `out`, as `pictures.draw` does of one.
-
-    Raises:
-        InputError: there are too many runs, a name is unknown, or `out` cannot be written.
-
-    """
-    if not 2 <= len(runs) <= len(LINES):
-        allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
-        raise InputError("plot", [Problem("compare", len(runs), allowed)])
-    names = labels(runs)
-    paths: list[Path] = []
-    missing: dict[str, str] = {}
-    for name in known(only, PICTURES) or list(PICTURES):
-        picture = PICTURES[name]
-        able = [not set(picture.needs) & set(run.missing) for run in runs]
-        left = [label for label, can in zip(names, able, strict=True) if not can]
-        if left:
-            missing[name] = f"without {', '.join(left)}: no {' or '.join(picture.needs)} there"
-        if not any(able) or (name == "difference" and not (able[0] and any(able[1:]))):
-            missing[name] = f"not drawn: {missing[name]}"
-            continue
-        make = {"difference": _difference, "sphere": _sphere}.get(name, _overlay)
-        drawn = [
-            (run, label, style)
-            for run, label, style, can in zip(runs, names, LINES, able, strict=False)
-            if can
-        ]
-        paths += save(make(picture, drawn), picture.title, out, f"compare_{name}")
-    return paths, missing
-
-
-Drawn = Sequence[tuple[Signals, str, dict[str, Any]]]
-
-
-def _overlay(picture: Overlay, runs: Drawn) -> Figure:
-    labels = [f"{letter} [{picture.unit}]" for letter in three(picture.letter)]
-    figure, panels = stack(labels)
-    for run, label, style in runs:
-        if picture.quantity == "tau":
-            seconds, values = applied(run)
-        else:
-            seconds, values = run.seconds(), picture.scale * run.legs(picture.quantity)
-        for axes, column in zip(panels, values.T, strict=True):
-            axes.plot(seconds, column, label=label, **style)
-    legend(panels[0])
-    return figure
-
-
-def _difference(_: Overlay, runs: Drawn) -> Figure:
+def _difference(runs: Drawn) -> Figure:
     figure, panels = stack(["largest |Δγₖ| [rad]", "largest |Δγ̇ₖ| [rad/s]"], 2.6)
     first = runs[0][0]
     for axes, name in zip(panels, ("gamma", "gamma_dot"), strict=True):
@@ -121,7 +75,7 @@ def _difference(_: Overlay, runs: Drawn) -> Figure:
     return figure
 
 
-def _sphere(_: Overlay, runs: Drawn) -> Figure:
+def _sphere(runs: Drawn) -> Figure:
     scene = runs[0][0].scene
     assert scene is not None
     figure, axes, view = workspace.ground(scene)
@@ -129,6 +83,48 @@ def _sphere(_: Overlay, runs: Drawn) -> Figure:
         axes.plot(*view.flat(workspace.directions(run)), label=label, **style)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     return figure
+
+
+JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
+PICTURES = {
+    "gamma": Overlay("Actuator angles", (JOINTS,), _overlay("gamma", "γ", "deg", DEGREES)),
+    "gamma_dot": Overlay("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇", "rad/s")),
+    "tracking_error": Overlay(
+        "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ", "rad")
+    ),
+    "torques": Overlay("Applied torques", (TICKS,), _overlay("tau", "τ", "N m")),
+    "difference": Overlay("Differences from the first run", (JOINTS,), _difference),
+    "sphere": Overlay("Path of E in the workspace", (TURN, SCENE.key), _sphere),
+}
+
+
+@styled
+def draw(
+    runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
+) -> tuple[list[Path], dict[str, str]]:
+    """Write the pictures of several runs into `out`, as `pictures.draw` does of one.
+
+    Raises:
+        InputError: there are too many runs, a name is unknown, or `out` cannot be written.
+
+    """
+    if not 2 <= len(runs) <= len(LINES):
+        allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
+        raise InputError("plot", [Problem("compare", len(runs), allowed)])
+    paths: list[Path] = []
+    missing: dict[str, str] = {}
+    for name in known(only, PICTURES) or list(PICTURES):
+        title, needs, make = PICTURES[name]
+        all_runs = list(zip(runs, labels(runs), LINES, strict=False))
+        drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
+        if left := [label for run, label, _ in all_runs if set(needs) & set(run.missing)]:
+            missing[name] = f"without {', '.join(left)}: no {' or '.join(needs)} there"
+        paired = len(drawn) > 1 and drawn[0][0] is runs[0]
+        if paired or (drawn and name != "difference"):
+            paths += save(make(drawn), title, out, f"compare_{name}")
+        else:
+            missing[name] = f"not drawn: {missing[name]}"
+    return paths, missing
 
 
 def differences(runs: Sequence[Signals]) -> DataFrame:

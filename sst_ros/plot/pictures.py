@@ -1,24 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registry of pictures of a recorded run: what each shows, what it needs, how it is drawn."""
+"""The pictures of a recorded run: what each shows, what it needs, how it is drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import write_into
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot import motion, workspace
 from sst_ros.plot.motion import Solution
-from sst_ros.plot.style import envelope, save_figure, styled
-from sst_ros.recording.signals import Signals
+from sst_ros.plot.style import (
+    BLUE,
+    GREY,
+    VERMILION,
+    envelope,
+    few,
+    legend,
+    lines,
+    mark_ends,
+    save_figure,
+    scaled,
+    span,
+    stack,
+    styled,
+    three,
+)
+from sst_ros.recording.signals import Integers, Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
+from sst_ros.state import NANOSECONDS
 
 FORMATS = ("pdf", "png")
+
+DEGREES = float(np.degrees(1.0))
+"""Angles are drawn in degrees, their errors in radians."""
+
+ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 
 
 class Picture(NamedTuple):
@@ -36,12 +59,45 @@ class Picture(NamedTuple):
     make: Callable[[Signals, Scene], Figure]
 
 
+Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
+"""Curves over time in one panel: label of the axis, names, and a column (n,) each of a run."""
+
+
+def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
+    """Return what draws panels one above the other."""
+
+    def make(run: Signals, _: Scene) -> Figure:
+        figure, grid = stack([panel[0] for panel in panels], height)
+        for axes, (_label, names, values) in zip(grid, panels, strict=True):
+            lines(axes, run.seconds(), values(run), names)
+        return figure
+
+    return make
+
+
+def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
+    """Return a panel of one quantity of the three legs."""
+    return label, three(letter), lambda run: scale * run.legs(quantity)
+
+
+def draw_legs(
+    labels: Sequence[str], series: Iterable[tuple[str, Array, Array, Mapping[str, Any]]]
+) -> Figure:
+    """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg."""
+    figure, panels = stack(labels)
+    for name, seconds, values, style in series:
+        for axes, column in zip(panels, values.T, strict=True):
+            axes.plot(seconds, column, label=name, **style)
+    legend(panels[0])
+    return figure
+
+
 def solution(run: Signals) -> Solution:
     """Return the recorded motion of the star."""
     quaternion = run.take("q_x", "q_y", "q_z", "q_w")
     euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-    curves = quaternion.T if euler is None else [*quaternion.T, *euler.T]
-    rows = envelope(curves, len(quaternion))
+    both = quaternion.T if euler is None else [*quaternion.T, *euler.T]
+    rows = envelope(both, len(quaternion))
     shown = None if euler is None else euler[rows]
     return Solution("run", run.seconds()[rows], quaternion[rows], shown)
 
@@ -50,34 +106,149 @@ def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
     return lambda run, _: motion.angle([solution(run)], which)
 
 
+def _tracking(run: Signals, _: Scene) -> Figure:
+    """Draw the desired angle of each actuator, and the measured one over it."""
+    desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
+    seconds = run.seconds()
+    figure = draw_legs(
+        [f"{name} [deg]" for name in three("γ")],
+        [
+            ("desired", seconds, desired, {"color": GREY, "linewidth": 3.2}),
+            ("measured", seconds, measured, {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}),
+        ],
+    )
+    span(figure.axes, seconds)
+    return figure
+
+
+def _torques(run: Signals, _: Scene) -> Figure:
+    """Draw the torque of each tick, and the commands over it where they were recorded.
+
+    Commands without a stamp are drawn where the recorder received them, by its clock.
+    """
+    seconds, torque = applied(run)
+    series = [("applied", seconds, torque, {"color": BLUE, "linewidth": 3.0})]
+    table = next((name for name in ("commands_stamped", "commands") if name in run.tables), None)
+    if table is not None:
+        at, values = run.seconds(table), run.legs("tau", table)
+        inside = (at >= seconds[0]) & (at <= seconds[-1])
+        dots = {"color": VERMILION, "linestyle": "none", "marker": ".", "markersize": 1.5}
+        if inside.any():
+            series.append(("commanded", at[inside], values[inside], dots))
+    figure = draw_legs([f"{name} [N m]" for name in three("τ")], series)
+    span(figure.axes, seconds)
+    return figure
+
+
+def applied(run: Signals) -> tuple[Array, Array]:
+    """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held."""
+    start = run.time_ns("ticks")
+    length = run.take("length", table="ticks")[:, 0].astype(np.int64)
+    return few(*held(start, start + length, run.legs("tau", "ticks")))
+
+
+def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:
+    """Return times [s] and values that draw a zero-order hold; a gap between ticks is nan."""
+    times = np.stack([start_ns, end_ns], axis=1).ravel() / NANOSECONDS
+    steps = np.repeat(values, 2, axis=0)
+    gaps = 2 * (np.flatnonzero(start_ns[1:] != end_ns[:-1]) + 1)
+    return np.insert(times, gaps, times[gaps]), np.insert(steps, gaps, np.nan, axis=0)
+
+
+def _energy(run: Signals, scene: Scene) -> Figure:
+    """Draw the energies, the work of the actuators, and what they differ by.
+
+    The difference is what friction, loads from outside and the integrator took or gave.
+    """
+    kinetic, potential = motion.energies(run, scene)
+    done = motion.work(run).sum(axis=1)
+    known = np.flatnonzero(np.isfinite(kinetic))[:1]
+    raised = potential - (potential[known[0]] if len(known) else 0.0)
+    gained = kinetic - (kinetic[known[0]] if len(known) else 0.0) + raised
+    residual, unit = scaled(gained - done)
+    shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
+    if not np.nanmax(np.abs(raised), initial=0.0):
+        del shown["potential, gained"]  # no gravity, no springs
+    figure, panels = stack(["energy [J]", f"energy gained − work [{unit}J]"], 2.8)
+    lines(panels[0], run.seconds(), np.stack([*shown.values()], axis=1), list(shown))
+    lines(panels[1], run.seconds(), residual[:, None], ["residual"])
+    panels[1].axhline(0.0, color=GREY, linewidth=0.8)
+    return figure
+
+
+def _phase(run: Signals, _: Scene) -> Figure:
+    """Draw each actuator's rate over its angle, from the circle to the square."""
+    figure = Figure(figsize=(10.5, 3.8))
+    angle, rate = DEGREES * run.legs("gamma"), run.legs("gamma_dot")
+    for leg, axes in enumerate(figure.subplots(1, 3)):
+        axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
+        mark_ends(axes, angle[:, leg], rate[:, leg])
+        axes.set_xlabel(f"{three('γ')[leg]} [deg]")
+        axes.set_ylabel(f"{three('γ̇')[leg]} [rad/s]")
+    figure.axes[-1].legend(loc="best", fontsize=8)
+    return figure
+
+
+def _margins(run: Signals, scene: Scene) -> Figure:
+    """Draw the distance of each leg to the nearest limit of its joints."""
+    geometry = Geometry.of(scene)
+    figure, panels = stack(["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6)
+    most = {"gamma": geometry.arc, "beta": geometry.beta_max}
+    for axes, (name, limit) in zip(panels, most.items(), strict=True):
+        left = np.minimum(run.legs(name), limit - run.legs(name))
+        lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
+        axes.axhline(0.0, color="black", linewidth=0.8)
+    return figure
+
+
+def _power(run: Signals) -> Array:
+    """Power of each actuator at the end of each step [W]."""
+    return run.legs("tau") * run.legs("gamma_dot")
+
+
+_TRACKING_ERROR = curves(  # as the controller received it
+    legs("γ desired − γ [rad]", "gamma_error", "γ"),
+    legs("γ̇ desired − γ̇ [rad/s]", "gamma_dot_error", "γ̇"),
+)
+_CONTROL_TORQUES = curves(
+    legs("feedforward [N m]", "tau_feedforward", "τ"), legs("feedback [N m]", "tau_feedback", "τ")
+)
+_POWER = curves(
+    ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
+    ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
+)
+_WORK = curves(("work [J]", ACTUATORS, motion.work), height=3.2)
+KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
+_JOINT_ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.items()))
+_JOINT_RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
 JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
+ERROR, REFERENCE = "tracking_error", "reference"
 PICTURES = {
     "path_of_E": Picture(
-        "Path of point E", (ORIENTATION, S),
-        lambda run, scene: motion.path(scene, [solution(run)]),
+        "Path of point E", (ORIENTATION, S), lambda run, scene: motion.path(scene, [solution(run)])
     ),
     "position_of_E": Picture(
-        "Position of point E", (ORIENTATION, S),
+        "Position of point E",
+        (ORIENTATION, S),
         lambda run, scene: motion.position_of_e(scene, [solution(run)]),
     ),
-    "theta": Picture("The angle θ", (ORIENTATION,), _angle(0)),
-    "phi": Picture("The angle φ", (ORIENTATION,), _angle(1)),
-    "psi": Picture("The angle ψ", (ORIENTATION,), _angle(2)),
-    "tracking": Picture("Desired and measured angles", (JOINTS, "reference"), motion.tracking),
-    "tracking_error": Picture("Tracking error", ("tracking_error",), motion.tracking_error),
-    "control_torques": Picture(
-        "Torques of the controller", ("reference", "tracking_error"), motion.control_torques
-    ),
-    "torques": Picture("Torques", (TICKS,), motion.applied_and_commanded),
-    "power": Picture("Power of the actuators", (JOINTS,), motion.power),
-    "work": Picture("Work of the actuators", (JOINTS, TICKS), motion.actuator_work),
-    "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), motion.energy),
-    "joint_angles": Picture("Joint angles", (JOINTS,), motion.joint_angles),
-    "joint_rates": Picture("Joint rates", (JOINTS,), motion.joint_rates),
-    "phase": Picture("Phase portraits of the actuators", (JOINTS,), motion.phase),
-    "margins": Picture("Distance to the limits", (JOINTS, S), motion.margins),
+    **{
+        name: Picture(f"The angle {letter}", (ORIENTATION,), _angle(which))
+        for which, (name, letter) in enumerate({"theta": "θ", "phi": "φ", "psi": "ψ"}.items())
+    },
+    "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
+    "tracking_error": Picture("Tracking error", (ERROR,), _TRACKING_ERROR),
+    "control_torques": Picture("Torques of the controller", (REFERENCE, ERROR), _CONTROL_TORQUES),
+    "torques": Picture("Torques", (TICKS,), _torques),
+    "power": Picture("Power of the actuators", (JOINTS,), _POWER),
+    "work": Picture("Work of the actuators", (JOINTS, TICKS), _WORK),
+    "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), _energy),
+    "joint_angles": Picture("Joint angles", (JOINTS,), _JOINT_ANGLES),
+    "joint_rates": Picture("Joint rates", (JOINTS,), _JOINT_RATES),
+    "phase": Picture("Phase portraits of the actuators", (JOINTS,), _phase),
+    "margins": Picture("Distance to the limits", (JOINTS, S), _margins),
     "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), workspace.sphere),
-}  # fmt: skip
+}
 
 
 @styled

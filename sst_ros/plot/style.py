@@ -14,21 +14,24 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.signals import Integers
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
 """Colours that the colour-blind can distinguish (Okabe and Ito); line styles differ too."""
 
-LINES: tuple[dict[str, Any], ...] = (
+Looks: TypeAlias = "dict[str, Any]"
+"""Arguments of matplotlib that say how something looks."""
+
+LINES: tuple[Looks, ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 2.6},
     {"color": VERMILION, "linestyle": "--", "linewidth": 1.8},
     {"color": GREEN, "linestyle": ":", "linewidth": 1.8},
@@ -102,6 +105,16 @@ def three(letter: str) -> tuple[str, str, str]:
     return first, second, third
 
 
+def sides(geometry: Geometry, points: int) -> list[Array]:
+    """Points on the three sides of the base triangle on the unit sphere, shape (points, 3) each."""
+    share = np.linspace(0.0, 1.0, points)[:, None]
+    across = np.cross(geometry.w, geometry.v)
+    return [
+        np.cos(arc * share) * v + np.sin(arc * share) * u
+        for arc, v, u in zip(geometry.arc, geometry.v, across, strict=True)
+    ]
+
+
 def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:
     """Make panels one above the other with a common time axis."""
     figure = Figure(figsize=(7.0, 1.0 + height * len(labels)))
@@ -137,18 +150,15 @@ def lines(
 
 def legend(axes: Axes) -> None:
     """Put the legend above the panel, where no curve can be."""
-    axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=4, borderaxespad=0.1, fontsize=8,
-        frameon=False,
-    )  # fmt: skip
+    place: Looks = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+    axes.legend(**place, ncol=4, fontsize=8, frameon=False)
 
 
 def mark_ends(axes: Axes, *path: Array) -> None:
     """Mark the first and the last known point of a path, shape (n,) a coordinate."""
     known = np.flatnonzero(np.isfinite(path[0]))
-    for at, marker, colour, name in (
-        (known[:1], "o", GREEN, "start"), (known[-1:], "s", VERMILION, "end"),
-    ):  # fmt: skip
+    ends = (known[:1], "o", GREEN, "start"), (known[-1:], "s", VERMILION, "end")
+    for at, marker, colour, name in ends:
         place = [column[at] for column in path]
         axes.plot(*place, marker, color=colour, markersize=6, label=name, linestyle="none")
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ from sst_ros.mechanism import workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
-from sst_ros.plot.style import BLUE, mark_ends
+from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
 from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene
 
@@ -34,9 +34,10 @@ WORST_COND = 10.0
 LABEL_INSET = math.radians(5.0)
 """Distance from a side of the triangle below which a contour has no label."""
 
-_INK, _PALE, _ALARM = "#222222", "#ececec", "#d1182b"
+_ALARM = "#d1182b"
 
 
+@styled
 def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
     """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
 
@@ -45,7 +46,7 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
         titles: a name for each; by default none.
 
     """
-    figure = Figure(figsize=(13.5, 4.3 * len(charts)), layout="constrained")
+    figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
     for row, chart, title in zip(rows, charts, names, strict=True):
@@ -54,36 +55,49 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
     return figure
 
 
+class _Measure(NamedTuple):
+    """A quantity on the map: its values (n,), its colours, and the colour bar's unit."""
+
+    title: str
+    values: Array
+    colours: str
+    unit: str
+
+    @property
+    def condition(self) -> bool:
+        """Whether it is cond J: logarithmic, from 1, and the least is the best."""
+        return self.unit == "cond J"
+
+
 def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
     view = View(chart.geometry)
     poses = workspace.parallel_singularities(chart)
     share = f"E reaches {100 * _reached(chart, faces):.0f} % of the triangle"
     worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
     least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
-    figure.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=_INK)
+    figure.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
     turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
-    panels = [
-        ("Free turn of the star about OE", "deg", turn, "viridis", (0.0, None)),
-        ("Best condition of J over that turn", "cond J", chart.best_cond_j, "magma_r",
-         (1.0, WORST_COND)),
-        ("Distance to the nearest limit, best turn", "deg", np.degrees(chart.best_margin),
-         "viridis", (0.0, None)),
-    ]  # fmt: skip
-    for axes, (name, unit, values, colours, limits) in zip(
-        figure.subplots(1, 3), panels, strict=True
-    ):
-        _panel(axes, view, chart, faces, values, colours, limits, unit)
-        axes.set_title(name, fontsize=10.5, color=_INK)
-        if unit == "cond J" and len(poses):
-            x, y = view.flat(poses.rotation[:, :, 2])
-            axes.plot(x, y, ".", markersize=2.2, color=_ALARM, alpha=0.8)
-            axes.plot([], [], "o", markersize=4, color=_ALARM, label="det J2 = 0 at some turn")
-        if unit == "cond J":
-            ends = workspace.serial_singularities(chart.geometry)
-            if len(ends):
-                x, y = view.flat(ends.rotation[:, :, 2])
-                axes.plot(x, y, "o", markersize=2, color="#1b6ca8", label="det J1 = 0 at the edge")
-            if len(poses) or len(ends):
+    margin = np.degrees(chart.best_margin)
+    panels = (
+        _Measure("Free turn of the star about OE", turn, "viridis", "deg"),
+        _Measure("Best condition of J over that turn", chart.best_cond_j, "magma_r", "cond J"),
+        _Measure("Distance to the nearest limit, best turn", margin, "viridis", "deg"),
+    )
+    for axes, panel in zip(figure.subplots(1, 3), panels, strict=True):
+        _panel(axes, view, chart, faces, panel)
+        axes.set_title(panel.title, fontsize=10.5, color=INK, loc="center")
+        if not panel.condition:
+            continue
+        ends = workspace.serial_singularities(chart.geometry)
+        marked = [
+            (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
+            (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
+        ]
+        for found, marker, size, colour, label in marked:
+            if len(found):
+                x, y = view.flat(found.rotation[:, :, 2])
+                axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
+                axes.plot([], [], "o", markersize=4, color=colour, label=label)
                 axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
@@ -95,101 +109,84 @@ def _reached(chart: OrientationMap, faces: NDArray[np.intp]) -> float:
 
 
 def _panel(
-    axes: Axes,
-    view: View,
-    chart: OrientationMap,
-    faces: NDArray[np.intp],
-    values: Array,
-    colours: str,
-    limits: tuple[float, float | None],
-    unit: str,
+    axes: Axes, view: View, chart: OrientationMap, faces: NDArray[np.intp], panel: _Measure
 ) -> None:
     x, y = view.flat(chart.s)
-    axes.tripcolor(Triangulation(x, y, faces), np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
-    mesh = Triangulation(x, y, faces)
+    mesh, values = Triangulation(x, y, faces), panel.values
+    axes.tripcolor(mesh, np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
     known = np.isfinite(values)
     if known.any():
-        scale = LogNorm if limits[1] else Normalize
-        norm = scale(limits[0], limits[1] or np.nanmax(values))
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        norm = LogNorm(1.0, WORST_COND) if panel.condition else Normalize(0.0, high)
         # Values go on past the edge of the workspace, and the picture is cut there.
         nearest = cKDTree(chart.s[known]).query(chart.s)[1]
         whole = np.where(known, values, values[known][nearest])
-        edge = axes.tricontourf(
-            mesh, chart.measures.margin.max(axis=1), levels=[0.0, np.pi], alpha=0.0
-        )
-        filled = axes.tripcolor(
-            mesh, whole, cmap=colours, shading="gouraud", norm=norm, rasterized=True
-        )
-        lines = _contours(axes, mesh, whole, limits)
+        inside = chart.measures.margin.max(axis=1)
+        edge = axes.tricontourf(mesh, inside, levels=[0.0, np.pi], alpha=0.0)
+        looks: Looks = {
+            "cmap": panel.colours,
+            "norm": norm,
+            "shading": "gouraud",
+            "rasterized": True,
+        }
+        filled = axes.tripcolor(mesh, whole, **looks)
+        lines = _contours(axes, mesh, whole, panel.condition)
         inset = LinearTriInterpolator(mesh, np.arcsin((chart.s @ chart.geometry.w.T).min(axis=1)))
         for label in lines[1:]:
             label.set_visible(bool(inset(*label.get_position()).filled(0.0) > LABEL_INSET))
         if not known.all():
             for part in (filled, *lines):
                 part.set_clip_path(edge.get_paths()[0], axes.transData)
-        above = limits[1] is not None and np.nanmax(values) > limits[1]
-        bar = axes.figure.colorbar(
-            filled, ax=axes, shrink=0.72, pad=0.02, extend="max" if above else "neither"
-        )
-        bar.set_label(unit, fontsize=9)
+        above = "max" if panel.condition and high > WORST_COND else "neither"
+        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, extend=above)
+        bar.set_label(panel.unit, fontsize=9)
         bar.ax.tick_params(labelsize=8)
-        if limits[1]:
+        if panel.condition:
             bar.set_ticks([1, 1.5, 2, 3, 5, 10], labels=["1", "1.5", "2", "3", "5", "10"])
             bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        goal = np.nanmin(values) if unit == "cond J" else np.nanmax(values)
+        goal = low if panel.condition else high
         near = np.abs(values - goal) <= 0.01 * abs(goal)
         best = int(np.nanargmax(np.where(near, chart.best_margin, np.nan)))
-        axes.plot(x[best], y[best], "*", markersize=13, color="white", markeredgecolor=_INK)
-        label = f"least {goal:.2f}" if unit == "cond J" else f"most {goal:.0f}°"
-        axes.annotate(
-            label, (x[best], y[best]), (0, 8), textcoords="offset points", fontsize=9,
-            color=_INK, ha="center",
-            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75},
-        )  # fmt: skip
+        place = x[best], y[best]
+        axes.plot(*place, "*", markersize=13, color="white", markeredgecolor=INK)
+        text = f"least {goal:.2f}" if panel.condition else f"most {goal:.0f}°"
+        box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
+        beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
+        axes.annotate(text, place, (0, 8), color=INK, **beside)
     frame(axes, view)
 
 
-def _contours(
-    axes: Axes, mesh: Triangulation, values: Array, limits: tuple[float, float | None]
-) -> list[Any]:
-    top = limits[1] or float(np.nanmax(values))
+def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -> list[Any]:
+    top = float(np.nanmax(values))
     step = 5 if top < 45 else 10 if top < 75 else 20
-    levels = [1.1, 1.2, 1.5, 2.0, 3.0, 5.0] if limits[1] else list(range(step, 360, step))
-    inside = [lv for lv in levels if np.nanmin(values) < lv < np.nanmax(values)]
+    levels = [1.1, 1.2, 1.5, 2.0, 3.0, 5.0] if condition else list(range(step, 360, step))
+    inside = [level for level in levels if np.nanmin(values) < level < top]
     if not inside:
         return []
     lines = axes.tricontour(mesh, values, levels=inside, colors="white", linewidths=0.8)
-    return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if limits[1] else "%g°")]
+    return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if condition else "%g°")]
 
 
 def frame(axes: Axes, view: View) -> None:
     """Draw the base triangle with its corners and the sense of gamma along its arcs."""
     geometry = view.geometry
     reach = max(float(np.hypot(*view.flat(v))) for v in geometry.v)
-    for k in range(3):
-        along = np.linspace(0.0, geometry.arc[k], 60)[:, None]
-        arc = np.cos(along) * geometry.v[k]
-        arc = arc + np.sin(along) * np.cross(geometry.w[k], geometry.v[k])
-        x, y = view.flat(arc)
-        axes.plot(x, y, color=_INK, lw=1.8, solid_capstyle="round")
+    arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.5}
+    for k, side in enumerate(sides(geometry, 61)):
+        x, y = view.flat(side)
+        axes.plot(x, y, color=INK, lw=1.8, solid_capstyle="round")
         # gamma_k grows from P_k to P_k+1.
-        axes.annotate("", (x[32], y[32]), (x[28], y[28]),
-                      arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.5})  # fmt: skip
-        corner = np.array(view.flat(geometry.v[k]))
-        axes.plot(*corner, "o", markersize=5, color=_INK)
-        _beside(axes, np.array([x[30], y[30]]), f"$\\gamma_{k + 1}$")
-        _beside(axes, corner, f"$P_{k + 1}$")
+        axes.annotate("", (x[32], y[32]), (x[28], y[28]), arrowprops=arrow)
+        corner, middle = np.array([x[0], y[0]]), np.array([x[30], y[30]])
+        axes.plot(*corner, "o", markersize=5, color=INK)
+        for point, name in ((middle, f"$\\gamma_{k + 1}$"), (corner, f"$P_{k + 1}$")):
+            x, y = point * (1.0 + 0.1 / np.hypot(*point))
+            axes.text(x, y, name, fontsize=12, color=INK, ha="center", va="center")
     axes.set_aspect("equal")
     axes.set_xlim(-1.22 * reach, 1.22 * reach)
     axes.set_ylim(-0.86 * reach, 1.2 * reach)
     axes.set_axis_off()
-
-
-def _beside(axes: Axes, point: Array, label: str) -> None:
-    """Write a label outward of a point on the triangle."""
-    x, y = point * (1.0 + 0.1 / np.hypot(*point))
-    axes.text(x, y, label, fontsize=12, color=_INK, ha="center", va="center")
 
 
 class View:
@@ -239,10 +236,10 @@ def ground(scene: Scene) -> tuple[Figure, Axes, View]:
     inside = Triangulation(mesh.x, mesh.y, faces, mask=beyond[faces].any(axis=1))
     levels = [level for level in LEVELS if np.nanmin(margin) < level < np.nanmax(margin)]
     if levels:
-        drawn = axes.tricontour(inside, np.nan_to_num(margin), levels=levels, colors="#999999",
-                                linewidths=0.7)  # fmt: skip
+        looks: Looks = {"levels": levels, "colors": GREY, "linewidths": 0.7, "alpha": 0.7}
+        drawn = axes.tricontour(inside, np.nan_to_num(margin), **looks)
         axes.clabel(drawn, fontsize=7, fmt="%g°")
-        axes.plot([], [], color="#999999", linewidth=0.7, label="distance to the nearest limit")
+        axes.plot([], [], color=GREY, linewidth=0.7, label="distance to the nearest limit")
     frame(axes, view)
     return figure, axes, view
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of a study in files: tables by pandas, a page of Markdown, figures."""
+"""What all reports share: tables by pandas, pages from templates by Jinja, files, provenance."""
 
 from __future__ import annotations
 
 import datetime
+import functools
 import json
 import os
 import platform
@@ -50,6 +51,29 @@ def markdown(frame: DataFrame) -> str:
     cells = frame.astype(object).where(frame.notna(), "-")
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in cells.itertuples(index=False)]
     return "\n".join(lines)
+
+
+@functools.cache
+def _templates() -> Any:
+    jinja2 = require("jinja2")
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("sst_ros.report"),
+        autoescape=jinja2.select_autoescape(["html"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill in a template of this folder; of text no line ends with blanks.
+
+    Raises:
+        MissingDependency: jinja2 is not installed.
+
+    """
+    lines: str = _templates().get_template(template).render(values)
+    return "\n".join(line.rstrip() for line in lines.splitlines()) + "\n"
 
 
 def write(

@@ -7,8 +7,10 @@ does not contain is None, never a guess.
 
 from __future__ import annotations
 
+import base64
 import json
 import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,11 +23,10 @@ from sst_ros.plot import pictures
 from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import page, reference, states, text, timing, tracking
+from sst_ros.report import overview, reference, states, timing, tracking
 from sst_ros.report.reference import Comparison, Deviation
-from sst_ros.report.results import made_on
+from sst_ros.report.results import made_line, made_on, render
 from sst_ros.report.states import begins, lags
-from sst_ros.report.text import ERROR_LIMIT_RAD, QUANTITIES
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
 
@@ -33,6 +34,14 @@ DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that a report has, too."""
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
+
+ERROR_LIMIT_RAD = 1e-9
+"""Integration error above which a run is warned of, where its tolerance was not recorded."""
+ANSWERED_PERCENT = 90.0
+"""Share of samples that a controller at the sample rate answers."""
+FORMULATION_LIMIT = 1e-9
+
+QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 
 
 class RunEvaluation(NamedTuple):
@@ -58,7 +67,7 @@ def evaluate(run: Recording) -> RunEvaluation:
         integration, ideal = reference.integration(run), beside.result()
     result = summarise(run, integration, ideal, states.check_with_paper(run))
     result |= timing.numbers(measured)
-    found = text.reasons(result)
+    found = list(reasons(result))
     result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
     return RunEvaluation(measured, integration, ideal, result)
 
@@ -72,7 +81,7 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
         damaged: evaluate what is intact of a damaged recording.
 
     Returns:
-        The summary, as written; `text.text` makes the short text of it, `text.table` the whole.
+        The summary, as written; `summary_text` makes a short text of it, `summary_table` the whole.
 
     Raises:
         InputError: the bag is no whole recording of a run, or `out` cannot be written.
@@ -82,67 +91,118 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     run = recording.read(bag, damaged=damaged)
     with write_into(out, "report"):
         measured, integration, ideal, result = evaluate(run)
-        drawn = _pictures(run, integration, ideal, out)
-        save_figure(page.overview(run, integration, measured, result), out / PAGE)
+        errors = {"(a) integration error, against the same torques": integration}
+        if ideal is not None:
+            errors["(b) sample-and-hold error, against continuous torques"] = ideal
+        drawn, _ = pictures.draw(run.signals, out, DRAWN, ["png"])
+        figure = overview.draw_errors(run.seconds, errors)
+        title = f"Error against run time, {run.scene.name}"
+        drawn += pictures.save(figure, title, out, "error", ["png"])
+        save_figure(overview.draw_overview(run, integration, measured, result), out / PAGE)
         result["pictures"] = [path.name for path in drawn]
         result["page"] = [PAGE, HTML]
-        page.write(result, out / PAGE, drawn, out / HTML)
+        page = render(
+            "run.html",
+            s=result,
+            table=summary_table(result),
+            overview=_embed(out / PAGE),
+            pictures=[(path.stem.replace("_", " "), _embed(path)) for path in drawn],
+            made=made_line(result["report"]),
+        )
+        (out / HTML).write_text(page, encoding="utf-8")
         document = json.dumps(result, indent=2, allow_nan=False) + "\n"
         (out / SUMMARY).write_text(document, encoding="utf-8")
     return result
 
 
-def _pictures(
-    run: Recording, integration: Comparison, ideal: Comparison | None, out: Path
-) -> list[Path]:
-    """Write the paper's figures of a run, its torques and its errors as PNG files."""
-    errors = {"(a) integration error, against the same torques": integration}
-    if ideal is not None:
-        errors["(b) sample-and-hold error, against continuous torques"] = ideal
-    title = f"Error against run time, {run.scene.name}"
-    paths, _ = pictures.draw(run.signals, out, DRAWN, ["png"])
-    return paths + pictures.save(
-        page.draw_errors(run.seconds, errors), title, out, "error", ["png"]
-    )
+def _embed(picture: Path) -> str:
+    return base64.b64encode(picture.read_bytes()).decode("ascii")
+
+
+def summary_text(summary: dict[str, Any], folder: str) -> str:
+    """Format verdict, figures that matter and the place of the files."""
+    return render("run.txt", s=summary, folder=folder)
+
+
+def summary_table(summary: dict[str, Any]) -> str:
+    """Format a whole summary as an aligned table; what is unknown is a dash."""
+    return render("run_table.txt", s=summary, made=made_line(summary["report"]))
+
+
+def reasons(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with a run, in order of weight; nothing where nothing is."""
+    if summary["fault"]:
+        yield f"fault: {summary['fault']}"
+    elif summary["phase"] not in (None, "finished"):
+        yield f"the run was cut short, or its recording was: last phase {summary['phase']}"
+    yield from summary["damage"]
+    if lost := summary["samples_lost"]:
+        yield f"{lost} samples lost ({summary['samples_recorded_percent']:.2f} % recorded)"
+    if gaps := summary["tick_gaps"]:
+        yield f"{gaps} gaps between applied torques"
+    if missed := summary["ticks_missed"]:
+        yield f"{missed} ticks missed by the simulator"
+    share, age = summary["samples_answered_percent"], summary["command_age_mean_s"]
+    if share is not None and share < ANSWERED_PERCENT:
+        yield f"commands answered {share:.3g} % of samples, mean age {1e3 * age:.3g} ms"
+    error, limit = summary["integration_error_gamma_rad"], summary["error_limit_rad"]
+    if error is not None and error > limit:
+        yield f"integration error {error:.1e} rad above {limit:.0e} rad"
+    estimate = summary["simulator_error_estimate"]
+    if estimate is not None and estimate > limit:
+        yield f"error estimate {estimate:.1e} rad above {limit:.0e} rad"
+    difference = summary["effort_difference_max_N_m"]
+    if difference and not summary["actuators_lag"]:
+        yield f"efforts differ from applied torques by {difference:.1e} N m"
+    if (relative := summary["formulation_difference_relative"] or 0.0) > FORMULATION_LIMIT:
+        yield f"equations of motion differ from the paper's by {relative:.1e} (relative)"
 
 
 def summarise(
-    recording: Recording,
+    run: Recording,
     integration: Comparison,
     ideal: Comparison | None,
     formulation: tuple[float | None, int],
 ) -> dict[str, Any]:
-    """Collect all figures of the report."""
-    summary: dict[str, Any] = {"scene": recording.scene.name, "bag": str(recording.path)}
-    summary |= _run(recording)
-    summary |= _loss(recording)
-    summary |= _tracking(recording)
-    summary |= _largest("integration_error", integration.error, recording.seconds)
-    summary |= _largest("integration_reference_error", integration.own)
-    summary |= {
+    """Collect all figures of the report but those of `timing`."""
+    tracked = tracking.of(run)
+    found = None if tracked is None else tracking.metrics(tracked)
+    summary = {
+        "scene": run.scene.name,
+        "bag": str(run.path),
+        **_reported(run),
+        **_loss(run),
+        "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
+        "tracking_error_rms_rad": None if found is None else found.rms.tolist(),
+        "tracking_error_max_rad": None if found is None else found.largest.tolist(),
+        "settling_time_s": None if found is None else found.settling,
+        **_largest("integration_error", integration.error, run.seconds),
+        **_largest("integration_reference_error", integration.own),
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
     }
     if ideal:
-        summary |= _largest("ideal_difference", ideal.error, recording.seconds)
+        summary |= _largest("ideal_difference", ideal.error, run.seconds)
         summary |= _largest("ideal_reference_error", ideal.own)
-        summary["hold_order"] = hold_order(recording)
-    summary |= {
+        summary["hold_order"] = hold_order(run)
+    off, when = _peak(run.effort_difference, run.seconds)
+    return summary | {
         "formulation_difference_relative": formulation[0],
         "formulation_states": formulation[1],
-        **_effort(recording),
-        "actuators_lag": lags(recording.scene),
-        "topics_missing": list(recording.missing),
-        "damage": list(recording.signals.damage),
-        "notes": list(_notes(recording, integration, ideal)),
+        "effort_difference_max_N_m": off,
+        "effort_difference_largest_at_s": when if off else None,
+        "actuators_lag": lags(run.scene),
+        "topics_missing": list(run.missing),
+        "damage": list(run.signals.damage),
+        "notes": list(_notes(run, integration, ideal)),
         "report": made_on(),
     }
-    return summary
 
 
-def _run(recording: Recording) -> dict[str, Any]:
-    reported = recording.diagnostics
+def _reported(run: Recording) -> dict[str, Any]:
+    """Take numbers and texts from the last diagnostics of the simulator."""
+    reported = run.diagnostics
     texts = ("phase", "fault", "integrator")
     counts = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
     numbers = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
@@ -152,28 +212,16 @@ def _run(recording: Recording) -> dict[str, Any]:
         **{key: _number(reported, key) for key in numbers},
         "simulator_error_estimate": _number(reported, "error_estimate"),
         "error_limit_rad": _number(reported, "tolerance") or ERROR_LIMIT_RAD,
-        "duration_s": float(recording.seconds[-1]),
-        "commands_recorded": len(recording.commands.torque),
+        "duration_s": float(run.seconds[-1]),
+        "commands_recorded": len(run.commands.torque),
     }
 
 
-def _tracking(recording: Recording) -> dict[str, Any]:
-    """Peak torques, and the tracking error where there is a reference."""
-    tracked = tracking.of(recording)
-    found = None if tracked is None else tracking.metrics(tracked)
-    return {
-        "torque_peak_N_m": np.abs(recording.ticks.torque).max(axis=0).tolist(),
-        "tracking_error_rms_rad": None if found is None else found.rms.tolist(),
-        "tracking_error_max_rad": None if found is None else found.largest.tolist(),
-        "settling_time_s": None if found is None else found.settling,
-    }
-
-
-def _loss(recording: Recording) -> dict[str, Any]:
-    recorded, period = len(recording.time_ns), recording.period_ns
-    spacing = np.diff(recording.time_ns)
+def _loss(run: Recording) -> dict[str, Any]:
+    recorded, period = len(run.time_ns), run.period_ns
+    spacing = np.diff(run.time_ns)
     between = int(np.sum(np.maximum(np.rint(spacing / period).astype(int) - 1, 0)))
-    published = _count(recording.diagnostics, "samples_published")
+    published = _count(run.diagnostics, "samples_published")
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
     lost = max(between, 0 if published is None else published - recorded)
     return {
@@ -186,92 +234,77 @@ def _loss(recording: Recording) -> dict[str, Any]:
         "samples_missing_between_stamps": between,
         # The last sample marks the end of the run, wherever that is.
         "stamps_off_the_period": int(np.count_nonzero(spacing[:-1] % period)),
-        "orientations_lost": int(np.count_nonzero(~np.isfinite(recording.quaternion[:, 0]))),
-        "idle_states": recording.idle_states,
-        "tick_period_s": recording.ticks.period_ns / NANOSECONDS,
-        "ticks_recorded": len(recording.ticks.start_ns),
-        "tick_gaps": recording.ticks.gaps,
+        "orientations_lost": int(np.count_nonzero(~np.isfinite(run.quaternion[:, 0]))),
+        "idle_states": run.idle_states,
+        "tick_period_s": run.ticks.period_ns / NANOSECONDS,
+        "ticks_recorded": len(run.ticks.start_ns),
+        "tick_gaps": run.ticks.gaps,
     }
 
 
 def _largest(name: str, deviation: Deviation, seconds: Array | None = None) -> dict[str, Any]:
     """Largest value of each quantity, and when gamma's was reached."""
-    result: dict[str, Any] = {}
-    for quantity, unit in QUANTITIES.items():
-        values = getattr(deviation, quantity)
-        known = values[np.isfinite(values)]
-        result[f"{name}_{quantity}_{unit}"] = float(known.max()) if len(known) else None
+    result: dict[str, Any] = {
+        f"{name}_{quantity}_{unit}": _peak(getattr(deviation, quantity))[0]
+        for quantity, unit in QUANTITIES.items()
+    }
     if seconds is not None:
-        known = np.isfinite(deviation.gamma)
-        at = float(seconds[np.nanargmax(deviation.gamma)]) if known.any() else None
-        result[f"{name}_gamma_largest_at_s"] = at
+        result[f"{name}_gamma_largest_at_s"] = _peak(deviation.gamma, seconds)[1]
     return result
 
 
-def hold_order(recording: Recording) -> int | None:
+def _peak(values: Array, seconds: Array | None = None) -> tuple[float | None, float | None]:
+    """Largest known value and, if times are given, when it was; None where none is known."""
+    if not np.isfinite(values).any():
+        return None, None
+    at = int(np.nanargmax(values))
+    return float(values[at]), None if seconds is None else float(seconds[at])
+
+
+def hold_order(run: Recording) -> int | None:
     """Order in the control period of the sample-and-hold error, by the torques that were held.
 
     Two where most of them are the scene's profile at the middle of a hold, one where they are that
     of another instant; None where the scene has no profile or nothing was held.
     """
-    torque, ticks = recording.scene.torque, recording.ticks
-    if torque is None or not len(ticks.start_ns):
+    profile, ticks = run.scene.torque, run.ticks
+    if profile is None or not len(ticks.start_ns):
         return None
     changes = 1 + np.flatnonzero(np.any(ticks.torque[1:] != ticks.torque[:-1], axis=1))
     first, last = np.append(0, changes), np.append(changes, len(ticks.start_ns)) - 1
     middle = (ticks.start_ns[first] + ticks.end_ns[last]) / 2 / NANOSECONDS
-    amplitude, frequency, phase = map(np.array, (torque.amplitude, torque.frequency, torque.phase))
-    expected = amplitude * np.sin(np.outer(middle, frequency) + phase)
-    off = np.abs(ticks.torque[first] - expected).max(axis=1)
-    return 2 if np.median(off) <= 1e-9 * np.abs(amplitude).max() else 1
+    off = np.abs(ticks.torque[first] - profile.values(middle)).max(axis=1)
+    return 2 if np.median(off) <= 1e-9 * np.abs(profile.amplitude).max() else 1
 
 
-def _effort(recording: Recording) -> dict[str, Any]:
-    """Largest difference of efforts and applied torques, and when."""
-    off = recording.effort_difference
-    known = bool(np.isfinite(off).any())
-    largest = float(np.nanmax(off)) if known else None
-    at = float(recording.seconds[np.nanargmax(off)]) if largest else None
-    return {"effort_difference_max_N_m": largest, "effort_difference_largest_at_s": at}
-
-
-def _notes(recording: Recording, integration: Comparison, ideal: Comparison | None) -> list[str]:
-    notes = []
-    reported, last = recording.diagnostics, recording.seconds[-1]
-    if not reported:
-        notes.append("no diagnostics are recorded: missed ticks and error estimates are unknown")
-    elif reported.get("phase") not in ("finished", "fault"):
-        notes.append(
-            f"the run or its recording was cut short: the last phase is {reported.get('phase')}"
-        )
-    if reported.get("phase") == "fault" or reported.get("fault"):
-        notes.append(
-            f"the run ended by a fault; it is compared up to its last sample, at {last:.6f} s"
-        )
-    if not begins(recording):
-        notes.append("the start of the run is not recorded; times count from the first sample")
-    lost = len(recording.time_ns) - integration.compared
-    notes += integration.reasons
-    if integration.restarts_ns and not integration.reasons:
-        notes.append(
-            f"torques are missing: the reference began again {len(integration.restarts_ns)} times "
-            f"from a recorded sample; {lost} samples are not compared"
-        )
+def _notes(run: Recording, integration: Comparison, ideal: Comparison | None) -> Iterator[str]:
+    phase, fault = (run.diagnostics.get(key) for key in ("phase", "fault"))
+    if not run.diagnostics:
+        yield "no diagnostics are recorded: missed ticks and error estimates are unknown"
+    elif phase not in ("finished", "fault"):
+        yield f"the run or its recording was cut short: the last phase is {phase}"
+    if phase == "fault" or fault:
+        last = run.seconds[-1]
+        yield f"the run ended by a fault; it is compared up to its last sample, at {last:.6f} s"
+    if not begins(run):
+        yield "the start of the run is not recorded; times count from the first sample"
+    lost = len(run.time_ns) - integration.compared
+    yield from integration.reasons
+    if (restarts := len(integration.restarts_ns)) and not integration.reasons:
+        again = f"the reference began again {restarts} times from a recorded sample"
+        yield f"torques are missing: {again}; {lost} samples are not compared"
     elif lost:
-        notes.append(f"{lost} samples could not be compared")
-    if ideal is None and recording.scene.moment and recording.scene.moment.topic:
-        notes.append("the moment comes from a topic: no ideal to compare with")
-    if ideal is None and recording.scene.torque is None:
-        notes.append("the scene has no torques: no ideal to compare with")
-    if lags(recording.scene):
-        notes.append("the actuators lag: efforts differ from the torques that are asked for")
-    if recording.signals.unverified:
-        notes.append(
-            f"{recording.signals.unverified} chunks have no checksum: damage would not be noticed"
-        )
-    if "euler_zyz" in recording.missing:
-        notes.append("euler_zyz is not recorded: its pictures show the orientation's angles")
-    return notes
+        yield f"{lost} samples could not be compared"
+    if ideal is None and run.scene.moment and run.scene.moment.topic:
+        yield "the moment comes from a topic: no ideal to compare with"
+    if ideal is None and run.scene.torque is None:
+        yield "the scene has no torques: no ideal to compare with"
+    if lags(run.scene):
+        yield "the actuators lag: efforts differ from the torques that are asked for"
+    if unverified := run.signals.unverified:
+        yield f"{unverified} chunks have no checksum: damage would not be noticed"
+    if "euler_zyz" in run.missing:
+        yield "euler_zyz is not recorded: its pictures show the orientation's angles"
 
 
 def _number(reported: dict[str, str], key: str) -> float | None:

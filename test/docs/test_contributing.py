@@ -38,8 +38,7 @@ import pathlib, sys, threading
 import bags, sst_ros
 from sst_ros import Simulation, load_scene
 from sst_ros.recording.recording import read
-from sst_ros.report.run import evaluate
-from sst_ros.report.text import table
+from sst_ros.report.run import evaluate, summary_table
 
 def passed(call):
     files, base = set(), pathlib.Path(sst_ros.__file__).parent
@@ -60,7 +59,7 @@ def step():
     simulation.step((0.0, 0.0, 0.0), 1_000_000)
 
 def report():
-    table(evaluate(read(bag)).summary)
+    summary_table(evaluate(read(bag)).summary)
 
 # What is imported at the first use is imported before.
 Simulation("friction")

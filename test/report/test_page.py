@@ -10,9 +10,8 @@ import pytest
 from matplotlib import image
 
 from sst_ros.recording import recording
-from sst_ros.report import page, reference, timing
-from sst_ros.report.run import evaluate, report
-from sst_ros.report.text import table
+from sst_ros.report import overview, reference, timing
+from sst_ros.report.run import evaluate, report, summary_table
 from sst_ros.scene import scene
 
 LATENCY_NS = 400_000
@@ -111,7 +110,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     assert "http" not in re.sub(r"base64,[^']+", "", text)
     assert "command to its step, mean" in text
     assert "What the recording does not contain" in text
-    assert "Not known: no diagnostics" in table(summary)
+    assert "Not known: no diagnostics" in summary_table(summary)
 
 
 def test_what_is_missing_is_said(tmp_path, bags, example2):
@@ -160,7 +159,7 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(tmp_path, bag
         ))  # fmt: skip
     run = recording.read(bags.write(tmp_path / "bag", sorted(entries, key=lambda e: e.received_ns)))
     found = evaluate(run)
-    drawn = page.overview(run, found.integration, found.timing, found.summary)
+    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
     titles = {axes.get_title("left"): axes for axes in drawn.axes}
     panel = titles["Error against computing time used, over the run"]
     curves = {line.get_label(): line.get_xydata() for line in panel.lines}
@@ -206,4 +205,4 @@ def test_an_altered_effort_of_joint_states_shows_when_it_was(tmp_path, bags, exa
     summary = numbers_of_run(tmp_path)
     assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
     assert summary["effort_difference_largest_at_s"] == 0.15
-    assert "(at 0.15 s)" in table(summary)
+    assert "(at 0.15 s)" in summary_table(summary)

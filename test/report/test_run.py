@@ -11,8 +11,7 @@ from matplotlib import image
 
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
-from sst_ros.report.run import evaluate, report
-from sst_ros.report.text import table
+from sst_ros.report.run import evaluate, report, summary_table
 from sst_ros.scene import scene
 
 
@@ -55,7 +54,7 @@ def test_the_summary_is_written_whole_and_finite(whole):
 
 def test_the_table_says_it_all_in_line(whole):
     summary, _ = whole
-    text = table(summary)
+    text = summary_table(summary)
     for word in ("ticks done", "ticks missed", "real-time factor", "samples lost", "(a)", "(b)"):
         assert word in text
     assert f"{summary['integration_error_gamma_rad']:.2e}" in text
@@ -89,7 +88,7 @@ def test_loss_is_counted_and_survived(tmp_path, bags, example2):
     assert summary["restarts_at_s"] == [0.044, 0.122]
     assert summary["integration_error_gamma_rad"] < 1e-11
     assert any("began again 2 times" in note for note in summary["notes"])
-    assert "Note: torques are missing" in table(summary)
+    assert "Note: torques are missing" in summary_table(summary)
 
 
 def test_what_is_not_recorded_is_unknown(tmp_path, bags, example2):
@@ -100,7 +99,7 @@ def test_what_is_not_recorded_is_unknown(tmp_path, bags, example2):
     assert summary["topics_missing"] == ["euler_zyz", "diagnostics", "commands"]
     assert any("no diagnostics" in note for note in summary["notes"])
     assert any("euler_zyz is not recorded" in note for note in summary["notes"])
-    line = next(line for line in table(summary).splitlines() if "ticks done" in line)
+    line = next(line for line in summary_table(summary).splitlines() if "ticks done" in line)
     assert line.split()[-1] == "-"
 
 
@@ -114,7 +113,7 @@ def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
     assert summary["sample_period_s"] == 0.002 and summary["stamp_gaps"] == 0
     assert summary["integration_error_gamma_rad"] < 1e-11
     assert any("ended by a fault" in note for note in summary["notes"])
-    assert summary["fault"] in table(summary)
+    assert summary["fault"] in summary_table(summary)
     assert "path_of_E.png" in summary["pictures"]  # no figure number outside the examples
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from sst_ros import __main__ as cli
 from sst_ros.recording import recording
-from sst_ros.report.run import evaluate
-from sst_ros.report.text import text
+from sst_ros.report.run import evaluate, summary_text
 from sst_ros.scene import scene
 
 
@@ -34,18 +33,20 @@ def summary_of(bags, folder, entries):
 def test_a_good_run_is_ok_in_few_lines(tmp_path, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
     summary = summary_of(bags, tmp_path, [*plain, *commands(bags, 1, 600_000)])
-    lines = text(summary, "out").splitlines()
+    lines = summary_text(summary, "out").splitlines()
     assert (summary["verdict"], summary["reasons"]) == ("OK", [])
     assert lines[0] == "OK: example2" and 12 <= len(lines) <= 18
     assert lines[-1].startswith("Files: out: page.png")
     assert any(line.split()[:2] == ["peak", "torques"] for line in lines)
-    assert "negative" not in text(summary, "out") and "minimum -" not in text(summary, "out")
+    assert "negative" not in summary_text(summary, "out") and "minimum -" not in summary_text(
+        summary, "out"
+    )
 
 
 def test_a_slow_controller_is_warned_of(tmp_path, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
     summary = summary_of(bags, tmp_path, [*plain, *commands(bags, 40, 600_000)])
-    first = text(summary, "out").splitlines()[0]
+    first = summary_text(summary, "out").splitlines()[0]
     assert first.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
     assert summary["command_age_mean_s"] == pytest.approx(0.0187, abs=0.002)
 
@@ -54,7 +55,9 @@ def test_a_negative_delay_has_its_meaning(tmp_path, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
     summary = summary_of(bags, tmp_path, [*plain, *commands(bags, 1, 1_900_000)])
     assert summary["command_latency_min_us"] < 0.0
-    assert "the recorder received a command after the step that applied it" in text(summary, "out")
+    assert "the recorder received a command after the step that applied it" in summary_text(
+        summary, "out"
+    )
 
 
 def test_losses_and_errors_are_reasons(tmp_path, bags, example2):
@@ -74,7 +77,7 @@ def test_tracking_figures_are_there_where_there_is_a_reference(tmp_path, bags, e
     start = np.array(scene.load("example2").initial.gamma)
     entries = bags.tracked(example2, lambda _: (start, np.zeros(3)))
     summary = summary_of(bags, tmp_path, entries)
-    lines = text(summary, "out").splitlines()
+    lines = summary_text(summary, "out").splitlines()
     assert any(line.strip().startswith("tracking error, RMS") for line in lines)
     assert any(line.strip().startswith("settling time") for line in lines)
 

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of the report of a run: errors over time, and the run on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    LINES,
+    SMALLEST_SHOWN,
+    VERMILION,
+    Looks,
+    few,
+    positive,
+    scaled,
+    span,
+    stack,
+    styled,
+    widen,
+)
+from sst_ros.recording.recording import Recording
+from sst_ros.report.reference import Comparison
+from sst_ros.report.results import made_line
+from sst_ros.report.timing import Timing
+
+NOT_RECORDED = "not recorded"
+
+ESTIMATES = (
+    "integration error",
+    "its estimate by the simulator",
+    "hold error if torques are those of the start",
+    "the same, of the middle",
+)
+
+Series: TypeAlias = "Mapping[str, tuple[Array, Array] | None]"
+"""Times or computing times and values by name; None for what was not recorded."""
+
+
+@styled
+def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
+    """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
+    figure, grid = stack(["largest difference"] * len(panels), 3.1)
+    for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
+        _draw_comparison(axes, seconds, comparison, legend=axes is grid[0])
+        axes.set_title(title)
+    span(grid, seconds)
+    return figure
+
+
+def _draw_comparison(
+    axes: Axes, seconds: Array, comparison: Comparison, *, legend: bool = True
+) -> None:
+    """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
+    error, own = comparison.error, comparison.own
+    times, floor = few(seconds, np.fmax.reduce([own.gamma, own.gamma_dot, own.orientation]))
+    band: Looks = {"color": GREY, "alpha": 0.3, "linewidth": 0.0, "label": "error of the reference"}
+    axes.fill_between(times, SMALLEST_SHOWN, np.fmax(floor, SMALLEST_SHOWN), **band)
+    names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
+    curves = (error.gamma, error.gamma_dot, error.orientation)
+    for values, name, style in zip(curves, names, LINES, strict=False):
+        axes.plot(*few(seconds, positive(values)), label=name, **style)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=SMALLEST_SHOWN)
+    axes.set_ylabel("largest difference")
+    if legend and comparison.compared:
+        axes.legend(fontsize=8, ncol=2, loc="lower right")
+
+
+class Panel(NamedTuple):
+    """A panel of the overview; `missing` is the reason why it is left out, or empty."""
+
+    title: str
+    draw: Callable[[Axes], None]
+    missing: str = ""
+    over_time: bool = True
+
+
+def _missing(values: Array | None) -> str:
+    """Return why a panel of values is left out; empty where some of them are known."""
+    return "" if values is not None and np.isfinite(values).any() else NOT_RECORDED
+
+
+def _curve(
+    title: str, label: str, seconds: Array, values: Array | None, reason: str = "", **looks: Any
+) -> Panel:
+    """Return a panel of one curve, small values in a power of ten; left out for a `reason`."""
+    absent = reason or _missing(values)
+    if values is None or absent:
+        return Panel(title, Axes.set_axis_off, absent)
+    shown, unit = scaled(values)
+
+    def draw(axes: Axes) -> None:
+        axes.set_ylabel(label.replace("[", f"[{unit}"))
+        axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
+
+    return Panel(title, draw, absent)
+
+
+def _draw_used(axes: Axes, estimates: Series, reports: int) -> None:
+    """Draw errors [rad] over computing time [s] by name; curves of `reports` points are marked."""
+    axes.set_xlabel("computing time of all steps [ms]")
+    axes.set_ylabel("error of the orientation [rad]")
+    for (name, curve), style in zip(estimates.items(), LINES, strict=False):
+        used, values = curve or (np.empty(0), np.empty(0))
+        marker = "o" if len(used) == reports else ""
+        axes.plot(1e3 * used, positive(values), label=name, marker=marker, markersize=4, **style)
+    axes.set_yscale("log")
+    axes.legend(fontsize=8, loc="best")
+
+
+def _draw_pace(axes: Axes, seconds: Array, pace: Array) -> None:
+    """Draw real-time factors over time."""
+    axes.set_ylabel("real-time factor")
+    axes.plot(seconds, pace, color=BLUE, marker=".", linewidth=1.2)
+    axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--")
+    widen(axes, pace, 0.04)
+
+
+def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
+    """Draw the histogram of periods between received samples around the nominal one [us]."""
+    axes.set_xlabel("deviation from the nominal period [µs]")
+    axes.set_ylabel("samples")
+    off = period_us - nominal_us
+    reach = max(1.0, 1.05 * float(np.abs(off).max()))
+    axes.hist(off, bins=np.linspace(-reach, reach, 81).tolist(), color=BLUE, log=True)
+    axes.set_ylim(bottom=0.5)
+    shares = {"p99": 99.0, "p99.9": 99.9}
+    numbers = {"nominal": nominal_us, "min": period_us.min(), "mean": period_us.mean()}
+    numbers["max"] = period_us.max()
+    for (name, share), colour, line in zip(
+        shares.items(), (VERMILION, GREEN), ("--", ":"), strict=True
+    ):
+        numbers[name] = float(np.percentile(period_us, share))
+        place = numbers[name] - nominal_us
+        axes.axvline(place, color=colour, linestyle=line, linewidth=1.5, label=name)
+    text = "\n".join(f"{name} {value:.1f} µs" for name, value in numbers.items())
+    axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", fontsize=8.5)
+    axes.legend(fontsize=8, loc="upper right")
+
+
+def _draw_losses(axes: Axes, losses: Series, end: float) -> None:
+    """Draw running counts of losses over time [s] by name; None for what was not recorded."""
+    axes.set_ylabel("count")
+    most = 0.0
+    for (name, loss), style in zip(losses.items(), LINES, strict=False):
+        if loss is None:
+            axes.plot([], [], " ", label=f"{name}: not recorded")
+            continue
+        times, counts = few(*loss) if len(loss[0]) else loss
+        last = float(counts[-1]) if len(counts) else 0.0
+        most = max(most, last)
+        steps = np.concatenate([[0.0], counts, [last]])
+        label = f"{name}: {last:.0f}"
+        axes.step(np.concatenate([[0.0], times, [end]]), steps, where="post", label=label, **style)
+    axes.set_ylim(0.0, max(1.0, 1.6 * most))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.legend(fontsize=8, loc="upper left")
+
+
+@styled
+def draw_overview(
+    run: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
+) -> Figure:
+    """Draw a run on one page; the footnote names what has no data."""
+    panels = _panels(run, integration, timing)
+    shown = [panel for panel in panels if not panel.missing]
+    rows = -(-len(shown) // 2)
+    figure = Figure(figsize=(12.0, 3.3 * rows + 0.5))
+    grid = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes, panel in zip(grid, shown, strict=False):
+        axes.set_title(panel.title)
+        panel.draw(axes)
+        if panel.over_time:
+            axes.set_xlabel("time t [s]")
+            axes.set_xlim(0.0, run.seconds[-1])
+    for axes in grid[len(shown) :]:
+        axes.set_axis_off()
+    title = f"Run of {run.scene.name}: {run.seconds[-1]:g} s, {len(run.time_ns)} samples"
+    figure.suptitle(title, fontsize=13)
+    absent = " ".join(f"{panel.title}: {panel.missing}." for panel in panels if panel.missing)
+    footnote = f"{absent}\n{made_line(summary['report'])}".strip()
+    figure.supxlabel(footnote, fontsize=8, color="#555555")
+    return figure
+
+
+def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence[Panel]:
+    seconds, latency, effort = run.seconds, timing.latency, run.effort_difference
+    losses: dict[str, tuple[Array, Array] | None] = {
+        name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
+        for name, times in {
+            "samples lost": timing.lost_s,
+            "gaps between applied torques": timing.gaps_s,
+        }.items()
+    }
+    at, missed, ticks, step_us, *estimates = timing.reported.T
+    known, timed = np.isfinite(missed), step_us > 0.0
+    losses["ticks missed"] = (at[known], missed[known]) if known.any() else None
+    used = 1e-6 * ticks * step_us
+    # Reports come once a second: between them, and from the start, the steps cost the same.
+    unknown = np.full(len(seconds), np.nan)
+    at_samples = np.interp(seconds, [0.0, *at], [0.0, *used]) if len(at) else unknown
+    found = np.fmax.accumulate(integration.error.orientation)
+    errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
+    drawn = any((np.isfinite(positive(y)) & np.isfinite(x)).any() for x, y in errors)
+    late = timing.late_us / 1e3
+    same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
+    periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
+    by_name = dict(zip(ESTIMATES, errors, strict=True))
+    dots: Looks = {"linestyle": "none", "marker": ".", "markersize": 3}
+    return [
+        Panel(
+            "Integration error, against the same torques",
+            partial(_draw_comparison, seconds=seconds, comparison=integration),
+            "" if integration.compared else "nothing could be compared",
+        ),
+        _curve("Energy residual", "energy residual [J]", seconds, timing.energy),
+        Panel(
+            "Real-time factor (recorder clock)",
+            partial(_draw_pace, seconds=timing.pace_s, pace=timing.pace),
+            _missing(timing.pace),
+        ),
+        Panel(
+            "Period between received samples", periods, _missing(timing.period_us), over_time=False
+        ),
+        Panel("Cumulative losses", partial(_draw_losses, losses=losses, end=seconds[-1])),
+        _curve(
+            "Latency: reception of a command to the step that applies it",
+            "latency [µs]",
+            latency.time_s,
+            latency.received_us,
+            **dots,
+        ),
+        _curve("Delay of samples", "delay, less the shortest [ms]", seconds, late),
+        _curve(
+            "Effort of joint_states against applied torque",
+            "largest difference [N m]",
+            seconds,
+            effort,
+            same,
+        ),
+        Panel(
+            "Error against computing time used, over the run",
+            partial(_draw_used, estimates=by_name, reports=len(at)),
+            "" if drawn else NOT_RECORDED,
+            over_time=False,
+        ),
+        _curve(
+            "Computing time of a step, mean since the start",
+            "time [µs]",
+            at[timed],
+            step_us[timed],
+            marker="o",
+        ),
+    ]
