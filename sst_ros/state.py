@@ -130,6 +130,35 @@ DIMENSIONS: dict[str, list[str] | list[int]] = {
 }
 """Coordinates of each dimension."""
 
+UNITS = {
+    "t": "s",
+    **{
+        f"{name}_{part}": unit
+        for name, (unit, dimension) in QUANTITIES.items()
+        for part in DIMENSIONS[dimension]
+    },
+    "energy": "J",
+}
+"""Unit of each column of a table of states: of one motion, or of many at their end."""
+
+
+def columns_of(states: Any) -> dict[str, Array]:
+    """Columns of a motion or a batch, each shape (n,), by the names of `UNITS`."""
+    columns: dict[str, Array] = {"t": states.t}
+    for name, (_, dimension) in QUANTITIES.items():
+        array = getattr(states, name)
+        columns |= {f"{name}_{part}": array[:, i] for i, part in enumerate(DIMENSIONS[dimension])}
+    return columns | {"energy": states.energy}
+
+
+def arrays_of(states: Any, *first: str) -> dict[str, Any]:
+    """Arrays of a motion or a batch as xarray takes them; `first` are their first dimensions."""
+    arrays: dict[str, Any] = {
+        name: ((*first, dimension), getattr(states, name), {"units": unit})
+        for name, (unit, dimension) in QUANTITIES.items()
+    }
+    return arrays | {"energy": (first, states.energy, {"units": "J"})}
+
 
 BASE_FRAME = "base_link"
 """Root of the robot (REP 105): frame {B} of the paper."""

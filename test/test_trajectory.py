@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory: derived quantities against the states of Simulation, files to the bit, at(t)."""
 
+import random
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -52,9 +54,10 @@ def test_labelled_arrays(run):
     assert found["torque"].attrs["units"] == "N m"
 
 
-def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path):
+@pytest.mark.parametrize("suffix", ["parquet", "npz"])
+def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path, suffix):
     pytest.importorskip("pyarrow", reason="files need pyarrow")
-    path = tmp_path / "run.parquet"
+    path = tmp_path / f"run.{suffix}"
     run.save(path)
     again = Trajectory.load(path)
     for name in ARRAYS:
@@ -69,12 +72,66 @@ def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path):
     run.save(path, overwrite=True)
 
 
-def test_what_is_no_trajectory_is_refused(tmp_path):
+def test_a_csv_is_the_table_and_other_suffixes_are_refused(run, tmp_path):
+    pytest.importorskip("pandas")
+    run.save(tmp_path / "run.csv")
+    found = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    assert list(found.dtype.names) == list(run.to_pandas())
+    assert np.array_equal(found.tolist(), run.to_pandas())
+    for name in ("run.dat", "run", "run.csv.gz"):
+        with pytest.raises(InputError, match=r"must end in .parquet or .csv or .npz"):
+            run.save(tmp_path / name)
+    with pytest.raises(InputError, match=r"must be writable"):
+        run.save(tmp_path / "nowhere" / "run.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_what_is_no_trajectory_is_refused(run, tmp_path):
     pytest.importorskip("pyarrow", reason="files need pyarrow")
     (tmp_path / "text.parquet").write_text("no table")
-    for path in (tmp_path / "text.parquet", tmp_path / "absent.parquet"):
+    run.save(tmp_path / "run.csv")
+    np.savez(tmp_path / "other.npz", t=run.t)
+    for name in ("text.parquet", "absent.parquet", "run.csv", "other.npz"):
         with pytest.raises(InputError, match=r"must be a trajectory"):
-            Trajectory.load(path)
+            Trajectory.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "npz"])
+def test_a_flipped_bit_is_refused_or_changes_nothing(run, tmp_path, suffix):
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    path, generator, refused = tmp_path / f"run.{suffix}", random.Random(1), 0
+    run.save(path)
+    whole = path.read_bytes()
+    for _ in range(600):
+        changed, at = bytearray(whole), generator.randrange(len(whole))
+        changed[at] ^= 1 << generator.randrange(8)
+        path.write_bytes(changed)
+        try:
+            again = Trajectory.load(path)
+        except InputError:
+            refused += 1
+            continue
+        same = all(np.array_equal(getattr(again, name), getattr(run, name)) for name in ARRAYS)
+        assert same and again.scene == run.scene and repr(again) == repr(run), f"byte {at}"
+    assert refused > 400
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "npz"])
+def test_parallel_saves_to_one_path_never_break_a_reader(run, tmp_path, suffix):
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    path, motions = tmp_path / f"run.{suffix}", (run, run.at(run.t[::2]))
+    run.save(path)
+    writers = [
+        threading.Thread(target=lambda m=m: [m.save(path, overwrite=True) for _ in range(20)])
+        for m in motions * 2
+    ]
+    for writer in writers:
+        writer.start()
+    lengths = set()
+    while any(writer.is_alive() for writer in writers):
+        lengths.add(len(Trajectory.load(path)))
+    assert lengths and lengths <= {len(one) for one in motions}
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
 
 
 PROFILES = {

@@ -163,10 +163,7 @@ def run_simulation(options: argparse.Namespace) -> int:
     print(f"energy residual  {trajectory.energy_residual:.1e} J")
     print(f"loop closure     {trajectory.closure_error:.1e}")
     if out is not None:
-        if out.suffix == ".csv":
-            trajectory.to_pandas().to_csv(out, index=False)
-        else:
-            trajectory.save(out, overwrite=options.force)
+        trajectory.save(out, overwrite=options.force)
         print(out)
     if picture is not None:
         function("plot.style:save_figure")(trajectory.plot(), picture)

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a long command leaves and shows: its folder of results, and a bar while it works.
 
-A folder is named after the recording, and is never written over unasked.
+A folder is named after the recording, and is never written over unasked. A file that others may
+read has its name when it is whole.
 """
 
 from __future__ import annotations
 
 import sys
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,6 +65,20 @@ def write_into(out: Path, origin: str) -> Iterator[None]:
     except OSError as error:
         allowed = f"must be a folder that can be written ({error})"
         raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Give a block a name of its own to write to; what it wrote then becomes `path` at once.
+
+    A reader of `path` has the earlier file or the later one, even if several processes write it.
+    """
+    own = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        yield own
+        own.replace(path)
+    finally:
+        own.unlink(missing_ok=True)
 
 
 class Bar:

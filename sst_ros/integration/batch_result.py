@@ -15,7 +15,7 @@ from sst_ros.integration.initial_states import REASONS
 from sst_ros.integration.parametric_model import OUTPUTS, ParameterColumns, ParametricModel
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
-from sst_ros.state import DIMENSIONS, QUANTITIES
+from sst_ros.state import DIMENSIONS, UNITS, arrays_of, columns_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,12 +128,7 @@ class BatchStates:
     def to_xarray(self) -> xr.Dataset:
         """Arrays with the dimension scenario, before it time if there are several; needs xarray."""
         first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
-        arrays: dict[str, Any] = {
-            name: ((*first, dimension), getattr(self, name), {"units": unit})
-            for name, (unit, dimension) in QUANTITIES.items()
-        }
-        arrays["energy"] = (first, self.energy, {"units": "J"})
-        arrays["t"] = (first, self.t, {"units": "s"})
+        arrays = arrays_of(self, *first) | {"t": (first, self.t, {"units": "s"})}
         coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
         found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS)
         found.attrs["scene"] = self._model.scene.name
@@ -214,16 +209,9 @@ class BatchResult(BatchStates):
     def to_pandas(self) -> pd.DataFrame:
         """Table with a row a scenario and a column a number, units in its `attrs`."""
         columns: dict[str, Any] = {name: getattr(self, name) for name in _SCENARIO}
-        columns["t"] = self.t
-        units = {"t": "s", "fault_time": "s", "energy": "J"}
-        for name, (unit, dimension) in QUANTITIES.items():
-            array = getattr(self, name)
-            for i, part in enumerate(DIMENSIONS[dimension]):
-                columns[f"{name}_{part}"] = array[:, i]
-                units[f"{name}_{part}"] = unit
-        table: pd.DataFrame = require("pandas").DataFrame(columns | {"energy": self.energy})
+        table: pd.DataFrame = require("pandas").DataFrame(columns | columns_of(self))
         table.index.name = "scenario"
-        table.attrs = {"units": units, "scene": self._model.scene.name}
+        table.attrs = {"units": UNITS | {"fault_time": "s"}, "scene": self._model.scene.name}
         return table
 
     def __repr__(self) -> str:

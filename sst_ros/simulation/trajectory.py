@@ -1,37 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory: a motion of a scene as arrays over time, simulated or recorded."""
+"""Trajectory: a motion of a scene as a table over time, simulated or recorded.
+
+Between its samples states are propagated from the sample before, under the torques that act there.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import html
+import io
+import json
+from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
-from sst_ros.simulation import trajectory_file
-from sst_ros.simulation.interpolation import integrated
-from sst_ros.simulation.sampled_motion import Array, Law, SampledMotion
-from sst_ros.simulation.torque_profile import LostTorque
+from sst_ros.extras import MissingDependency, require
+from sst_ros.host.table_file import SUFFIXES, read_table, write_table
+from sst_ros.integration.adaptive_stepper import EvaluationBudget
+from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.methods import DOP853
+from sst_ros.integration.propagator import Propagator
+from sst_ros.mechanism import frames, kinematics
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import dump, read
+from sst_ros.simulation.torque_profile import (
+    ConstantTorque,
+    FeedbackFunction,
+    LostTorque,
+    TorqueProfile,
+    profile_from,
+)
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["JOINTS", "Array", "Law", "Trajectory"]
+__all__ = ["Array", "Law", "Trajectory"]
 
-JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+Law: TypeAlias = TorqueProfile | FeedbackFunction
 
-_OF_THE_RUN = (
-    "status", "message", "method", "error_estimate", "evaluations", "step", "law", "dense",
+_KEY, _FORMAT = "sst_ros", 1
+_JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+_FIGURES = (
+    "status", "message", "method", "error_estimate", "energy_residual", "evaluations", "step",
 )  # fmt: skip
+"""What a run says of itself, in its files and in xarray."""
+
 _FEW = 300
 """Samples below which a picture asks for more."""
 
+_ACCURACY = 1e-13
+"""Error of a step between samples; gaps are short, so that steps do not add up."""
 
-class Trajectory(SampledMotion):
+
+def _joint(first: int, meaning: str) -> cached_property[Array]:
+    found = cached_property[Array](lambda motion: motion._joints[:, first : first + 3])
+    found.__doc__ = f"{meaning}, shape (n, 3)."
+    return found
+
+
+class Trajectory:
     """A motion over n instants. Arrays are its own, and read-only.
 
     Args:
@@ -60,6 +98,113 @@ class Trajectory(SampledMotion):
 
     """
 
+    def __init__(
+        self,
+        scene: Scene,
+        t: ArrayLike,
+        quaternion: ArrayLike,
+        body_rate: ArrayLike,
+        torque: ArrayLike,
+        *,
+        joints: ArrayLike | None = None,
+        status: int = 0,
+        message: str = "",
+        method: str = "",
+        error_estimate: float = float("nan"),
+        energy_residual: float | Callable[[], float] = float("nan"),
+        evaluations: int = 0,
+        step: float = float("nan"),
+        law: Law | None = None,
+        dense: Callable[[Array], Array] | None = None,
+    ) -> None:
+        self.scene = scene
+        self.t, self.quaternion, self.body_rate = _own(t), _own(quaternion), _own(body_rate)
+        self.torque = _own(torque)
+        if joints is not None:
+            self._joints = _own(joints)
+        self._refuse_misfits()
+        self.status, self.message, self.method = status, message, method
+        self.error_estimate, self._residual = error_estimate, energy_residual
+        self.evaluations, self.step = evaluations, step
+        self.law, self.dense = law, dense
+
+    def _refuse_misfits(self) -> None:
+        t, problems = self.t, []
+        if t.ndim != 1 or not np.isfinite(t).all() or (t[1:] <= t[:-1]).any():
+            problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
+        for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
+            array = vars(self).get(name)
+            if array is not None and array.shape != (len(t), size):
+                allowed = f"must have the shape ({len(t)}, {size})"
+                problems.append(Problem(name.strip("_"), array.shape, allowed))
+        if problems:
+            raise InputError("trajectory", problems)
+
+    def with_states(self, y: Array) -> Trajectory:
+        """Return the same run with other read-only states (n, 7 or 10), before anything is derived.
+
+        Nothing is checked again: a prepared run makes its results by it.
+        """
+        again = object.__new__(type(self))
+        again.__dict__.update(self.__dict__, quaternion=y[:, :4], body_rate=y[:, 4:7])
+        if y.shape[1] > 7:
+            again.torque = y[:, 7:10]
+        return again
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def success(self) -> bool:
+        """Whether the motion reached its end."""
+        return self.status == 0
+
+    @cached_property
+    def _joints(self) -> Array:
+        """Angles and rates of the joints, shape (n, 18)."""
+        with np.errstate(all="ignore"):
+            found = kernel.joints(self._dynamics.model, self._columns)
+        return np.stack([np.broadcast_to(x, self.t.shape) for row in found for x in row], axis=1)
+
+    gamma = _joint(0, "Angles of the actuators [rad]")
+    mu = _joint(3, "Angles between base arcs and arcs of the star [rad]")
+    beta = _joint(6, "Angles from the carriages to E [rad]")
+    gamma_dot = _joint(9, "Rates of gamma [rad/s]")
+    mu_dot = _joint(12, "Rates of mu [rad/s]")
+    beta_dot = _joint(15, "Rates of beta [rad/s]")
+
+    @cached_property
+    def euler_zyz(self) -> Array:
+        """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
+        return frames.unwrap_zyz(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+
+    @cached_property
+    def energy(self) -> Array:
+        """Kinetic and potential energy [J], shape (n,)."""
+        with np.errstate(all="ignore"):
+            model, columns = self._dynamics.model, self._columns
+            total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(model, columns)
+        return np.asarray(np.broadcast_to(total, self.t.shape))
+
+    @cached_property
+    def energy_residual(self) -> float:
+        """Energy at the end, less that at the start, less the work done [J]; nan if unknown."""
+        return float(self._residual() if callable(self._residual) else self._residual)
+
+    @cached_property
+    def closure_error(self) -> float:
+        """Largest abs(r_k . t_k) of all samples: how far the loops are from closed; 0 if exact."""
+        rotation, geometry = frames.rotation_matrix(self.quaternion), Geometry.of(self.scene)
+        return float(np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0))
+
+    @property
+    def _dynamics(self) -> Dynamics:
+        return Dynamics.of(self.scene)
+
+    @property
+    def _columns(self) -> tuple[Array, ...]:
+        return (*self.quaternion.T, *self.body_rate.T)
+
     def at(self, t: ArrayLike) -> Trajectory:
         """Sample the motion at other times, ascending, to the accuracy of the run.
 
@@ -81,44 +226,116 @@ class Trajectory(SampledMotion):
         if isinstance(self.law, LostTorque) and not np.all(np.isin(times, self.t)):
             allowed = "must be times of samples: the function of the torques is not in the file"
             raise InputError("at", [Problem("t", t, allowed)])
-        y = integrated(self, times)
-        kept = {name: getattr(self, name) for name in _OF_THE_RUN}
-        residual = lambda: self.energy_residual  # noqa: E731 computed if it is asked for
+        y = _propagate(self, times)
         return Trajectory(
-            self.scene, times, y[:, :4], y[:, 4:7], y[:, 7:], energy_residual=residual, **kept
-        )
+            self.scene, times, y[:, :4], y[:, 4:7], y[:, 7:],
+            status=self.status, message=self.message, method=self.method,
+            error_estimate=self.error_estimate, energy_residual=lambda: self.energy_residual,
+            evaluations=self.evaluations, step=self.step, law=self.law, dense=self.dense,
+        )  # fmt: skip
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with a row an instant and a column a number, units in its `attrs`."""
-        return trajectory_file.frame(self)
+        table: pd.DataFrame = require("pandas").DataFrame(columns_of(self))
+        table.attrs = {"units": UNITS, "scene": self.scene.name}
+        return table
 
     def to_xarray(self) -> xr.Dataset:
         """Arrays with the dimensions time, leg, axis and part; needs the package xarray."""
-        return trajectory_file.dataset(self)
+        found: xr.Dataset = require("xarray").Dataset(
+            arrays_of(self, "time"),
+            {"time": ("time", self.t, {"units": "s"}), **DIMENSIONS},
+            {"scene": self.scene.name} | self._figures(),
+        )
+        return found
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write a Parquet file that `load` reads back to the bit, units and scene included.
+        """Write a file: whole, or not at all; others may read and write the same path meanwhile.
+
+        Args:
+            path: ends in .parquet or .npz, which `load` reads back to the bit, units (Parquet) and
+                scene included; or in .csv, the table of `to_pandas` for other programs.
+            overwrite: replace a file that exists.
 
         Raises:
-            InputError: the file exists, unless `overwrite`.
-            MissingDependency: pyarrow is not installed.
+            InputError: the suffix is another, the file exists, or it cannot be written.
+            MissingDependency: pyarrow (.parquet) or pandas (.csv) is not installed.
 
         """
-        trajectory_file.save(self, Path(path), overwrite=overwrite)
+        path = Path(path)
+        if path.suffix not in SUFFIXES:
+            allowed = f"must end in {' or '.join(SUFFIXES)}"
+            raise InputError("save", [Problem("path", str(path), allowed)])
+        if path.exists() and not overwrite:
+            allowed = "exists; overwrite=True replaces it"
+            raise InputError("save", [Problem("path", str(path), allowed)])
+        known = self.law.record() if isinstance(self.law, TorqueProfile) else {"kind": "function"}
+        about = self._figures() | {
+            "format": _FORMAT,
+            "scene": dump(self.scene),
+            "torque": None if self.law is None else known,
+        }
+        units = {name: {"unit": unit} for name, unit in UNITS.items()}
+        try:
+            write_table(columns_of(self), path, units, {_KEY: json.dumps(about)})
+        except OSError as error:
+            allowed = f"must be writable ({error})"
+            raise InputError("save", [Problem("path", str(path), allowed)]) from None
 
     @classmethod
     def load(cls, path: str | Path) -> Trajectory:
-        """Read a file that `save` has written.
+        """Read a Parquet or NPZ file that `save` has written.
 
         Raises:
-            InputError: there is no such file, or it holds no trajectory.
+            InputError: there is no such file, it holds no trajectory, or it is damaged.
 
         """
-        return trajectory_file.load(cls, Path(path))
+        allowed = "must be a trajectory that `Trajectory.save` has written"
+        try:
+            columns, texts = read_table(Path(path), list(UNITS), [_KEY])
+            about = json.loads(texts[_KEY])
+        except KeyError:
+            raise InputError("load", [Problem("path", str(path), allowed)]) from None
+        except ValueError as error:
+            problem = Problem("path", str(path), f"{allowed} ({error})")
+            raise InputError("load", [problem]) from None
+        if about["format"] != _FORMAT:
+            raise InputError("load", [Problem("format", about["format"], f"must be {_FORMAT}")])
+        arrays = {
+            name: np.stack([columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1)
+            for name, (_, dimension) in QUANTITIES.items()
+        }
+        return cls(
+            read(Scene, about["scene"], str(path)),
+            columns["t"],
+            *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
+            joints=np.hstack([arrays[name] for name in _JOINTS]),
+            law=profile_from(about["torque"]),
+            **{name: about[name] for name in _FIGURES if name in about},
+        )
+
+    def _figures(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in _FIGURES}
 
     def plot(self) -> Figure:
         """Draw actuator angles, rates, torques and the energy over time; needs matplotlib."""
-        return trajectory_file.draw(self._dense_enough())
+        require("matplotlib")
+        from matplotlib.figure import Figure
+
+        shown = self._dense_enough()
+        figure = Figure(figsize=(8.0, 9.0), layout="constrained")
+        panels = figure.subplots(4, 1, sharex=True)
+        for axes, name in zip(panels, ("gamma", "gamma_dot", "torque"), strict=False):
+            for k, column in enumerate(getattr(shown, name).T, start=1):
+                axes.plot(shown.t, column, label=f"leg {k}", linewidth=1.2)
+            axes.set_ylabel(f"{name} [{QUANTITIES[name][0]}]")
+        panels[0].legend(loc="best", ncols=3)
+        panels[3].plot(shown.t, shown.energy, color="black", linewidth=1.2)
+        panels[3].set(ylabel="energy [J]", xlabel="time [s]")
+        for axes in panels:
+            axes.grid(alpha=0.3)
+        figure.suptitle(f"{self.scene.name}: {self.message}")
+        return figure
 
     def __repr__(self) -> str:
         span = f"{self.t[0]:g} to {self.t[-1]:g} s" if len(self) else "no samples"
@@ -128,10 +345,99 @@ class Trajectory(SampledMotion):
         )
 
     def _repr_html_(self) -> str:
-        return trajectory_file.html(self, self._dense_enough())
+        rows = {
+            "scene": self.scene.name,
+            "samples": f"{len(self)}, {self.t[0]:g} to {self.t[-1]:g} s",
+            "status": f"{self.status}: {self.message}",
+            "method": self.method,
+            "error estimate": f"{self.error_estimate:.1e} rad",
+        }
+        cells = "".join(
+            f"<tr><th style='text-align:left'>{name}</th><td>{html.escape(value)}</td></tr>"
+            for name, value in rows.items()
+        )
+        picture = io.StringIO()
+        with contextlib.suppress(MissingDependency):
+            self.plot().savefig(picture, format="svg")
+        svg = picture.getvalue()
+        return f"<table>{cells}</table>{svg[max(svg.find('<svg'), 0) :]}"
 
     def _dense_enough(self) -> Trajectory:
         """Return a trajectory with samples enough for a picture."""
         if not 2 <= len(self.t) < _FEW or isinstance(self.law, LostTorque):
             return self
         return self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))
+
+
+def _own(value: ArrayLike) -> Array:
+    """Return an array that nothing can change: a copy, unless it is one already."""
+    array: Array = np.asarray(value, dtype=float)
+    if array is value and (array.flags.writeable or not array.flags.owndata):
+        array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def _propagate(trajectory: Trajectory, times: Array) -> Array:
+    """States (quaternion, body rate, acting torque) at times [s] inside, shape (m, 10)."""
+    if trajectory.dense is not None:
+        states = trajectory.dense(times)
+        if states.shape[1] > 7 or not isinstance(trajectory.law, TorqueProfile):
+            return states
+        actuators = trajectory.scene.actuators
+        limit = (actuators.torque_limit if actuators else None) or np.inf
+        return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
+    samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
+    before = np.searchsorted(trajectory.t, times, side="right") - 1
+    found = samples[before]
+    gap = _Gap(trajectory)
+    for k in np.unique(before[times > trajectory.t[before]]):
+        rows = np.flatnonzero((before == k) & (times > trajectory.t[k]))
+        order = rows[np.argsort(times[rows], kind="stable")]
+        found[order] = gap.states(int(k), samples[k], times[order])
+    return found
+
+
+class _Gap:
+    """Propagates from a sample towards the next one."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._propagator = Propagator(
+            trajectory.scene, DOP853.name, _ACCURACY,
+            compiled=False, budget=EvaluationBudget(), limits=False,
+        )  # fmt: skip
+        self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
+
+    def states(self, k: int, sample: Array, times: Array) -> Array:
+        """States at ascending times between sample k and the next, shape (m, 10)."""
+        propagator, dynamics = self._propagator, self._propagator.dynamics
+        moment = (0.0,) * (len(dynamics.drive) - 3)
+        at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
+        found = []
+        for end, asked in self._pieces(k, t, float(times[-1])):
+            torque = propagator.torque.acting(asked)
+            for time in (*times[(times > t) & (times < end)].tolist(), end):
+                if time > t:
+                    at, _ = propagator.advance(at, t, time - t, 1, torque, moment)
+                    t = time
+                    lagged = at.y[7:10] if len(dynamics.state) > 7 else None
+                    acting = lagged or propagator.torque.at(torque, t, at.y)
+                    found.append((t, *at.y[:7], *acting))
+        states = np.array(found)
+        return np.asarray(states[np.searchsorted(states[:, 0], times), 1:])
+
+    def _pieces(self, k: int, begin: float, end: float) -> list[tuple[float, Torque]]:
+        """List the ends of the pieces with a smooth torque, and the torque there."""
+        law = self._law
+        if law is None:
+            first, second, third = self._torque[k + 1].tolist()
+            return [(end, (first, second, third))]
+        if not isinstance(law, TorqueProfile):
+            return [(end, StateFeedback(law, self._propagator.dynamics))]
+        breaks = law.breaks()
+        ends = [*breaks[(breaks > begin) & (breaks < end)].tolist(), end]
+        pieces = (law.between(*span) for span in zip([begin, *ends], ends, strict=False))
+        return [
+            (stop, piece.torque if isinstance(piece, ConstantTorque) else piece)
+            for stop, piece in zip(ends, pieces, strict=True)
+        ]
