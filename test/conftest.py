@@ -28,9 +28,7 @@ def pytest_pycollect_makemodule(module_path, parent):
 
     A module that skips itself then skips its whole folder.
     """
-    if module_path.name != "test_launch_testing.py":
-        return pytest.Module.from_parent(parent, path=module_path)
-    return None
+    return pytest.Module.from_parent(parent, path=module_path)
 
 
 @pytest.fixture(scope="session")

@@ -18,12 +18,20 @@ from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from ros import message_types  # noqa: E402
 from ros.forked import ForkedNode  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
 from sst_ros.host import child_process  # noqa: E402
 from sst_ros.nodes.process import configure_middleware  # noqa: E402
-from sst_ros.state import IDLE_FRAME_ID  # noqa: E402
+from sst_ros.state import IDLE_FRAME_ID, nanoseconds  # noqa: E402
+
+NODE = "/sst_simulator"
+COMMANDS, STAMPED = f"{NODE}/commands", f"{NODE}/commands_stamped"
+NAMES = ["gamma_1", "gamma_2", "gamma_3"]
 
 # A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -32,16 +40,17 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 configure_middleware()
 
 
-@pytest.fixture
-def domain():
-    with child_process.own_domain() as number:
-        yield number
+def torques(*numbers):
+    """A plain command [N m]."""
+    return Float64MultiArray(data=list(map(float, numbers)))
 
 
-@pytest.fixture(scope="module")
-def domain_of_module():
-    with child_process.own_domain() as number:
-        yield number
+def named(effort, stamp=None, names=NAMES, **given):
+    """A command by name and stamp [N m]."""
+    message = JointState(name=list(names), effort=list(map(float, effort)), **given)
+    if stamp is not None:
+        message.header.stamp = stamp
+    return message
 
 
 def children(process):
@@ -59,9 +68,10 @@ class Nodes:
     def __init__(self):
         self.running = []
 
-    def start(self, command, *words, executable=None, env=None):
+    def start(self, command, *words, executable=None, env=None, **given):
         """Start a command in an interpreter of its own."""
         argv = executable or [sys.executable, "-m", "sst_ros", command]
+        words = [*words, *(["--ros-args", *child_process.words(given)] if given else [])]
         # Ends with this process, also where that is killed: the next run has the same domains.
         ends_with = {} if executable else {child_process.PARENT: str(os.getpid())}
         process = subprocess.Popen(
@@ -86,10 +96,15 @@ class Nodes:
         assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"
         return process.stdout.readline()
 
+    def ended(self, process, timeout=40):
+        """Status, stdout and stderr of a process that ends by itself."""
+        out, err = process.communicate(timeout=timeout)
+        assert "Traceback" not in err
+        return process.returncode, out, err
+
     def stop(self, process, number=signal.SIGINT, timeout=40):
         process.send_signal(number)
-        out, err = process.communicate(timeout=timeout)
-        return process.returncode, out, err
+        return self.ended(process, timeout)
 
     def close(self):
         """End all that run; what they have printed is shown where the test failed."""
@@ -97,13 +112,6 @@ class Nodes:
             if process.poll() is None:
                 process.kill()
             sys.stderr.write("".join(text for text in process.communicate() if text))
-
-
-@pytest.fixture
-def nodes(domain):
-    started = Nodes()
-    yield started
-    started.close()
 
 
 @pytest.fixture
@@ -134,19 +142,46 @@ class Observer:
         self.node = rclpy.create_node("observer", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        self.heard = {}
+        self.heard, self._publishers, self._clients = {}, {}, {}
 
     def listen(self, kind, topic, *, latched=False):
-        heard = self.heard.setdefault(topic, [])
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=1000, durability=durability)
-        self.node.create_subscription(kind, topic, heard.append, qos)
-        return heard
+        """Messages of a topic since the first call of this, which grow."""
+        if topic not in self.heard:
+            heard = self.heard[topic] = []
+            durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+            qos = QoSProfile(depth=1000, durability=durability)
+            self.node.create_subscription(kind, topic, heard.append, qos)
+        return self.heard[topic]
+
+    @property
+    def states(self):
+        return self.listen(JointState, "/joint_states")
+
+    @property
+    def phases(self):
+        return [phase.data for phase in self.listen(String, f"{NODE}/phase", latched=True)]
+
+    def samples(self):
+        """Those of the states that belong to a run."""
+        return [state for state in self.states if self.stamp(state)]
+
+    def stamps(self, messages=None):
+        """Of the messages of a run [ns]."""
+        found = map(self.stamp, self.states if messages is None else messages)
+        return [stamp for stamp in found if stamp]
+
+    def torques(self):
+        return [tuple(state.effort[:3]) for state in self.states]
 
     def publisher(self, kind, topic, readers=1):
-        publisher = self.node.create_publisher(kind, topic, 10)
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(kind, topic, 1000)
+        publisher = self._publishers[topic]
         self.until(lambda: publisher.get_subscription_count() >= readers, f"readers of {topic}")
         return publisher
+
+    def command(self, *numbers, readers=1):
+        self.publisher(Float64MultiArray, COMMANDS, readers).publish(torques(*numbers))
 
     def until(self, condition, what, timeout=40.0):
         deadline = time.monotonic() + timeout
@@ -164,38 +199,64 @@ class Observer:
 
         self.until(published, what)
 
-    def call(self, kind, name, /, **fields):
-        client = self.node.create_client(kind, name)
-        self.until(client.service_is_ready, f"service {name}")
-        future = client.call_async(kind.Request(**fields))
-        self.until(future.done, f"reply of {name}")
-        self.node.destroy_client(client)
+    def preview(self):
+        """Wait for a state; return the last one."""
+        self.until(lambda: self.states, "state")
+        return self.states[-1]
+
+    def phase(self, wanted):
+        """Wait for a phase, of which this is the beginning; return the whole."""
+        self.until(lambda: self.phases and self.phases[-1].startswith(wanted), f"phase {wanted}")
+        return self.phases[-1]
+
+    def result(self, future, what, timeout=40.0):
+        self.until(future.done, what, timeout)
         return future.result()
 
-    def set_parameter(self, node, name, value):
+    def call(self, kind, name, /, **fields):
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        self.until(client.service_is_ready, f"service {name}")
+        return self.result(client.call_async(kind.Request(**fields)), f"reply of {name}")
+
+    def pause(self, paused, node=NODE):
+        return self.call(SetBool, f"{node}/pause", data=paused)
+
+    def set_parameter(self, name, value):
         parameter = Parameter(name, value=value).to_parameter_msg()
-        reply = self.call(SetParameters, f"{node}/set_parameters", parameters=[parameter])
+        reply = self.call(SetParameters, f"{NODE}/set_parameters", parameters=[parameter])
         return reply.results[0]
+
+    def diagnostics(self, name=""):
+        """All that was said in the statuses whose name ends so."""
+        heard = self.listen(DiagnosticArray, "/diagnostics")
+        statuses = [message.status[0] for message in heard]
+        return [
+            {
+                **{pair.key: pair.value for pair in status.values},
+                **{"level": status.level, "said": status.message},
+            }
+            for status in statuses
+            if status.name.endswith(name)
+        ]
 
     def told(self, key, value, timeout=40.0):
         """Wait until the diagnostics say so; return all that they say then."""
-        heard = self.heard.get("/diagnostics")
-        if heard is None:
-            heard = self.listen(DiagnosticArray, "/diagnostics")
-
-        def last():
-            return {pair.key: pair.value for pair in heard[-1].status[0].values}
-
         meets = value if callable(value) else lambda said: said == str(value)
-        self.until(lambda: heard and meets(last()[key]), f"{key} in the diagnostics", timeout)
-        return {**last(), "level": heard[-1].status[0].level, "said": heard[-1].status[0].message}
+        said = []
+
+        def is_told():
+            said[:] = self.diagnostics()[-1:]
+            return said and meets(said[0][key])
+
+        self.until(is_told, f"{key} in the diagnostics", timeout)
+        return said[0]
 
     @staticmethod
     def stamp(message):
         """Of a sample [ns]; 0 for a state before the run, in a pause or in a fault."""
-        if message.header.frame_id == IDLE_FRAME_ID:
-            return 0
-        return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        return 0 if message.header.frame_id == IDLE_FRAME_ID else nanoseconds(message.header.stamp)
 
     def close(self):
         self.executor.shutdown()
@@ -203,8 +264,71 @@ class Observer:
         rclpy.try_shutdown(context=self.context)
 
 
+def _closing(started):
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def domain():
+    with child_process.own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def nodes(domain):
+    yield from _closing(Nodes())
+
+
 @pytest.fixture
 def observer(domain):
-    watching = Observer(domain)
-    yield watching
-    watching.close()
+    yield from _closing(Observer(domain))
+
+
+@pytest.fixture(scope="module")
+def domain_of_module():
+    with child_process.own_domain() as number:
+        yield number
+
+
+@pytest.fixture(scope="module")
+def nodes_of_module(domain_of_module):
+    yield from _closing(Nodes())
+
+
+@pytest.fixture(scope="module")
+def observer_of_module(domain_of_module):
+    yield from _closing(Observer(domain_of_module))
+
+
+@pytest.fixture(scope="module")
+def forked_demos(domain_of_module):
+    """Have demos fork their nodes, too; test_demo.py starts them as a user does."""
+
+    def start(command, given, **_):
+        words = [command, "--ros-args", *child_process.words(given)]
+        return ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(child_process, "start", start)
+        yield
+
+
+@pytest.fixture
+def profile(tmp_path):
+    """Write a torque profile of rows of time and torques as a file; return its path."""
+
+    def write(*rows):
+        path = tmp_path / "torque.csv"
+        path.write_text("\n".join(["time,tau_1,tau_2,tau_3", *rows, ""]))
+        return path
+
+    return write
+
+
+def foreign_types(package):
+    """Make the types of a package importable, here and in nodes; yield their environment."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = str(message_types.folder(package))
+        patch.syspath_prepend(folder)
+        yield {"PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])}

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import forkserver, resource_tracker
 
 import pytest
@@ -38,7 +38,7 @@ class ForkedNode:
             os.close(end)
         self.pid = self._process.pid
         self.stdout, self.stderr = (os.fdopen(begin, encoding="utf-8") for begin, _ in pipes)
-        self._readers = None
+        self._texts = []
 
     @property
     def returncode(self):
@@ -55,12 +55,12 @@ class ForkedNode:
 
     def communicate(self, timeout=None):
         """Read both pipes to their ends at once, so that none is full."""
-        if self._readers is None:
-            self._readers = [_Reader(pipe) for pipe in (self.stdout, self.stderr)]
-        for reader in self._readers:
-            reader.join(timeout)
+        if not self._texts:
+            pool = ThreadPoolExecutor(2)
+            self._texts = [pool.submit(pipe.read) for pipe in (self.stdout, self.stderr)]
+        texts = tuple(text.result(timeout) for text in self._texts)
         self.wait(timeout)
-        return tuple(reader.text for reader in self._readers)
+        return texts
 
     def send_signal(self, number):
         if self.poll() is None:
@@ -68,17 +68,6 @@ class ForkedNode:
 
     def kill(self):
         self._process.kill()
-
-
-class _Reader(threading.Thread):
-    def __init__(self, pipe):
-        super().__init__(daemon=True)
-        self._pipe, self.text = pipe, ""
-        self.start()
-
-    def run(self):
-        with self._pipe:
-            self.text = self._pipe.read()
 
 
 class _Call:

@@ -7,7 +7,7 @@ import re
 import shutil
 import signal
 import subprocess
-import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -41,28 +41,22 @@ class Launch:
     """A `ros2 launch` with all that it prints."""
 
     def __init__(self, folder, *words):
-        self._process = subprocess.Popen(
-            ["ros2", *words],
-            cwd=folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")},
-        )
-        self.text, self._news = "", threading.Condition()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._printed = folder / f"printed_{len(list(folder.glob('printed_*')))}"
+        with self._printed.open("w") as out:
+            env = {**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")}
+            self._process = subprocess.Popen(
+                ["ros2", *words], cwd=folder, stdout=out, stderr=subprocess.STDOUT, env=env
+            )
 
-    def _read(self):
-        for line in self._process.stdout:
-            with self._news:
-                self.text += line
-                self._news.notify()
+    @property
+    def text(self):
+        return self._printed.read_text()
 
     def until(self, pattern, timeout=60):
-        with self._news:
-            found = self._news.wait_for(lambda: re.search(pattern, self.text), timeout)
-        assert found, f"no {pattern} in {self.text}"
+        deadline = time.monotonic() + timeout
+        while (found := re.search(pattern, self.text)) is None:
+            assert time.monotonic() < deadline, f"no {pattern} in {self.text}"
+            time.sleep(0.05)
         return found
 
     def interrupt(self):
@@ -74,7 +68,6 @@ class Launch:
             status = self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             raise AssertionError(f"it does not end:\n{self.text}") from None
-        self._reader.join(10)
         pids = map(int, re.findall(r"process started with pid \[(\d+)\]", self.text))
         assert not [pid for pid in pids if Path("/proc", str(pid)).exists()]
         return status
@@ -182,6 +175,72 @@ def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):
     assert view.ended() == 0, view.text
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("simulate.launch.py", ["scene:=swing", "duration:=0.0"]),
+        ("feedforward.launch.py", ["record:=false", "hold:=100.0"]),
+    ],
+)
+def test_ctrl_c_ends_a_run_in_order(launch, name, words):
+    run = launch(name, *words)
+    run.until("running")
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert "process has died" not in run.text
+
+
+CONTROLLER_MANAGER = """#!/usr/bin/env python3
+import rclpy
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("controller_manager")
+commands = node.create_publisher(JointState, "/sst_simulator/commands_stamped", 10)
+def write(states):
+    command = JointState(name=states.name[:3], effort=[0.0] * 3)
+    command.header.stamp = node.get_clock().now().to_msg()
+    commands.publish(command)
+node.create_subscription(JointState, "/joint_states", write, 10)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+"""
+"""Stands in for the real one, with the messages of its plug-in for an effort controller."""
+STAND_INS = {
+    "controller_manager": {"ros2_control_node": CONTROLLER_MANAGER, "spawner": "#!/bin/true\n"},
+    "robot_state_publisher": {"robot_state_publisher": "#!/bin/sh\nexec sleep 60\n"},
+    "joint_state_broadcaster": {},
+    "joint_state_topic_hardware_interface": {},
+}
+"""Programs of the packages that ros2_control.launch.py needs."""
+
+
+def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch):
+    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    for package, programs in STAND_INS.items():
+        if not installed(package):
+            (index / package).touch()
+            (tmp_path / "lib" / package).mkdir(parents=True)
+            for name, text in programs.items():
+                path = tmp_path / "lib" / package / name
+                path.write_text(text)
+                path.chmod(0o755)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ['AMENT_PREFIX_PATH']}")
+    run = launch("ros2_control.launch.py")
+    run.until("running")
+    run.until(r"\[spawner-\d\]: process has finished cleanly")
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
+def test_no_launch_file_is_left_out():
+    text = Path(__file__).read_text(encoding="utf-8")
+    found = {path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py")}
+    assert found and all(f'"{name}"' in text for name in found)
+
+
 @pytest.mark.skipif(installed("rviz2"), reason="for a ROS installation without RViz")
 @pytest.mark.parametrize("name", ["view.launch.py", "simulate.launch.py"])
 def test_rviz_without_its_packages_starts_nothing(launch, name):
@@ -195,7 +254,7 @@ def test_rviz_without_its_packages_starts_nothing(launch, name):
 def test_ros2_control_without_its_packages_starts_nothing(launch):
     run = launch("ros2_control.launch.py")
     assert run.ended() == 1
-    assert re.search(r"needs the ROS package\(s\) controller_manager", run.text)
+    assert re.search(r"needs the ROS package\(s\) .*controller_manager", run.text)
     assert "process started" not in run.text
 
 

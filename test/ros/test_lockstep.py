@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lockstep: a closed loop gives the same bits on an idle and on a loaded machine."""
 
-import signal
+import ast
+import re
 import subprocess
 import sys
-from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from ros.conftest import STAMPED, named
 from sensor_msgs.msg import JointState
 
-from sst_ros import Simulation, simulate
+from sst_ros import Simulation, load_scene, simulate
 from sst_ros.recording import recording
 from sst_ros.state import Joints
 
 pytestmark = pytest.mark.ros
-NODE = "/sst_simulator"
 JOINTS = Joints._fields
+AT_ONCE = {"sync": "lockstep", "real_time_factor": 0.0}
+PERIOD_NS = 2_000_000
+EXAMPLE = Path(__file__).parents[2] / "examples" / "controller.py"
+GOAL = ast.literal_eval(re.search(r"^GOAL = (\(.*?\))", EXAMPLE.read_text(), re.MULTILINE)[1])
 
 
 def pd_torque(gamma, gamma_dot):
@@ -24,80 +29,54 @@ def pd_torque(gamma, gamma_dot):
     return (60.0 * (goal - np.array(gamma)) - 6.0 * np.array(gamma_dot)).tolist()
 
 
-class Controller:
-    """PD on gamma, answering every sample by its stamp."""
-
-    def __init__(self, observer):
-        self.publisher = observer.node.create_publisher(JointState, f"{NODE}/commands_stamped", 10)
-        self.node = observer.node
-        self.states = self.node.create_subscription(JointState, "/joint_states", self.answer, 10)
-
-    def close(self):
-        self.node.destroy_subscription(self.states)
-        self.node.destroy_publisher(self.publisher)
-
-    def answer(self, state):
-        effort = pd_torque(state.position[:3], state.velocity[:3])
-        answer = JointState(name=state.name[:3], effort=effort)
-        answer.header.stamp = state.header.stamp
-        self.publisher.publish(answer)
-
-
-def closed_loop(nodes, observer, bag, disturb=lambda: None, **options):
-    recorder = nodes.run("recorder", output=bag)
-    simulator = nodes.run(
-        "simulator",
-        sync="lockstep",
-        duration=0.3,
-        real_time_factor=0.0,
-        publish_rate=500,
-        **options,
-    )
-    assert nodes.line(recorder).startswith("ready")
-    disturb()
-    controller = Controller(observer)
-    observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=60.0)
-    controller.close()
-    assert simulator.returncode == 0
-    assert nodes.stop(recorder)[0] == 0
-    return recording.read(bag)
-
-
 @pytest.fixture
 def load():
-    """Keep all processors busy."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
-    yield busy
+    """A function that keeps all processors busy until the end of the test."""
+    busy = []
+    yield lambda: busy.extend(
+        subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)
+    )
     for process in busy:
         process.kill()
         process.wait()
 
 
-@pytest.mark.slow
-def test_a_closed_loop_is_the_same_on_a_loaded_machine(nodes, observer, tmp_path, request):
-    idle = closed_loop(nodes, observer, tmp_path / "idle")
-    disturb = partial(request.getfixturevalue, "load")
-    loaded = closed_loop(nodes, observer, tmp_path / "loaded", disturb)
-    assert len(idle.time_ns) == 151 and idle.ticks.gaps == 0
-    assert np.ptp(idle.gamma, axis=0).min() > 1e-3  # it moves
-    for name in (
-        *("time_ns", "gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"),
-        *("effort", "quaternion", "euler"),
-    ):
-        assert np.array_equal(getattr(idle, name), getattr(loaded, name)), name
-    assert np.array_equal(idle.ticks.torque, loaded.ticks.torque)
-    assert np.array_equal(idle.ticks.end_ns, loaded.ticks.end_ns)
+@pytest.fixture
+def closed_loop(nodes, observer, tmp_path):
+    """A recorded run under PD on gamma, which answers every sample by its stamp."""
+
+    def run(disturb):
+        recorder = nodes.run("recorder", output=tmp_path / "bag")
+        rates = {"rate": 500, "publish_rate": 500}
+        simulator = nodes.run("simulator", duration=0.3, **rates, **AT_ONCE)
+        assert nodes.line(recorder).startswith("ready")
+        disturb()
+        publisher = observer.node.create_publisher(JointState, STAMPED, 10)
+
+        def answer(state):
+            torque = pd_torque(state.position[:3], state.velocity[:3])
+            publisher.publish(named(torque, state.header.stamp))
+
+        observer.node.create_subscription(JointState, "/joint_states", answer, 10)
+        observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=60.0)
+        assert simulator.returncode == 0
+        assert nodes.stop(recorder)[0] == 0
+        return recording.read(tmp_path / "bag")
+
+    return run
 
 
-def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_path):
+@pytest.mark.parametrize("loaded", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(closed_loop, load, loaded):
     """One closed loop three times: in one call, step by step, and as nodes in lockstep."""
-    bag = closed_loop(nodes, observer, tmp_path / "bag", rate=500).trajectory
-    tolerance, period = 1e-10, 0.002
+    recorded = closed_loop(load if loaded else lambda: None)
+    bag = recorded.trajectory
+    tolerance = 1e-10
     whole = simulate(
         bag.scene,
         lambda t, state: pd_torque(state.joints.gamma, state.joints.gamma_dot),
         0.3,
-        control_period=period,
+        control_period=PERIOD_NS / 1e9,
         tolerance=tolerance,
     )
     simulation = Simulation(bag.scene, tolerance=tolerance)
@@ -105,9 +84,12 @@ def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(nodes, obse
     for _ in range(150):
         joints = simulation.state.joints
         torque = tuple(pd_torque(joints.gamma, joints.gamma_dot))
-        states.append(simulation.step(torque, round(period * 1e9)))
+        states.append(simulation.step(torque, PERIOD_NS))
     assert len(bag) == len(whole) == len(states) == 151
-    assert np.ptp(bag.gamma, axis=0).min() > 1e-3
+    assert np.ptp(bag.gamma, axis=0).min() > 1e-3  # it moves
+    assert recorded.ticks.gaps == 0
+    assert np.array_equal(recorded.ticks.torque, bag.torque[1:])
+    assert np.array_equal(recorded.ticks.end_ns, recorded.time_ns[1:])
     single = {
         **{name: [getattr(state.joints, name) for state in states] for name in JOINTS},
         "t": [state.time_ns / 1e9 for state in states],
@@ -123,56 +105,37 @@ def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(nodes, obse
     assert bag.error_estimate == pytest.approx(whole.error_estimate, rel=1e-2)
 
 
-def test_without_an_answer_it_stops_with_a_fault(nodes, observer):
-    states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", sync="lockstep", lockstep_timeout=0.3)
-    publisher = observer.publisher(JointState, f"{NODE}/commands_stamped")
-    observer.until(lambda: states, "preview")
-    answer = JointState(name=["gamma_1", "gamma_2", "gamma_3"], effort=[0.0] * 3)
-    publisher.publish(answer)  # stamp zero: begins
-    observer.until(lambda: any(observer.stamp(s) for s in states), "the first sample")
-    first = next(state for state in states if observer.stamp(state))
-    publisher.publish(answer)  # of the wrong stamp, not counted: answers to previews are harmless
-    answer.header.stamp = first.header.stamp
-    answer.header.stamp.nanosec ^= 1
-    publisher.publish(answer)  # of a wrong stamp
-    said = observer.told("phase", "fault")
-    assert "no command answered the sample of" in said["fault"]
-    assert said["commands_dropped_because"] == "stamp 1" and said["ticks"] == "0"
-    status, _, err = nodes.stop(process, signal.SIGTERM)
-    assert status == 0 and "Traceback" not in err
-
-
-@pytest.mark.parametrize(("timeout", "factor"), [(1.5, 1.0), (3.0, 0.0)])
-def test_the_timeout_counts_from_the_sample(nodes, observer, timeout, factor):
-    """Longer than the period of the diagnostics, which wake the run."""
-    states = observer.listen(JointState, "/joint_states")
-    nodes.run(
-        "simulator",
-        sync="lockstep",
-        lockstep_timeout=timeout,
-        real_time_factor=factor,
-        duration=0.0,
-    )
-    publisher = observer.publisher(JointState, f"{NODE}/commands_stamped")
-    observer.until(lambda: states, "preview")
-    begin = JointState(name=["gamma_1", "gamma_2", "gamma_3"], effort=[0.0] * 3)
-    begin.header.stamp = states[-1].header.stamp
-    publisher.publish(begin)
-    observer.told("phase", "running")
-    said = observer.told("phase", "fault", timeout + 3.0)
-    assert f"within {timeout:g} s" in said["fault"]
-
-
-@pytest.mark.slow
-def test_the_player_plays_in_lockstep(nodes, observer, tmp_path):
-    table = tmp_path / "torque.csv"
-    table.write_text("time,tau_1,tau_2,tau_3\n0,0.1,0.2,0.3\n0.05,0.3,0.2,0.1\n0.1,0,0,0\n")
-    states = observer.listen(JointState, "/joint_states")
-    simulator = nodes.run("simulator", sync="lockstep", duration=0.1, real_time_factor=0.0)
-    observer.until(lambda: states, "preview")
-    player = nodes.run("torque_player", csv=table, stamped=True)
+@pytest.mark.parametrize("name", [pytest.param("example1", marks=pytest.mark.slow), "example2"])
+def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
+    """The same samples as by the default equations."""
+    given = {"scene": name, "equations": "virtual_work", "duration": 0.05}
+    simulator = nodes.run("simulator", **given, **AT_ONCE)
+    observer.preview()
+    nodes.run("torque_player", scene=name, stamped=True)
     observer.until(lambda: simulator.poll() is not None, "end of the run")
-    assert (simulator.returncode, player.wait(timeout=10)) == (0, 0)
-    run = [tuple(s.effort[:3]) for s in states if observer.stamp(s)]
-    assert run == [(0.0,) * 3, *[(0.1, 0.2, 0.3)] * 25, *[(0.3, 0.2, 0.1)] * 25]
+    samples = observer.samples()
+    assert simulator.returncode == 0 and len(samples) == 26
+    simulation, profile = Simulation(name), load_scene(name).torque.at
+    for k, sample in enumerate(samples):
+        joints = simulation.state.joints
+        expected = [*joints.gamma, *joints.mu, *joints.beta]
+        np.testing.assert_allclose(sample.position[:9], expected, rtol=0.0, atol=1e-12)
+        simulation.steps(profile((k + 0.5) * PERIOD_NS / 1e9), PERIOD_NS // 2, 2)
+
+
+@pytest.mark.parametrize("sync", ["free", "lockstep"])
+def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
+    controller = subprocess.Popen([sys.executable, str(EXAMPLE)])
+    try:
+        nodes.run("simulator", scene="example2", sync=sync, wait_for_command=True)
+        observer.until(
+            lambda: (
+                observer.states
+                and observer.states[-1].position[:3] == pytest.approx(GOAL, abs=0.02)
+            ),
+            "angles at the goal",
+            30.0,
+        )
+    finally:
+        controller.terminate()
+        controller.wait(10.0)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as bytes, against what rclpy and rosbags read from them."""
+"""Messages as bytes, against what rclpy and rosbags read from them; what is shown without a run."""
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from sst_ros import load_scene
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.nodes.publications import (
     NotFinite,
+    SimulatorTopics,
     StateMessages,
     TorqueLog,
     clock_message,
@@ -27,11 +30,13 @@ from sst_ros.nodes.publications import (
 from sst_ros.nodes.publications import (
     zyz_angles as angles_of,
 )
+from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 1_700_000_000_123_456_789
+BAD = (math.nan, math.inf, -math.inf)
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +55,14 @@ def stamped(messages, stamp_ns, state):
 def sample(state):
     """Return what `Simulation.sample` returns."""
     return [*state.quaternion, *state.body_rate], sum(state.joints, ()), state.torque
+
+
+def broken(state, bad):
+    """The state with a number that is none, in three places."""
+    joints = state.joints._replace(mu_dot=(0.0, bad, 0.0))
+    quaternion = (bad, *state.quaternion[1:])
+    for field, value in (("joints", joints), ("torque", (bad, 0, 0)), ("quaternion", quaternion)):
+        yield replace(state, **{field: value})
 
 
 def strictly(data, name):
@@ -77,18 +90,13 @@ def test_a_state_is_read_as_it_is(state):
     strictly(euler, "geometry_msgs/msg/Vector3Stamped")
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("bad", BAD)
 def test_what_is_not_finite_is_refused(state, bad):
     quaternion, joints, torque = finite(*sample(state))
     assert (tuple(quaternion), joints, torque) == (state.quaternion, *sample(state)[1:])
-    joints = state.joints._replace(mu_dot=(0.0, bad, 0.0))
-    for broken in (
-        replace(state, joints=joints),
-        replace(state, torque=(bad, 0.0, 0.0)),
-        replace(state, quaternion=(bad, *state.quaternion[1:])),
-    ):
+    for wrong in broken(state, bad):
         with pytest.raises(NotFinite, match="not finite"):
-            finite(*sample(broken))
+            finite(*sample(wrong))
 
 
 @pytest.mark.parametrize("moments", [False, True])
@@ -153,3 +161,44 @@ def test_zyz_angles_are_those_of_the_rotation(theta, phi, psi, length):
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.6, 0.8), (0.6, 0.8, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)])
 def test_at_a_pole_psi_carries_it_all(q):
     np.testing.assert_allclose(angles_of(q), zyz_angles(rotation_matrix(q)), atol=1e-15)
+
+
+class Topic:
+    """A topic with a subscriber."""
+
+    def __init__(self, kind, name, _):
+        self.topic_name, self.published = name, []
+        self.publish = self.published.append
+
+    def get_subscription_count(self):
+        return 1
+
+
+@pytest.fixture
+def shown():
+    """A function that shows a state, and the last messages of all topics, by their names."""
+    made = []
+    create = lambda *given: made.append(Topic(*given)) or made[-1]  # noqa: E731
+    node = SimpleNamespace(publishers=made, create_publisher=create)
+    simulated = SimulatorTopics(node, load_scene("example2"), SimulatorParameters())
+
+    def show(state, *, at_rest=False):
+        simulated.idle(state, 7, at_rest=at_rest)
+        last = {topic.topic_name: topic.published[-1:] for topic in made}
+        return deserialize_message(*last["joint_states"], JointState), last
+
+    return show
+
+
+def test_a_state_at_rest_keeps_its_angles(shown, state):
+    (moving, _), (rest, _) = shown(state), shown(state, at_rest=True)
+    assert any(moving.velocity) and tuple(moving.effort[:3]) == state.torque
+    assert rest.position == moving.position and all(rest.position)
+    assert not any(rest.velocity) and not any(rest.effort)
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_in_place_of_what_is_not_finite_the_last_valid_state_is_shown(shown, state, bad):
+    before = shown(state)[1]
+    for wrong in broken(state, bad):
+        assert shown(wrong)[1] == before

@@ -5,13 +5,12 @@ import contextlib
 import math
 import os
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 from rcl_interfaces.srv import DescribeParameters
-from std_srvs.srv import SetBool
+from ros.conftest import NODE
 
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.schema import specs
@@ -22,10 +21,10 @@ ROOT = Path(__file__).parents[2]
 
 def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, observer):
     nodes.run("simulator")
-    observer.told("phase", "running")
+    observer.phase("running")
 
     def put(name, value):
-        result = observer.set_parameter("/sst_simulator", name, value)
+        result = observer.set_parameter(name, value)
         return result.successful, result.reason
 
     assert put("real_time_factor", 4.0) == (True, "")
@@ -73,14 +72,14 @@ def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes,
     if not fifo_is_permitted():
         pytest.skip("SCHED_FIFO is not permitted here")
     process = nodes.run("simulator", realtime_priority=20)
-    observer.told("phase", "running")
+    observer.phase("running")
     fifo = os.SCHED_FIFO
 
     def all_are(others, run):
         return lambda: {*scheduling(process)[:-1]} == {others} and scheduling(process)[-1] == run
 
     observer.until(all_are((fifo, 10), (fifo, 20)), "SCHED_FIFO of all threads")
-    assert observer.set_parameter("/sst_simulator", "real_time_factor", 0.0).successful
+    assert observer.set_parameter("real_time_factor", 0.0).successful
     usual = (os.SCHED_OTHER, 0)
     observer.until(all_are(usual, usual), "usual scheduling as fast as possible")
 
@@ -101,28 +100,24 @@ def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(no
     process = nodes.run("simulator", cpu_dma_latency=0)
     observer.told("cpu_dma_latency", "0 us")
     assert machine_latency_us() == 0
-    assert observer.set_parameter("/sst_simulator", "real_time_factor", 0.0).successful
+    assert observer.set_parameter("real_time_factor", 0.0).successful
     observer.told("cpu_dma_latency", "no limit")
     assert machine_latency_us() == before
-    assert observer.set_parameter("/sst_simulator", "real_time_factor", 1.0).successful
+    assert observer.set_parameter("real_time_factor", 1.0).successful
     observer.until(lambda: machine_latency_us() == 0, "limit of a run with deadlines")
-    pause = partial(observer.call, SetBool, "/sst_simulator/pause")
-    assert pause(data=True).success
+    assert observer.pause(True).success
     observer.until(lambda: machine_latency_us() == before, "no limit in a pause")
-    assert pause(data=False).success
+    assert observer.pause(False).success
     observer.until(lambda: machine_latency_us() == 0, "limit of a run that was resumed")
     process.kill()
     process.wait(10)
     assert machine_latency_us() == before
 
 
-@pytest.mark.slow
 def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
     nodes.run("simulator")
     known = specs(SimulatorParameters)
-    reply = observer.call(
-        DescribeParameters, "/sst_simulator/describe_parameters", names=list(known)
-    )
+    reply = observer.call(DescribeParameters, f"{NODE}/describe_parameters", names=list(known))
     for descriptor in reply.descriptors:
         assert descriptor.description.startswith(known[descriptor.name].doc)
         may_change = descriptor.name in SimulatorParameters.CHANGEABLE
@@ -148,10 +143,31 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
         ({"publish_clock": True, "use_sim_time": True}, "cannot be its source"),
     ],
 )
-def test_refused_at_start(run_here, given, said):
+def test_a_simulator_is_refused_at_its_start(run_here, given, said):
     status, _, err = run_here("simulator", **given)
     assert status == 1
     assert said in err
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "said"),
+    [
+        ("torque_player", {"rate": 300}, "rate = 300: must divide 1e9"),
+        ("torque_player", {"csv": "{folder}/bad.csv"}, "line 2: row"),
+        ("torque_player", {"timeout": 0.5}, "no joint_states for"),
+        ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
+        ("inverse_dynamics", {"torque_limit": 0.5}, "exceeds the limit 0.5 N m"),
+        ("inverse_dynamics", {"stiffness": "[1.0, .nan, 1.0]"}, "stiff"),
+        ("recorder", {"output": "{folder}"}, "output = '{folder}': must be a new folder"),
+    ],
+)
+def test_a_node_ends_that_cannot_do_its_work(run_here, tmp_path, command, given, said):
+    """See test_trajectory_following.py for more reasons of the controller."""
+    (tmp_path / "bad.csv").write_text("time,tau_1,tau_2,tau_3\n0,1,2,nan\n")
+    given = {name: str(value).format(folder=tmp_path) for name, value in given.items()}
+    status, _, err = run_here(command, **given)
+    assert status == 1
+    assert said.format(folder=tmp_path) in err.replace("PosixPath", "")
 
 
 def test_the_file_of_parameters_holds_the_defaults(nodes, observer):

@@ -1,17 +1,228 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The end of a process: by a signal, by its work, by a callback that fails."""
+"""What a process asks of Fast DDS and takes from it, and how it ends."""
 
+import math
+import os
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from ros.conftest import torques
+from std_msgs.msg import Float64MultiArray
 
 from sst_ros.errors import SstError
-from sst_ros.nodes import process, signals
+from sst_ros.nodes import process, signals, topics
+
+NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+
+LISTEN = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(String, "said", lambda message: None, 1000)
+print("listening", flush=True)
+rclpy.spin(node)
+"""
+
+SPEAKER = """
+import time
+import rclpy
+from rclpy.duration import Duration
+from std_msgs.msg import String
+from sst_ros.nodes import process
+process.configure_middleware()
+rclpy.init()
+node = rclpy.create_node("speaker")
+publisher = node.create_publisher(String, "said", 1000)
+end = time.monotonic() + 30.0
+while publisher.get_subscription_count() == 0 and time.monotonic() < end:
+    time.sleep(0.01)
+"""
+
+SPEAK = """
+for _ in range(4):
+    publisher.publish(String(data="a word"))
+    print(publisher.wait_for_all_acked(Duration(seconds=1.0)), flush=True)
+"""
+
+
+QUIET = """
+import gc, time
+import rclpy
+from sensor_msgs.msg import JointState
+from sst_ros.nodes.simulator import Simulator
+rclpy.init(args=["simulator", "--ros-args", "-p", "scene:=swing", "-p", "compiled:=true"])
+simulator, samples = Simulator(), []
+node = rclpy.create_node("observer")
+node.create_subscription(JointState, "joint_states", samples.append, 10)
+end = time.monotonic() + 30.0
+while not any(sample.header.frame_id == "" for sample in samples) and time.monotonic() < end:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(gc.isenabled(), len(gc.get_objects()))
+simulator.close()
+"""
+
+BURST = """
+from pathlib import Path
+tasks = [task for task in Path("/proc/self/task").iterdir()
+         if (task / "comm").read_text().startswith("dds.ev")]
+def wakes():
+    rows = (task / "status" for task in tasks)
+    return sum(int(row.read_text().partition("\\nvoluntary_ctxt_switches:")[2].split()[0])
+               for row in rows)
+before = wakes()
+for _ in range(500):
+    publisher.publish(String(data="a word"))
+    time.sleep(0.001)
+print(wakes() - before)
+"""
+
+
+@pytest.fixture
+def no_profile(monkeypatch):
+    for name in NAMES:
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def context(domain):
+    own = rclpy.Context()
+    rclpy.init(context=own, domain_id=domain)
+    yield own
+    rclpy.try_shutdown(context=own)
+
+
+def run(text, status=0):
+    """Run a text in a process of its own."""
+    argv = [sys.executable, "-c", text]
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=100, check=False)
+    assert ended.returncode == status, ended.stderr
+    return ended
+
+
+def speak(words):
+    """Run a speaker beside a listener, each in a process of its own."""
+    argv = [sys.executable, "-c", LISTEN]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as listener:
+        try:
+            assert listener.stdout.readline() == "listening\n"
+            return run(SPEAKER + words)
+        finally:
+            listener.kill()
+
+
+def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
+    """By default they are asked every 3 s: the second of waiting would pass in vain."""
+    spoken = speak(SPEAK)
+    assert spoken.stdout.split() == ["True"] * 4
+    assert spoken.stderr == ""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_profile_of_the_user_is_left_alone(name, no_profile, monkeypatch):
+    monkeypatch.setenv(name, "mine.xml")
+    before = dict(os.environ)
+    process.configure_middleware()
+    assert dict(os.environ) == before
+
+
+@pytest.mark.parametrize(("rclpy", "name"), [("7.1.5", NAMES[0]), ("9.1.2", NAMES[1])])
+def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch):
+    monkeypatch.setattr(process, "version", lambda package: {"rclpy": rclpy}[package])
+    process.configure_middleware()
+    (given,) = {each: os.environ.pop(each) for each in NAMES if each in os.environ}.items()
+    assert given[0] == name
+    assert Path(given[1]).is_file()
+
+
+def test_a_publication_does_not_wake_the_thread_for_events(domain, no_profile):
+    """By default each of them does: more than 500 times here."""
+    spoken = speak(BURST)
+    assert int(spoken.stdout) < 250
+
+
+def test_garbage_of_the_start_is_not_looked_through_again(domain):
+    enabled, objects = run(QUIET).stdout.split()[:2]
+    assert enabled == "False"
+    assert int(objects) < 3000  # before: 12,000, with numba 63,000
+
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def node(context):
+    return rclpy.create_node("reader", context=context)
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    made, original = [], topics.take
+
+    def take(subscription):
+        made.append(subscription)
+        return original(subscription)
+
+    monkeypatch.setattr(topics, "take", take)
+    return made
+
+
+def publish(node, *torque):
+    """Publish a command and wait until it has arrived."""
+    publisher = node.create_publisher(Float64MultiArray, topics.SIMULATOR["commands"].name, 10)
+    deadline = time.monotonic() + 30.0
+    while not publisher.get_subscription_count():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    publisher.publish(torques(*torque))
+    publisher.wait_for_all_acked()
+    return publisher
+
+
+def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(node, looks):
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
+    for tick in range(100):
+        assert not reader.read(tick * MS)
+    assert len(looks) == 5
+
+
+def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks):
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
+    at = time.monotonic_ns() + 10**12  # the test does not count its own time
+    assert not reader.read(at)
+    publisher = publish(node, 1.0, 2.0, 3.0)
+    assert not reader.read(at + 19 * MS)
+    (taken,) = reader.read(at + 20 * MS)
+    assert list(taken.data) == [1.0, 2.0, 3.0]
+    before = len(looks)
+    for tick in range(10):
+        assert not reader.read(at + (21 + tick) * MS)
+    assert len(looks) == before + 10  # at each tick from now on
+    publisher.publish(torques(4.0, 5.0, 6.0))
+    publisher.wait_for_all_acked()
+    assert len(reader.read(at + 32 * MS)) == 1
+
+
+def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
+    """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
+    reader = topics.Reader(node, topics.SIMULATOR["commands"])
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    publish(node, 1.0, 2.0, 3.0)
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.0)  # what else there was to do
+    before = time.thread_time()
+    executor.spin_once(timeout_sec=1.0)
+    assert time.thread_time() - before < 0.05  # 0.002 asleep, up to 1.0 awake
+    assert len(reader.read(math.inf)) == 1
+    executor.shutdown()
 
 
 class Worker:
@@ -24,14 +235,6 @@ class Worker:
 
     def close(self):
         self.closed.set()
-
-
-@pytest.fixture
-def context(domain):
-    own = rclpy.Context()
-    rclpy.init(context=own, domain_id=domain)
-    yield own
-    rclpy.try_shutdown(context=own)
 
 
 @pytest.fixture
@@ -52,12 +255,6 @@ def test_a_signal_ends_a_node_while_a_callback_waits_for_it(context, stop):
     began = time.monotonic()
     process.spin(worker)
     assert worker.closed.is_set() and time.monotonic() - began < 30.0  # it would wait for 60 s
-
-
-def test_the_end_of_the_work_ends_a_node(context, stop):
-    worker = Worker(context, lambda own: own.done.set())
-    process.spin(worker)
-    assert worker.entered.is_set() and worker.closed.is_set()
 
 
 def test_the_failure_of_a_callback_is_that_of_the_process(context, stop):
@@ -97,8 +294,6 @@ process.spin(Worker())
 
 def test_a_node_ends_though_its_middleware_hangs(domain):
     began = time.monotonic()
-    argv = [sys.executable, "-c", HANGS]
-    ended = subprocess.run(argv, capture_output=True, text=True, timeout=100, check=False)
+    ended = run(HANGS, status=1)
     assert time.monotonic() - began < 50.0  # it would wait for 60 s
-    assert (ended.returncode, ended.stdout) == (1, "closed\n")
-    assert "in destroy_node" in ended.stderr
+    assert ended.stdout == "closed\n" and "in destroy_node" in ended.stderr

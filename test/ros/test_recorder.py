@@ -1,71 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What a recorder keeps, waits for and misses; cut recordings, and what comes out of them."""
+
 import re
+import resource
 import signal
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
+from mcap.writer import MCAP0_MAGIC
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from ros.conftest import COMMANDS, NODE
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
+from sst_ros.errors import InputError
 from sst_ros.nodes import topics
+from sst_ros.recording import bag_writer, recording
 
 pytestmark = pytest.mark.ros
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def recorded(nodes, observer, bag, **given):
+    """A recorder and a simulator that runs."""
+    recorder = nodes.run("recorder", output=bag)
+    simulator = nodes.run("simulator", wait_for_command=True, command_timeout=0.0, **given)
+    assert nodes.line(recorder) == "ready: 9 topics\n"
+    observer.command(0.0, 0.0, 0.0, readers=2)
+    return recorder, simulator
+
+
+def whole(bag, more_than):
+    """Read a bag, which has so many samples of the run and no gap."""
+    run = recording.read(bag)
+    assert len(run.time_ns) > more_than
+    assert np.array_equal(run.time_ns, np.arange(len(run.time_ns)) * 2_000_000)
+    return run
 
 
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
 def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path, number):
-    recorder = nodes.run("recorder", output=tmp_path / "bag")
-    simulator = nodes.run("simulator", wait_for_command=True, duration=0.3)
-    assert nodes.line(recorder) == "ready: 9 topics\n"
-    commands = observer.publisher(Float64MultiArray, "/sst_simulator/commands", readers=2)
-    commands.publish(Float64MultiArray(data=[0.0, 0.0, 0.0]))
+    recorder, simulator = recorded(nodes, observer, tmp_path / "bag", duration=0.3)
     assert simulator.wait(timeout=60) == 0
-    status, _, err = nodes.stop(recorder, number)
-    assert status == 0
-    assert "Traceback" not in err
-    types = get_typestore(Stores.ROS2_KILTED)
-    stamps = []
-    with Reader(tmp_path / "bag") as bag:
-        for connection, _, data in bag.messages():
-            if connection.topic == "/joint_states":
-                header = types.deserialize_cdr(data, connection.msgtype).header
-                if header.frame_id != "idle":
-                    stamps.append(header.stamp.sec * 10**9 + header.stamp.nanosec)
-    run = stamps
-    assert run == [run[0] + 2_000_000 * k for k in range(151)]
+    assert nodes.stop(recorder, number)[0] == 0
+    assert len(whole(tmp_path / "bag", 150).time_ns) == 151
 
 
 def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observer, tmp_path):
     """Who commands waits for their readers: what the recorder has not found would be lost."""
-    node = "/sst_simulator"
     kinds = {
-        "/joint_states": JointState,
-        f"{node}/orientation": QuaternionStamped,
-        f"{node}/euler_zyz": Vector3Stamped,
-        f"{node}/applied_torques": JointTrajectory,
-        f"{node}/scene": String,
-        f"{node}/phase": String,
-        "/diagnostics": DiagnosticArray,
+        "/joint_states": (JointState, 10),
+        f"{NODE}/orientation": (QuaternionStamped, 10),
+        f"{NODE}/euler_zyz": (Vector3Stamped, 10),
+        f"{NODE}/applied_torques": (JointTrajectory, 10),
+        f"{NODE}/scene": (String, LATCHED),
+        f"{NODE}/phase": (String, LATCHED),
+        "/diagnostics": (DiagnosticArray, 10),
     }
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-    def make(kind, topic, depth):
-        is_latched = topic in (f"{node}/scene", f"{node}/phase")
-        return observer.node.create_publisher(kind, topic, latched if is_latched else depth)
+    def make(topic):
+        kind, qos = kinds[topic]
+        return observer.node.create_publisher(kind, topic, qos), kind()
 
-    speak = [(make(kind, topic, 10), kind()) for topic, kind in kinds.items() if "ori" not in topic]
-    observer.node.create_subscription(Float64MultiArray, f"{node}/commands", print, 10)
+    speak = [make(topic) for topic in kinds if "orientation" not in topic]
+    observer.node.create_subscription(Float64MultiArray, COMMANDS, print, 10)
     recorder = nodes.run("recorder", output=tmp_path / "bag")
     said = 0
 
@@ -76,10 +83,10 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
         said += all(publisher.get_subscription_count() for publisher, _ in speak)
         return said > times
 
-    commanded = partial(observer.node.count_subscribers, f"{node}/commands")
+    commanded = partial(observer.node.count_subscribers, COMMANDS)
     observer.until(partial(say_all, 20), "readers of all but one")  # 20 x 0.05 s: many looks
     assert commanded() == 1
-    speak.append((make(QuaternionStamped, f"{node}/orientation", 10), QuaternionStamped()))
+    speak.append(make(f"{NODE}/orientation"))
     observer.until(lambda: say_all(0) and commanded() == 2, "reader of the commands")
     assert nodes.line(recorder) == "ready: 8 topics\n"
 
@@ -88,14 +95,13 @@ def test_a_latched_topic_is_heard_though_its_subscriber_is_seen_first(
     nodes, observer, domain, tmp_path
 ):
     """As where a player starts before the simulator."""
-    phase = "/sst_simulator/phase"
+    phase = f"{NODE}/phase"
     observer.listen(String, phase, latched=True)
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics=f"[{phase}]")
     observer.until(lambda: observer.node.count_subscribers(phase) == 2, "the recorder")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     simulator = type(observer)(domain)  # that nobody has discovered yet
     try:
-        simulator.node.create_publisher(String, phase, latched).publish(String(data="waiting"))
+        simulator.node.create_publisher(String, phase, LATCHED).publish(String(data="waiting"))
         assert nodes.line(recorder) == "ready: 1 topics\n"
         assert nodes.stop(recorder)[0] == 0
     finally:
@@ -107,19 +113,18 @@ def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, observer, tmp_pat
     timeout = 0.5 if ending == "timeout" else 0.0
     recorder = nodes.run("recorder", output=tmp_path / "bag", timeout=timeout)
     if ending == "timeout":
-        _, err = recorder.communicate(timeout=60)
+        status, _, err = nodes.ended(recorder, 60)
         assert "given up after 0.5 s" in err
     else:
         assert "recording to" in recorder.stderr.readline()
-        _, _, err = nodes.stop(recorder)
-    assert recorder.returncode == 1
+        status, _, err = nodes.stop(recorder)
+    assert status == 1
     assert "is incomplete: no message of /diagnostics, /joint_states, /sst_simulator/app" in err
-    assert "/sst_simulator/commands" not in err  # no run needs it
-    assert "Traceback" not in err
+    assert COMMANDS not in err  # no run needs it
 
 
 def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, tmp_path):
-    wanted = "[/joint_states, /sst_simulator/orientation]"
+    wanted = f"[/joint_states, {NODE}/orientation]"
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
     states = observer.publisher(JointState, "/joint_states")
     states.publish(JointState())
@@ -148,12 +153,6 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
     assert re.search(r"lost messages: \d+ of /joint_states", err), err
 
 
-def test_an_existing_folder_is_refused(run_here, tmp_path):
-    status, _, err = run_here("recorder", output=tmp_path)
-    assert status == 1
-    assert f"output = '{tmp_path}': must be a new folder" in err.replace("PosixPath", "")
-
-
 def test_rosbag2_is_given_the_declared_qos():
     config = Path(__file__).parents[2] / "config"
     profiles = yaml.safe_load((config / "rosbag2_qos.yaml").read_text(encoding="utf-8"))
@@ -167,17 +166,66 @@ def test_rosbag2_is_given_the_declared_qos():
 
 
 def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path):
-    states = observer.listen(JointState, "/joint_states")
     recorder = nodes.run("recorder", output=tmp_path / "bag")
     run = {"sync": "lockstep", "real_time_factor": 0.0, "duration": 1.0}
     simulator = nodes.run("simulator", **run)
     assert nodes.line(recorder).startswith("ready")
     nodes.run("torque_player", stamped=True, min_subscribers=2)
-    observer.until(lambda: observer.stamp(states[-1]) if states else 0, "the run")
+    observer.until(observer.samples, "the run")
     recorder.send_signal(signal.SIGSTOP)
-    heard = len(states)
-    observer.until(lambda: len(states) > heard + 200, "samples")
+    heard = len(observer.states)
+    observer.until(lambda: len(observer.states) > heard + 200, "samples")
     recorder.send_signal(signal.SIGCONT)
     assert simulator.wait(timeout=40) == 0
     status, _, err = nodes.stop(recorder)
     assert status == 0, err
+
+
+@pytest.mark.slow  # the campaign does the same
+def test_kill_of_the_recorder_leaves_all_but_the_last_second(nodes, observer, tmp_path):
+    recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
+    said = observer.told("samples_published", lambda n: int(n) > 1000)
+    recorder.kill()
+    recorder.communicate()
+    assert nodes.stop(simulator)[0] == 0  # it does not care
+    with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
+        recording.read(tmp_path / "bag")
+    result = bag_writer.recover(tmp_path / "bag")
+    assert (result.bag, result.cut) == (tmp_path / "bag_recovered", True)
+    whole(result.bag, int(said["samples_published"]) - 750)
+
+
+def test_kill_of_the_simulator_leaves_a_whole_bag(nodes, observer, tmp_path):
+    recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
+    observer.told("samples_published", lambda n: int(n) > 300)
+    simulator.kill()
+    simulator.communicate()
+    assert nodes.stop(recorder)[0] == 0
+    # The report says that it was cut.
+    assert whole(tmp_path / "bag", 300).diagnostics["phase"] == "running"
+
+
+def test_a_full_disk_ends_the_recorder_in_words(nodes, observer, tmp_path):
+    recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (700_000, 700_000))
+    status, _, err = nodes.ended(recorder)
+    assert status == 1 and "bag is cut: " in err and "sst_ros recover" in err
+    observer.told("phase", "running")
+    assert nodes.stop(simulator, signal.SIGTERM)[0] == 0
+    whole(bag_writer.recover(tmp_path / "bag").bag, 100)
+
+
+def test_what_cannot_be_recovered_is_refused(tmp_path):
+    (tmp_path / "noise.mcap").write_bytes(b"no bag at all")
+    (tmp_path / "empty.mcap").write_bytes(MCAP0_MAGIC)
+    (tmp_path / "folder").mkdir()
+    for name, said in (
+        ("noise.mcap", "must be an MCAP file"),
+        ("empty.mcap", "holds no message"),
+        ("nowhere.mcap", "must be readable"),
+        ("folder", "must hold one .mcap file"),
+    ):
+        with pytest.raises(InputError, match=said):
+            bag_writer.recover(tmp_path / name)
+    with pytest.raises(InputError, match="must be a new folder"):
+        bag_writer.recover(tmp_path / "empty.mcap", tmp_path / "folder")

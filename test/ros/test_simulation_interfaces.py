@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """simulation_interfaces 2.x with real types, a real client and a real simulator."""
 
-import os
-from functools import partial
-
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from sensor_msgs.msg import JointState
+from ros.conftest import NODE, foreign_types
 
 from sst_ros import load_scene
 from sst_ros.mechanism import kinematics
@@ -16,11 +13,7 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.nodes.simulation_interfaces import FEATURES
 
-from . import message_types
-from .conftest import Nodes, Observer
-
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
-NODE = "/sst_simulator"
 SCENE = "gravity_payload"
 UNSUPPORTED, OK, NOT_FOUND, FAILED, INVALID_POSE = 0, 1, 2, 4, 101
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
@@ -32,14 +25,21 @@ class Client:
     def __init__(self, nodes, observer, env):
         from simulation_interfaces import srv
 
-        self.observer, self.srv = observer, srv
-        self.states = observer.listen(JointState, "/joint_states")
-        words = ("-p", f"scene:={SCENE}", "-p", "duration:=0.0", "-p", "publish_rate:=100")
-        self.process = nodes.start("simulator", "--ros-args", *words, env=env)
+        self.observer, self.srv, self.states = observer, srv, observer.states
+        given = {"scene": SCENE, "duration": 0.0, "publish_rate": 100}
+        self.process = nodes.start("simulator", env=env, **given)
 
     def call(self, kind, **fields):
         name = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).removeprefix("_")
         return self.observer.call(getattr(self.srv, kind), f"{NODE}/{name}", **fields)
+
+    def code(self, kind, **fields):
+        """Code of the result, and its words."""
+        result = self.call(kind, **fields).result
+        return result.result, result.error_message
+
+    def set(self, state, **which):
+        return self.code("SetEntityState", entity="star", state=state, **which)
 
     def state(self):
         return self.call("GetSimulationState").state.state
@@ -47,31 +47,28 @@ class Client:
     def to(self, state):
         from simulation_interfaces.msg import SimulationState
 
-        wanted = SimulationState(state=state)
-        return self.call("SetSimulationState", state=wanted).result.result
+        return self.code("SetSimulationState", state=SimulationState(state=state))[0]
 
 
 @pytest.fixture(scope="module")
-def client(domain_of_module):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = str(message_types.folder("simulation_interfaces"))
-        patch.syspath_prepend(folder)
-        env = {"PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])}
-        nodes, observer = Nodes(), Observer(domain_of_module)
-        yield Client(nodes, observer, env)
-        nodes.close()
-        observer.close()
+def types():
+    yield from foreign_types("simulation_interfaces")
+
+
+@pytest.fixture(scope="module")
+def client(types, nodes_of_module, observer_of_module):
+    return Client(nodes_of_module, observer_of_module, types)
 
 
 def test_features_states_and_scopes(client):
     features = client.call("GetSimulatorFeatures").features
     assert list(features.features) == list(FEATURES)
     client.observer.until(lambda: client.state() == PLAYING, "the run")
-    assert client.call("StepSimulation", steps=1).result.result == FAILED
+    assert client.code("StepSimulation", steps=1)[0] == FAILED
     assert client.to(PAUSED) == OK and client.state() == PAUSED
-    assert client.call("ResetSimulation", scope=1).result.result == UNSUPPORTED
+    assert client.code("ResetSimulation", scope=1)[0] == UNSUPPORTED
     assert client.state() == PAUSED
-    assert client.call("ResetSimulation", scope=2).result.result == OK
+    assert client.code("ResetSimulation", scope=2)[0] == OK
     assert client.state() == STOPPED
     assert client.to(PLAYING) == OK and client.state() == PLAYING
     assert client.to(STOPPED) == OK and client.state() == STOPPED
@@ -81,40 +78,32 @@ def test_steps_by_count_and_by_the_action(client):
     from simulation_interfaces.action import SimulateSteps
 
     client.to(STOPPED)
-    stamps = [client.observer.stamp(state) for state in client.states]
-    before = len(set(stamps))
-
-    def samples(count):
-        return len({client.observer.stamp(s) for s in client.states}) >= before + count
-
-    assert client.call("StepSimulation", steps=5).result.result == OK
-    client.observer.until(partial(samples, 5), "five samples")
+    until, stamps = client.observer.until, client.observer.stamps
+    before = len(set(stamps()))
+    assert client.code("StepSimulation", steps=5)[0] == OK
+    until(lambda: len(set(stamps())) >= before + 5, "five samples")
     action = ActionClient(client.observer.node, SimulateSteps, f"{NODE}/simulate_steps")
-    client.observer.until(action.server_is_ready, "the action server")
+    until(action.server_is_ready, "the action server")
     feedback = []
 
     def send(steps):
         feedback.clear()
-        sent = action.send_goal_async(
-            SimulateSteps.Goal(steps=steps), lambda message: feedback.append(message.feedback)
-        )
-        client.observer.until(sent.done, "the answer")
-        return sent.result()
+        goal = SimulateSteps.Goal(steps=steps)
+        sent = action.send_goal_async(goal, lambda message: feedback.append(message.feedback))
+        return client.observer.result(sent, "the answer")
 
     def result(handle):
-        done = handle.get_result_async()
-        client.observer.until(done.done, "the result")
-        return done.result().status, done.result().result.result
+        done = client.observer.result(handle.get_result_async(), "the result")
+        return done.status, done.result.result
 
     # The long one first: feedback from before the server has found its reader is lost.
     handle = send(10**9)
-    client.observer.until(lambda: len(feedback) > 3, "feedback")
-    cancelled = handle.cancel_goal_async()
-    client.observer.until(cancelled.done, "the answer")
+    until(lambda: len(feedback) > 3, "feedback")
+    client.observer.result(handle.cancel_goal_async(), "the answer")
     assert result(handle)[0] == GoalStatus.STATUS_CANCELED
     handle = send(7)
     # Before the result is asked for: after it rclpy's client hears no feedback.
-    client.observer.until(lambda: len(feedback) >= 7, "feedback")
+    until(lambda: len(feedback) >= 7, "feedback")
     status, reply = result(handle)
     assert (status, reply.result) == (GoalStatus.STATUS_SUCCEEDED, OK)
     counts = [(message.completed_steps, message.remaining_steps) for message in feedback]
@@ -133,8 +122,8 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     assert client.call("GetEntities").entities == ["star"]
     none = client.call("GetEntities", filters=EntityFilters(filter="^robot"))
     assert none.result.result == OK and not none.entities
-    assert client.call("GetEntities", filters=EntityFilters(filter="(")).result.result == FAILED
-    assert client.call("GetEntityState", entity="arm").result.result == NOT_FOUND
+    assert client.code("GetEntities", filters=EntityFilters(filter="("))[0] == FAILED
+    assert client.code("GetEntityState", entity="arm")[0] == NOT_FOUND
 
     scene = load_scene(SCENE)
     geometry = Geometry.of(scene)
@@ -145,9 +134,7 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     state.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
     turning = (0.1, -0.2, 0.3)
     state.twist.angular.x, state.twist.angular.y, state.twist.angular.z = turning
-    given = {"entity": "star", "state": state}
-    reply = client.call("SetEntityState", set_pose=True, set_twist=True, **given)
-    assert reply.result.result == OK, reply.result.error_message
+    assert client.set(state, set_pose=True, set_twist=True) == (OK, "")
     client.observer.until(
         lambda: np.abs(np.subtract(client.states[-1].position[:3], gamma)).max() < 1e-9,
         "the state that was set",
@@ -169,26 +156,20 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     listed = client.call("GetEntitiesStates")
     assert listed.entities == ["star"] and listed.states[0].pose == found.pose
 
-    keep = client.call("SetEntityState", set_twist=True, entity="star", state=EntityState())
-    assert keep.result.result == OK
+    assert client.set(EntityState(), set_twist=True)[0] == OK
     client.observer.until(lambda: not any(client.states[-1].velocity), "rest")
-    for change, code in (
-        ({"orientation": Quaternion(w=0.5)}, INVALID_POSE),
-        ({"orientation": Quaternion(x=1.0, w=0.0)}, INVALID_POSE),
-        ({"orientation": Quaternion(x=float("nan"))}, INVALID_POSE),
-    ):
-        bad = EntityState()
-        for name, value in change.items():
-            setattr(bad.pose, name, value)
-        reply = client.call("SetEntityState", entity="star", state=bad, set_pose=True)
-        assert reply.result.result == code and reply.result.error_message
+    for bad in (Quaternion(w=0.5), Quaternion(x=1.0, w=0.0), Quaternion(x=float("nan"))):
+        wrong = EntityState()
+        wrong.pose.orientation = bad
+        code, words = client.set(wrong, set_pose=True)
+        assert code == INVALID_POSE and words
     away = EntityState()
     away.pose.orientation, away.pose.position.z = state.pose.orientation, 0.1
-    reply = client.call("SetEntityState", entity="star", state=away, set_pose=True)
-    assert reply.result.result == INVALID_POSE and "position" in reply.result.error_message
+    code, words = client.set(away, set_pose=True)
+    assert code == INVALID_POSE and "position" in words
     client.to(PLAYING)
-    reply = client.call("SetEntityState", set_pose=True, **given)
-    assert reply.result.result == FAILED and "running" in reply.result.error_message
+    code, words = client.set(state, set_pose=True)
+    assert code == FAILED and "running" in words
 
 
 def _turned(angle, axis):
@@ -198,10 +179,8 @@ def _turned(angle, axis):
     return np.eye(3) + across + 0.5 * across @ across
 
 
-def test_spawning_is_refused_by_name_and_the_node_quits(client):
-    reply = client.call("SpawnEntity", name="table")
-    assert reply.result.result == UNSUPPORTED
-    assert "table is not spawned" in reply.result.error_message
+def test_spawning_is_refused_by_name_and_the_node_quits(client, nodes_of_module):
+    code, words = client.code("SpawnEntity", name="table")
+    assert code == UNSUPPORTED and "table is not spawned" in words
     assert client.to(QUITTING) == OK
-    assert client.process.wait(20) == 0
-    assert "Traceback" not in client.process.communicate()[1]
+    assert nodes_of_module.ended(client.process, 20)[0] == 0

@@ -1,33 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Samples and torques that a simulator publishes; two of them side by side."""
+
 import math
 import signal
 
 import pytest
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
-from ros.conftest import Observer
+from ros.conftest import NODE, torques
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import nanoseconds
 
 pytestmark = pytest.mark.ros
-COMMANDS = "/sst_simulator/commands"
-nanoseconds = Observer.stamp
+SHARED = {"/diagnostics", "/rosout", "/parameter_events", "/clock"}
+"""Names that are the same for all nodes, as everywhere in ROS 2."""
 
 
 def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
-    states = observer.listen(JointState, "/joint_states")
     nodes.run("simulator", wait_for_command=True, duration=0.2)
-    commands = observer.publisher(Float64MultiArray, COMMANDS)
-    observer.until(lambda: states, "preview")
-    assert (states[0].header.frame_id, states[0].header.stamp.sec > 1e9) == ("idle", True)
-    commands.publish(Float64MultiArray(data=[0.1, 0.2, 0.3]))
-    observer.until(lambda: sum(nanoseconds(s) > 0 for s in states) == 101, "the 101 samples")
+    first = observer.preview()
+    assert (first.header.frame_id, first.header.stamp.sec > 1e9) == ("idle", True)
+    observer.command(0.1, 0.2, 0.3)
+    observer.until(lambda: len(observer.samples()) == 101, "the 101 samples")
 
-    run = [state for state in states if nanoseconds(state)]
-    stamps = [nanoseconds(state) for state in run]
+    run, stamps = observer.samples(), observer.stamps()
     assert stamps == [stamps[0] + 2_000_000 * k for k in range(101)]
     assert run[0].name[:4] == ["gamma_1", "gamma_2", "gamma_3", "mu_1"]
     assert {len(run[0].name), len(run[0].position), len(run[0].velocity), len(run[0].effort)} == {9}
@@ -43,24 +43,23 @@ def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
 
 
 def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes, observer):
-    orientation = observer.listen(QuaternionStamped, "/sst_simulator/orientation")
-    euler = observer.listen(Vector3Stamped, "/sst_simulator/euler_zyz")
-    applied = observer.listen(JointTrajectory, "/sst_simulator/applied_torques")
+    orientation = observer.listen(QuaternionStamped, f"{NODE}/orientation")
+    euler = observer.listen(Vector3Stamped, f"{NODE}/euler_zyz")
+    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
     nodes.run("simulator", wait_for_command=True, duration=0.05, publish_rate=250)
-    commands = observer.publisher(Float64MultiArray, COMMANDS)
     observer.until(lambda: orientation and euler and applied, "preview of every topic")
-    commands.publish(Float64MultiArray(data=[1.0, 0.0, 0.0]))
-    observer.until(lambda: sum(nanoseconds(m) > 0 for m in euler) == 14, "the 14 samples")
+    observer.command(1.0, 0.0, 0.0)
+    observer.until(lambda: len(observer.stamps(euler)) == 14, "the 14 samples")
     observer.until(lambda: sum(len(m.points) for m in applied) == 50, "torques of the 50 ticks")
 
-    first = [nanoseconds(m) for m in orientation if nanoseconds(m)]
-    assert first == [nanoseconds(m) for m in euler if nanoseconds(m)]
+    stamps = observer.stamps(orientation)
+    assert stamps == observer.stamps(euler)
     ends = [
-        nanoseconds(m) + p.time_from_start.sec * 10**9 + p.time_from_start.nanosec
-        for m in applied
-        for p in m.points
+        observer.stamp(message) + nanoseconds(point.time_from_start)
+        for message in applied
+        for point in message.points
     ]
-    assert ends == [first[0] + 1_000_000 * (k + 1) for k in range(50)]
+    assert ends == [stamps[0] + 1_000_000 * (k + 1) for k in range(50)]
     q = orientation[-1].quaternion
     assert orientation[-1].header.frame_id == "base_link"
     assert math.hypot(q.x, q.y, q.z, q.w) == pytest.approx(1.0, abs=1e-15)
@@ -71,37 +70,15 @@ def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes,
 
 
 def test_torques_are_published_every_50_ms_and_at_the_end(nodes, observer):
-    applied = observer.listen(JointTrajectory, "/sst_simulator/applied_torques")
+    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
     nodes.run("simulator", wait_for_command=True, duration=0.131)
     observer.until(lambda: applied, "preview")
-    observer.publisher(Float64MultiArray, COMMANDS).publish(Float64MultiArray(data=[1.0, 0.0, 0.0]))
+    observer.command(1.0, 0.0, 0.0)
     observer.until(lambda: sum(len(m.points) for m in applied) == 131, "torques of the 131 ticks")
-    messages = [m for m in applied if m.points]
-    assert [len(m.points) for m in messages] == [50, 50, 31]
-    begins = [nanoseconds(m) for m in messages]
+    messages = [message for message in applied if message.points]
+    assert [len(message.points) for message in messages] == [50, 50, 31]
+    begins = observer.stamps(messages)
     assert begins == [begins[0] + k * 50_000_000 for k in range(3)]
-
-
-def test_bad_commands_are_dropped_whole_and_counted(nodes, observer):
-    states = observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
-    commands = observer.publisher(Float64MultiArray, COMMANDS)
-    bad = [[1.0, 2.0], [1.0] * 4, [], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]]
-    for data in ([0.1, 0.2, 0.3], *bad):
-        commands.publish(Float64MultiArray(data=data))
-    assert observer.told("commands_dropped", len(bad))["commands_received"] == "1"
-    assert list(states[-1].effort[:3]) == [0.1, 0.2, 0.3]
-    status, _, err = nodes.stop(process)
-    (warning,) = (line for line in err.splitlines() if "command dropped" in line)
-    assert status == 0 and "must be 3 finite torques" in warning
-
-
-def test_without_a_command_the_torque_is_zero(nodes, observer):
-    states = observer.listen(JointState, "/joint_states")
-    nodes.run("simulator", scene="example1", real_time_factor=0.1)
-    observer.until(lambda: len(states) > 20, "states")
-    assert {tuple(state.effort) for state in states} == {(0.0,) * 9}
-    assert states[-1].position[0] != states[0].position[0]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -111,9 +88,52 @@ def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, obser
     Its name may stay: rmw_dds_common keeps for ever what a node that has left said at last.
     """
     process = nodes.run("simulator")
-    observer.told("phase", "running")
-    status, _, err = nodes.stop(process, number)
-    assert status == 0 and "Traceback" not in err
-    observer.until(
-        lambda: not observer.node.count_publishers("/sst_simulator/phase"), "end of it", 5.0
-    )
+    observer.phase("running")
+    assert nodes.stop(process, number)[0] == 0
+    observer.until(lambda: not observer.node.count_publishers(f"{NODE}/phase"), "end of it", 5.0)
+
+
+def test_two_simulators_do_not_hear_each_other(nodes, observer):
+    places = ("/left", "/right")
+    given = {"wait_for_command": True, "duration": 0.0}
+    started = {
+        place: nodes.start("simulator", "--ros-args", "-r", f"__ns:={place}", **given)
+        for place in places
+    }
+    states = {place: observer.listen(JointState, f"{place}/joint_states") for place in places}
+    observer.diagnostics()
+    commands = {
+        place: observer.publisher(Float64MultiArray, f"{place}{NODE}/commands") for place in places
+    }
+    observer.until(lambda: all(states.values()), "previews of both")
+
+    def begun(place):
+        return [state for state in states[place] if observer.stamp(state)]
+
+    commands["/left"].publish(torques(0.5, 0.0, 0.0))
+    observer.until(lambda: len(begun("/left")) > 10, "the run on the left")
+    assert not begun("/right")
+    paused = observer.pause(True, f"/left{NODE}")
+    assert (paused.success, paused.message) == (True, "paused")
+
+    commands["/right"].publish(torques(0.0, 0.0, -0.5))
+    observer.until(lambda: len(begun("/right")) > 10, "the run on the right")
+    assert begun("/left")[-1].effort[0] == 0.5
+    assert begun("/right")[-1].effort[2] == -0.5
+
+    def phases():
+        last = (observer.diagnostics(f"{place}{NODE}: run")[-1:] for place in places)
+        return [said["phase"] for statuses in last for said in statuses]
+
+    observer.until(lambda: phases() == ["paused", "running"], "what both say of themselves")
+
+    for place in places:
+        for offered in (
+            observer.node.get_publisher_names_and_types_by_node("sst_simulator", place),
+            observer.node.get_subscriber_names_and_types_by_node("sst_simulator", place),
+            observer.node.get_service_names_and_types_by_node("sst_simulator", place),
+        ):
+            names = {name for name, _ in offered}
+            assert names
+            assert all(name.startswith(f"{place}/") for name in names - SHARED)
+    assert [nodes.stop(process)[0] for process in started.values()] == [0, 0]
