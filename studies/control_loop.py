@@ -23,7 +23,7 @@ from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
 from sst_ros.scene.scene import Initial, Scene
-from sst_ros.scene.yaml_document import from_values, values_of
+from sst_ros.scene.yaml_document import build, values_of
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.state import Vector3
 from studies.sampled_data import largest_stable, stability_limit
@@ -122,7 +122,7 @@ def make_heavier(scene: Scene, factor: float) -> Scene:
             body["inertia"][part] *= factor
     if "actuators" in document:
         document["actuators"]["rotor_inertia"] *= factor
-    return from_values(Scene, document, scene.name)
+    return build(Scene, document, scene.name)
 
 
 def model_errors() -> Iterator[ModelError]:

@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.bodies import Inertia, Link, Star
-from sst_ros.scene.loads import Actuators, Friction
+from sst_ros.scene.bodies import Link, Star
+from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section
-from sst_ros.scene.yaml_document import from_values, replace_values, values_of
+from sst_ros.scene.yaml_document import addressed, build, open_values, replace_values, values_of
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -92,17 +89,18 @@ def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = Fa
         moments: bodies have mass 1, so that "centre" is mass times centre.
 
     """
-    result = open_section(scene)
+    values = values_of(scene)
     if moments:
-        for body in (result.star, *result.actuated_links, *result.intermediate_links):
-            body.centre = [body.mass * part for part in body.centre]
-            body.mass = 1.0
-    for name, symbol in symbols.items():
-        if moments and name.endswith(".mass"):
-            continue  # torques depend on mass times centre alone
-        name = re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
-        set_number(result, re.findall(r"\w+", name), symbol)
-    return result
+        for body in (values["star"], *values["actuated_links"], *values["intermediate_links"]):
+            body["centre"] = [body["mass"] * part for part in body["centre"]]
+            body["mass"] = 1.0
+    # Torques depend on mass times centre alone.
+    used = {
+        _of_centre(name): symbol
+        for name, symbol in symbols.items()
+        if not (moments and name.endswith(".mass"))
+    }
+    return open_values(Scene, replace_values(values, used))
 
 
 def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: str) -> Scene:
@@ -123,29 +121,14 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
         elif not name.startswith("offset"):
             changed[name] = number
     document = replace_values(values_of(scene), changed)
-    _drop_friction(document)
+    for terms in document.get("friction", {}).values():
+        for key in Friction.EFFECTS:
+            if terms.get(key, 0.0) < NEGLIGIBLE:
+                terms[key] = 0.0
     notes = document.setdefault("provenance", {})
     known = {re.sub(r"\[\d\]", "", name).split(".")[0] for name in found}
     notes |= dict.fromkeys(sorted(known & document.keys()), note)
-    return from_values(Scene, document, scene.name)
-
-
-def _drop_friction(document: dict[str, Any]) -> None:
-    """Take away friction without a coefficient, and smoothing that acts on nothing."""
-    friction = document.get("friction", {})
-    for kind in list(friction):
-        terms = friction[kind]
-        for key in ("viscous", "coulomb", "static"):
-            if terms.get(key, 0.0) < NEGLIGIBLE:
-                terms.pop(key, None)
-        if not (terms.get("coulomb") or terms.get("static")):
-            terms.pop("smoothing", None)
-        if not terms.get("static"):
-            terms.pop("stribeck", None)
-        if not terms:
-            del friction[kind]
-    if not friction:
-        document.pop("friction", None)
+    return build(Scene, document, scene.name, of_row=True)
 
 
 def _own(scene: Scene) -> Iterator[str]:
@@ -188,76 +171,24 @@ def _body(name: str, body: Star | Link, scene: Scene) -> Iterator[str]:
 
 
 def _value(scene: Scene, name: str) -> float:
-    words = re.findall(r"\w+", name)
-    if words[0] == "offset":
-        return 0.0
-    if words[-2:-1] == ["moment"] and words[0] != "moment":
-        value = at(scene, words[:-2])
-        return float(value.mass * value.centre["xyz".index(words[-1])])
-    value = at(scene, words)
-    return 0.0 if value is None else float(value)
+    body, _, axis = name.partition(".moment.")
+    if axis:
+        mass, centre = value_of(scene, f"{body}.mass"), value_of(scene, _of_centre(name))
+        return (mass or 0.0) * (centre or 0.0)
+    return value_of(scene, name) or 0.0
+
+
+def _of_centre(name: str) -> str:
+    """Return the key of the component of a centre that a moment has."""
+    return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
 
 
 def value_of(scene: Scene, name: str) -> float | None:
     """Return a number of a scene by its key, the first of a list; None where there is none."""
     try:
-        value = at(scene, re.findall(r"\w+", name))
-    except (AttributeError, IndexError, TypeError):
+        _, value, spec = next(addressed(scene, name, components=True))
+    except ValueError:
         return None
-    return float(value) if isinstance(value, (int, float)) else None
-
-
-def at(value: Any, words: Sequence[str]) -> Any:
-    """Return what a key, split in words, names; of a list without index the first entry."""
-    for word in words:
-        if value is None:
-            return None
-        if isinstance(value, (tuple, list)):
-            if not word.isdigit():
-                value = getattr(value[0], word)
-                continue
-            value = value[int(word)]
-        else:
-            value = getattr(value, word)
-    return value[0] if isinstance(value, (tuple, list)) else value
-
-
-def open_section(value: Any) -> Any:
-    """Return a section as an object whose fields may be set to anything, tuples as lists."""
-    if isinstance(value, Section):
-        return SimpleNamespace(
-            **{f.name: open_section(getattr(value, f.name)) for f in fields(value)}
-        )
-    return [open_section(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def set_number(value: Any, words: Sequence[str], symbol: Any) -> None:
-    """Set a number of an `open_section`; a list without an index means all of its entries."""
-    first, *rest = words
-    if isinstance(value, list):
-        if not first.isdigit():
-            for entry in value:
-                set_number(entry, words, symbol)
-        elif rest:
-            set_number(value[int(first)], rest, symbol)
-        else:
-            value[int(first)] = symbol
-        return
-    known = vars(value)
-    if rest:
-        if known.get(first) is None:
-            known[first] = _make_absent(first)
-        set_number(known[first], rest, symbol)
-    else:
-        entries = known.get(first)
-        known[first] = [symbol] * len(entries) if isinstance(entries, list) else symbol
-
-
-def _make_absent(name: str) -> SimpleNamespace:
-    """Return an empty section for a term that the scene does not have."""
-    if name == "friction":
-        return SimpleNamespace(gamma=None, mu=None, beta=None)
-    if name == "inertia":
-        return SimpleNamespace(**dict.fromkeys((f.name for f in fields(Inertia)), 0.0))
-    section: type[Section] = Actuators if name == "actuators" else Friction
-    return SimpleNamespace(**{f.name: f.default for f in fields(section)})
+    if spec.kind != "number" or value is None:
+        return None
+    return float(np.ravel(value)[0])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,18 +18,60 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.limits import Limit, limits_of
+from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.limit_distances import limit_distances
-from sst_ros.integration.scenario_constants import Constants, Place, constants_of, leaves, rebuilt
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.scene.yaml_document import Place, leaves, rebuild
 from sst_ros.state import Joints
 
 OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
 
 _OF_GEOMETRY = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+
+
+class Constants(NamedTuple):
+    """All numbers that the traced programs of a scene are made of: a tree of numbers or columns.
+
+    Attributes:
+        model: the dynamics.
+        ends: cosine and sine of the end of each limit, in the order of `limits_of`.
+        torque: the scene's own torques over time; None where they do not act.
+
+    """
+
+    model: kernel.Model
+    ends: tuple[tuple[float, float], ...]
+    torque: SineTorque | None
+
+
+def constants_of(scene: Scene, columns: Any, geometry: Geometry, *, profile: bool) -> Constants:
+    """Constants of `columns`, an object like `scene` with arrays for what varies."""
+    ends = [limit.end for limit in limits_of(scene, geometry)]
+    pairs = tuple((_plain(np.cos(end)), _plain(np.sin(end))) for end in ends)
+    columns.stroke = _with_damping(columns.stroke)
+    with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
+        model = kernel.model_of(columns, geometry)
+    return Constants(model, pairs, columns.torque if profile else None)
+
+
+def _plain(value: Any) -> Any:
+    return value if value.ndim else float(value)
+
+
+def _with_damping(stroke: Any) -> Any:
+    """Elastic stops with the damping that their restitution gives, row by row if it varies."""
+    varied = (stroke.restitution, stroke.impact_rate)
+    if not any(isinstance(value, np.ndarray) for value in varied):
+        return stroke
+    pairs = zip(*np.broadcast_arrays(*varied), strict=True)
+    rows = [SimpleNamespace(restitution=float(e), impact_rate=float(v)) for e, v in pairs]
+    damping = np.array([damping_of(row) for row in rows])  # type: ignore[arg-type]
+    return SimpleNamespace(**vars(stroke) | {"damping": damping, "restitution": None})
 
 
 class VariedNumber(Expression):
@@ -168,7 +211,7 @@ class ParametricModel:
             for entry in inputs
         ]
         numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, given, strict=True))
-        tree: Constants = rebuilt(self._tree, numbers)
+        tree: Constants = rebuild(self._tree, numbers)
         return tree
 
     def _numbers(self, scenarios: Scenarios) -> tuple[Constants, dict[Place, Any]]:

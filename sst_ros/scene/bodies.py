@@ -11,14 +11,16 @@ link k.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.scene.schema import Section, choice, number, section
+from sst_ros.scene.schema import Rules, Section, choice, number, section
 from sst_ros.state import Vector3
 
 RELATIVE_ROUNDING = 1e-9
@@ -56,18 +58,26 @@ class Inertia(Section):
         ]
         return np.array(rows)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse what no rigid body has."""
-        moments = [float(moment) for moment in np.linalg.eigvalsh(self.matrix)]
-        if moments[0] < SMALLEST_MOMENT:
-            allowed = (
+
+        def told(allowed: str) -> Problem:
+            return Problem("", np.linalg.eigvalsh(self.matrix).tolist(), allowed)
+
+        tensor = entries_of(self)
+        largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
+        definite = _is_positive(tensor, -SMALLEST_MOMENT)
+        yield (
+            ~definite,
+            lambda: told(
                 "principal moments of inertia must be > 0 (positive definite), "
                 f"at least {SMALLEST_MOMENT:g} kg m^2"
-            )
-            yield Problem("", moments, allowed)
-        elif moments[2] > (moments[0] + moments[1]) * (1.0 + RELATIVE_ROUNDING):
-            allowed = "no principal moment may exceed the sum of the other two"
-            yield Problem("", moments, allowed)
+            ),
+        )
+        yield (
+            definite & ~_is_positive([-part for part in tensor], largest),
+            lambda: told("no principal moment may exceed the sum of the other two"),
+        )
 
 
 @dataclass(frozen=True)
@@ -83,24 +93,26 @@ class Base(Section):
     )
     radius: float = number("radius of the base sphere", "m", above=0.0)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse triangles without area and left-handed ones."""
-        v = np.array(self.v)
-        lengths = np.linalg.norm(v, axis=1)
-        if np.any(lengths < 1e-6):
-            yield Problem("v", self.v, "no direction may be zero (shorter than 1e-6)")
-            return
-        unit = v / lengths[:, None]
-        volume = float(np.linalg.det(unit))
-        side = float(np.linalg.norm(unit - np.roll(unit, 1, axis=0), axis=1).max())
-        if abs(volume) < RELATIVE_ROUNDING and side < SMALLEST_SIDE:
-            allowed = f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more: triangle too small"
-            yield Problem("v", self.v, allowed)
-        elif abs(volume) < RELATIVE_ROUNDING:
-            yield Problem("v", self.v, "P1, P2, P3 must not lie on one great circle (degenerate)")
-        elif volume < 0.0:
-            allowed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
-            yield Problem("v", self.v, allowed)
+        v = np.moveaxis(np.asarray(self.v), (0, 1), (-2, -1))
+        lengths = np.linalg.norm(v, axis=-1)
+        unit = v / lengths[..., None]
+        volume = np.linalg.det(unit)
+        side = np.linalg.norm(unit - np.roll(unit, 1, axis=-2), axis=-1).max(axis=-1)
+        zero = lengths.min(axis=-1) < 1e-6
+        flat, small = ~zero & (abs(volume) < RELATIVE_ROUNDING), side < SMALLEST_SIDE
+        apart = f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more: triangle too small"
+        for broken, allowed in (
+            (zero, "no direction may be zero (shorter than 1e-6)"),
+            (flat & small, apart),
+            (flat & ~small, "P1, P2, P3 must not lie on one great circle (degenerate)"),
+            (
+                ~zero & ~flat & (volume < 0.0),
+                "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points",
+            ),
+        ):
+            yield broken, partial(Problem, "v", self.v, allowed)
 
 
 @dataclass(frozen=True)
@@ -110,7 +122,12 @@ class Link(Section):
     inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
     mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
     centre: Vector3 = number(
-        "centre of mass in the frame of the inertia", "m", shape=(3,), default=(0.0, 0.0, 0.0)
+        "centre of mass in the frame of the inertia",
+        "m",
+        shape=(3,),
+        default=(0.0, 0.0, 0.0),
+        acts_on=("mass",),
+        needs="needs mass > 0 [kg]",
     )
     inertia_about: str = choice(
         "point of the inertia; the scene that is read has it about O",
@@ -123,28 +140,38 @@ class Link(Section):
         super().__post_init__()
         if self.inertia_about == ABOUT_CENTRE and self.inertia is not None:
             about_o = self.inertia.matrix + _of_point(self.mass, self.centre)
-            (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_o.tolist()
-            object.__setattr__(self, "inertia", Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz))
+            object.__setattr__(self, "inertia", _inertia_of(about_o))
             object.__setattr__(self, "inertia_about", ABOUT_O)
 
     def check(self) -> Iterator[Problem]:
+        """Refuse an inertia about no centre of mass."""
+        if self.inertia_about == ABOUT_O:
+            yield from super().check()
+        elif self.mass == 0.0 or self.inertia is None:
+            yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
+
+    def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, centre, inertia = self.mass, self.centre, self.inertia
-        if self.inertia_about == ABOUT_CENTRE:
-            if mass == 0.0 or inertia is None:
-                yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
-        elif mass == 0.0 and any(centre):
-            yield Problem("centre", centre, "needs mass > 0 [kg]")
-        elif mass > 0.0:
-            about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
-            own = np.linalg.eigvalsh(about_o - _of_point(mass, centre))
-            scale = max(float(np.abs(about_o).max()), mass * float(np.dot(centre, centre)))
-            if own[0] < -1e-6 * scale or own[2] > own[0] + own[1] + 1e-6 * scale:
-                allowed = (
-                    f"must fit the inertia about O, which leaves {own} about this centre "
-                    f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
-                )
-                yield Problem("centre", centre, allowed)
+        mass, centre, about_o = self.mass, self.centre, entries_of(self.inertia)
+        x, y, z = centre
+        point = (y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z)
+        own = [whole - mass * part for whole, part in zip(about_o, point, strict=True)]
+        scale = mass * (x * x + y * y + z * z)
+        for part in about_o:
+            scale = np.maximum(scale, abs(part))
+        # Moments about the centre of mass: none exceeds half their sum, but for rounding.
+        fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
+
+        def contradiction() -> Problem:
+            xx, yy, zz, xy, xz, yz = own
+            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            allowed = (
+                f"must fit the inertia about O, which leaves {moments} about this centre "
+                f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
+            )
+            return Problem("centre", centre, allowed)
+
+        yield np.greater(mass, 0.0) & np.greater(scale, 0.0) & ~fits, contradiction
 
 
 @dataclass(frozen=True)
@@ -157,17 +184,23 @@ class Star(Link):
     )
     radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
         total = sum(self.alpha_deg)
-        if abs(total - 360.0) > 360.0 * RELATIVE_ROUNDING:
-            yield Problem("alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}")
-        yield from super().check()
+        yield (
+            np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING),
+            lambda: Problem(
+                "alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}"
+            ),
+        )
+        yield from Link.rules(self)  # `self` may be an object of columns
 
 
 @dataclass(frozen=True)
 class Payload(Section):
     """A body carried by the star; its inertia is about its own centre of mass."""
+
+    EFFECTS = "mass", "inertia"
 
     mass: float = number("mass", "kg", above=0.0)
     centre: Vector3 = number("centre of mass in {E}", "m", shape=(3,))
@@ -182,6 +215,27 @@ class Payload(Section):
         """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
         own = np.zeros((3, 3)) if self.inertia is None else self.inertia.matrix
         return own + _of_point(self.mass, self.centre)
+
+
+def entries_of(inertia: Inertia | None) -> list[Any]:
+    """Return xx, yy, zz, xy, xz and yz, zero without inertia; they may be columns or symbols."""
+    if inertia is None:
+        return [0.0] * 6
+    return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]
+
+
+def _is_positive(entries: Sequence[Any], more: Any) -> Any:
+    """Whether a symmetric matrix + more 1 is positive definite: the pivots of its L D L^T are."""
+    xx, yy, zz, xy, xz, yz = map(np.asarray, entries)
+    first, second = xx + more, yy + more - xy * xy / (xx + more)
+    off = yz - xy * xz / first
+    third = zz + more - xz * xz / first - off * off / second
+    return np.asarray((first > 0.0) & (second > 0.0) & (third > 0.0))
+
+
+def _inertia_of(tensor: NDArray[np.float64]) -> Inertia:
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
+    return Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz)
 
 
 def _of_point(mass: float, centre: Vector3) -> NDArray[np.float64]:
@@ -224,11 +278,7 @@ def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) ->
     ratio = math.sin(2.0 * half) / (2.0 * half)
     spread = 0.5 * (1.0 + ratio) * np.outer(middle, middle)
     spread += 0.5 * (1.0 - ratio) * np.outer(across, across)
-    tensor = mass * radius**2 * (np.eye(3) - spread)
-    xx, yy, zz = (float(tensor[i, i]) for i in range(3))
-    return Inertia(
-        xx=xx, yy=yy, zz=zz, xy=float(tensor[0, 1]), xz=float(tensor[0, 2]), yz=float(tensor[1, 2])
-    )
+    return _inertia_of(np.asarray(mass * radius**2 * (np.eye(3) - spread)))
 
 
 def _towards(axis: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
-from sst_ros.scene.schema import Section, choice, flag, number, section
+from sst_ros.scene.schema import Rules, Section, choice, flag, number, section
 from sst_ros.state import Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
@@ -27,12 +28,10 @@ STRIBECK = 0.1
 class Gravity(Section):
     """A uniform field."""
 
-    acceleration: Vector3 = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
+    EFFECTS = ("acceleration",)
+    IDLE = "acceleration", "must not be zero: leave gravity out"
 
-    def check(self) -> Iterator[Problem]:
-        """Refuse a field that is none."""
-        if not any(self.acceleration):
-            yield Problem("acceleration", self.acceleration, "must not be zero: leave gravity out")
+    acceleration: Vector3 = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
 
 
 @dataclass(frozen=True)
@@ -55,45 +54,53 @@ class Friction(Section):
     viscous v + (coulomb + (static - coulomb) exp(-(v / stribeck)^2)) tanh(v / smoothing)
     """
 
+    EFFECTS = "viscous", "coulomb", "static"
+    IDLE = "viscous", "friction without a coefficient: leave it out"
+
     viscous: float = number("viscous coefficient", "N m s/rad", default=0.0, least=0.0)
     coulomb: float = number("Coulomb torque", "N m", default=0.0, least=0.0)
     smoothing: float = number(
-        "rate over which the Coulomb torque changes sign", "rad/s", default=SMOOTHING, above=0.0
+        "rate over which the Coulomb torque changes sign",
+        "rad/s",
+        default=SMOOTHING,
+        above=0.0,
+        acts_on=("coulomb", "static"),
     )
     static: float = number("breakaway torque (Stribeck); 0 for none", "N m", default=0.0, least=0.0)
     stribeck: float = number(
-        "rate at which the breakaway torque has faded", "rad/s", default=STRIBECK, above=0.0
+        "rate at which the breakaway torque has faded",
+        "rad/s",
+        default=STRIBECK,
+        above=0.0,
+        acts_on=("static",),
     )
 
-    def check(self) -> Iterator[Problem]:
-        """Refuse friction that is none and a breakaway torque below the Coulomb torque."""
-        if not (self.viscous or self.coulomb or self.static):
-            yield Problem("viscous", self.viscous, "friction without a coefficient: leave it out")
-        if self.static and self.static < self.coulomb:
-            yield Problem("static", self.static, f"must be >= coulomb = {self.coulomb:g} N m")
-        if self.smoothing != SMOOTHING and not (self.coulomb or self.static):
-            yield Problem("smoothing", self.smoothing, "acts on coulomb or static: give one")
-        if self.stribeck != STRIBECK and not self.static:
-            yield Problem("stribeck", self.stribeck, "acts on static: give it")
+    def rules(self) -> Rules:
+        """Refuse a breakaway torque below the Coulomb torque."""
+        below = np.not_equal(self.static, 0.0) & np.less(self.static, self.coulomb)
+        yield (
+            below,
+            lambda: Problem("static", self.static, f"must be >= coulomb = {self.coulomb:g} N m"),
+        )
 
 
 @dataclass(frozen=True)
 class JointFriction(Section):
     """Friction by kind of joint, the same in all legs."""
 
+    EFFECTS = "gamma", "mu", "beta"
+    IDLE = "", "names no joint: give gamma, mu or beta, or leave it out"
+
     gamma: Friction | None = section("actuated revolute joints", Friction, default=None)
     mu: Friction | None = section("passive revolute joints", Friction, default=None)
     beta: Friction | None = section("passive curved prismatic joints", Friction, default=None)
-
-    def check(self) -> Iterator[Problem]:
-        """Refuse friction in no joint."""
-        if self.gamma is self.mu is self.beta is None:
-            yield Problem("", None, "names no joint: give gamma, mu or beta, or leave it out")
 
 
 @dataclass(frozen=True)
 class Spring(Section):
     """A torsional spring at one joint: torque -stiffness (angle - rest)."""
+
+    EFFECTS = ("stiffness",)
 
     joint: str = choice("joint", JOINTS)
     stiffness: float = number("stiffness", "N m/rad", above=0.0)
@@ -108,8 +115,21 @@ class Actuators(Section):
     it lags.
     """
 
+    EFFECTS = (
+        "rotor_inertia", "torque_limit", "time_constant", "idle_damping", "velocity_limit",
+        "acceleration_limit",
+    )  # fmt: skip
+    IDLE = "", "changes nothing: leave it out"
+
     rotor_inertia: float = number("inertia of the motor's rotor", "kg m^2", default=0.0, least=0.0)
-    gear_ratio: float = number("motor turns per joint turn", "1", default=1.0, above=0.0)
+    gear_ratio: float = number(
+        "motor turns per joint turn",
+        "1",
+        default=1.0,
+        above=0.0,
+        acts_on=("rotor_inertia",),
+        needs="acts on rotor_inertia only (torques are those at the joint): give it",
+    )
     torque_limit: float | None = number("largest torque", "N m", default=None, above=0.0)
     time_constant: float | None = number(
         "time constant of a first-order lag of the torque", "s", default=None, above=0.0
@@ -132,15 +152,6 @@ class Actuators(Section):
         default=None,
         above=0.0,
     )
-
-    def check(self) -> Iterator[Problem]:
-        """Refuse actuators that change nothing, and a gear without a rotor behind it."""
-        limits = (self.torque_limit, self.velocity_limit, self.acceleration_limit)
-        if self.gear_ratio != 1.0 and not self.rotor_inertia:
-            allowed = "acts on rotor_inertia only (torques are those at the joint): give it"
-            yield Problem("gear_ratio", self.gear_ratio, allowed)
-        elif not self.rotor_inertia and not any((*limits, self.time_constant, self.idle_damping)):
-            yield Problem("", None, "changes nothing: leave it out")
 
 
 @dataclass(frozen=True)
@@ -182,15 +193,23 @@ class Stroke(Section):
         elastic = self.at_end == "elastic"
         if (self.stiffness is not None) != elastic:
             yield Problem("stiffness", self.stiffness, only)
-        for name in ("damping", "restitution", "impact_rate"):
+        for name in ("restitution", "impact_rate"):
             if getattr(self, name) and not elastic:
                 yield Problem(name, getattr(self, name), only)
         if (self.restitution is None) != (self.impact_rate is None):
             yield Problem(
                 "impact_rate", self.impact_rate, "is given with restitution, both or none"
             )
-        if self.damping and self.restitution is not None:
-            yield Problem("damping", self.damping, "give either damping or restitution")
+        yield from super().check()
+
+    def rules(self) -> Rules:
+        """Refuse damping where there is none, and where restitution gives it."""
+        damped = np.not_equal(self.damping, 0.0)
+        for broken, allowed in (
+            (damped & (self.at_end != "elastic"), "is given with at_end: elastic, and only there"),
+            (damped & (self.restitution is not None), "give either damping or restitution"),
+        ):
+            yield broken, partial(Problem, "damping", self.damping, allowed)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,19 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.motions import DesiredMotion
-from sst_ros.scene.schema import Section, Spec, notes, number, section, sections, specs, text
-from sst_ros.scene.yaml_document import from_values, plain, read, replace_values, values_of
+from sst_ros.scene.schema import Rules, Section, notes, number, section, sections, text
+from sst_ros.scene.yaml_document import build, has, numbers, plain, read, replace_values, values_of
 
 Matrix = NDArray[np.float64]
 
 LARGEST, SMALLEST = 1e9, 1e-12
 """No number of a scene is larger, none that must be positive smaller: it is a slip of units, and
 its powers leave the range of double precision."""
+
+_BODIES = (
+    ("star", None),
+    *((name, k) for name in ("actuated_links", "intermediate_links") for k in range(3)),
+)
 
 __all__ = [
     "Actuators",
@@ -102,12 +108,12 @@ class Scene(Section):
 
         """
         try:
-            changed = replace_values(values_of(self), values)
+            changed = replace_values(values_of(self), plain(values))
         except KeyError as error:
             key = error.args[0]
             problem = Problem(str(key), values[key], "names nothing in this scene")
             raise InputError(self.name, [problem]) from None
-        return from_values(Scene, changed, self.name)
+        return build(Scene, changed, self.name)
 
     @property
     def star_inertia(self) -> Matrix:
@@ -130,30 +136,38 @@ class Scene(Section):
 
     def check(self) -> Iterator[Problem]:
         """Refuse what contradicts itself across sections, and numbers of another unit."""
-        for key, value, spec in _numbers(self, ""):
+        for key, value, spec in numbers(self):
             if abs(value) > LARGEST:
                 allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
                 yield Problem(key, value, allowed)
             elif spec.above == 0.0 and value < SMALLEST:
                 allowed = f"must be at least {SMALLEST:g}: use m, kg, s, rad, N"
                 yield Problem(key, value, allowed)
-        reach = max(self.base.radius, self.star.radius)
-        for key, body in self._bodies():
-            if np.linalg.norm(body.centre) > reach:
-                yield Problem(f"{key}.centre", body.centre, f"must lie within {reach:g} m of O")
-        heavy = self.payload or any(body.mass for _, body in self._bodies())
-        if self.gravity and not heavy:
-            allowed = "acts on nothing: no body has a mass"
-            yield Problem("gravity", self.gravity.acceleration, allowed)
+        yield from super().check()
         for key, note in self.provenance:
-            if not _has(type(self), key.split(".")):
+            if not has(type(self), key):
                 yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
-    def _bodies(self) -> Iterator[tuple[str, Link]]:
-        yield "star", self.star
-        for key in ("actuated_links", "intermediate_links"):
-            for k, link in enumerate(getattr(self, key)):
-                yield f"{key}[{k}]", link
+    def rules(self) -> Rules:
+        """Refuse a centre of mass far from the bodies, and gravity without a mass."""
+        reach = np.maximum(self.base.radius, self.star.radius)
+        mass: Any = 0.0 if self.payload is None else self.payload.mass
+        for name, k in _BODIES:
+            body: Link = self.star if k is None else getattr(self, name)[k]
+            mass = mass + body.mass
+            x, y, z = body.centre
+            key = f"{name}.centre" if k is None else f"{name}[{k}].centre"
+            yield np.sqrt(x * x + y * y + z * z) > reach, partial(_far, key, body.centre, reach)
+        if self.gravity is not None:
+            allowed = "acts on nothing: no body has a mass"
+            yield (
+                np.equal(mass, 0.0),
+                partial(Problem, "gravity", self.gravity.acceleration, allowed),
+            )
+
+
+def _far(key: str, centre: object, reach: float) -> Problem:
+    return Problem(key, centre, f"must lie within {reach:g} m of O")
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
@@ -166,7 +180,7 @@ def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, Mapping):
-        return from_values(Scene, scene, "scene")
+        return build(Scene, scene, "scene")
     if isinstance(scene, (str, Path)):
         return load(scene)
     allowed = "must be a Scene, the name or path of one, or its document as a dict"
@@ -251,25 +265,3 @@ def share_directory() -> Path:
 
 def _matrix(link: Link) -> Matrix:
     return np.zeros((3, 3)) if link.inertia is None else link.inertia.matrix
-
-
-def _numbers(
-    value: object, key: str, spec: Spec | None = None
-) -> Iterator[tuple[str, float, Spec]]:
-    """Yield every number of a section with its key and its specification."""
-    if isinstance(value, Section):
-        for name, inner in specs(type(value)).items():
-            yield from _numbers(getattr(value, name), f"{key}.{name}" if key else name, inner)
-    elif isinstance(value, tuple):
-        for index, entry in enumerate(value):
-            where = f"{key}[{index}]" if isinstance(entry, Section) else key
-            yield from _numbers(entry, where, spec)
-    elif isinstance(value, float) and spec is not None:
-        yield key, value, spec
-
-
-def _has(cls: type[Section], path: list[str]) -> bool:
-    spec = specs(cls).get(path[0])
-    if spec is None or len(path) == 1:
-        return spec is not None
-    return spec.section is not None and _has(spec.section, path[1:])

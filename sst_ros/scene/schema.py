@@ -12,9 +12,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
 
 from sst_ros.errors import InputError, Problem
 
@@ -31,7 +33,10 @@ _TEXT = {"type": "string", "pattern": "\\S"}
 
 @dataclass(frozen=True)
 class Spec:
-    """What a field may hold. `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows."""
+    """What a field may hold. `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows.
+
+    Without any of the fields `acts_on` it has no effect; `needs` says so.
+    """
 
     kind: str
     doc: str
@@ -43,9 +48,12 @@ class Spec:
     choices: tuple[str, ...] = ()
     section: type[Section] | None = None
     lengths: tuple[int, ...] = ()
+    acts_on: tuple[str, ...] = ()
+    needs: str = ""
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
+        unit = f" [{self.unit}]" if self.unit else ""
         if self.kind == "number":
             size = " x ".join(map(str, self.shape))
             what = f"{size} finite numbers" if size else "a finite number"
@@ -54,10 +62,9 @@ class Spec:
                 f">= {self.least:g}" if math.isfinite(self.least) else "",
                 f"<= {self.most:g}" if math.isfinite(self.most) else "",
             ]
-            unit = f" [{self.unit}]" if self.unit else ""
             return " ".join(["must be", what, *filter(None, bounds)]) + unit
         return {
-            "integer": f"must be a whole number from {self.least:g} to {self.most:g} [{self.unit}]",
+            "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
             "flag": "must be true or false",
             "text": "must be text without control characters",
             "texts": "must be a list of text",
@@ -130,9 +137,22 @@ def _declare(spec: Spec, default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"spec": spec}, kw_only=True)
 
 
+Rules: TypeAlias = "Iterator[tuple[Any, Callable[[], Problem]]]"
+"""Whether each rule is broken, and the problem that is told where it is."""
+
+
 @dataclass(frozen=True)
 class Section:
     """Base of every part of a document; refuses what its fields do not allow."""
+
+    ORIGIN: ClassVar[str] = ""
+    """What messages are headed by; by default the name of the class."""
+
+    EFFECTS: ClassVar[tuple[str, ...]] = ()
+    """A section has no effect where all of these are zero or not given."""
+
+    IDLE: ClassVar[tuple[str, str]] = "", ""
+    """Key and text that refuse a section without effect; no text where its fields refuse it."""
 
     def __post_init__(self) -> None:
         problems = []
@@ -144,13 +164,38 @@ class Section:
                 object.__setattr__(self, name, accept(spec, value))
             except ValueError:
                 problems.append(Problem(name, value, spec.describe()))
-        if not problems:
-            problems = list(self.check())
+        problems = problems or list(self._find_idle()) or list(self.check())
         if problems:
-            raise InputError(type(self).__name__.lower(), problems)
+            raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
+
+    def _find_idle(self) -> Iterator[Problem]:
+        """Yield what has no effect."""
+        acts = True
+        for field in dataclasses.fields(self):
+            spec, value = field.metadata["spec"], getattr(self, field.name)
+            if spec.acts_on and value != field.default and not self._has_any(spec.acts_on):
+                given = "it" if len(spec.acts_on) == 1 else "one"
+                text = spec.needs or f"acts on {' or '.join(spec.acts_on)}: give {given}"
+                yield Problem(field.name, value, text)
+                acts = False
+        key, text = self.IDLE
+        if text and acts and not self._has_any(self.EFFECTS):
+            yield Problem(key, getattr(self, key, None), text)
+
+    def _has_any(self, names: tuple[str, ...]) -> bool:
+        values = (getattr(self, name) for name in names)
+        return any(any(value) if isinstance(value, tuple) else value for value in values)
 
     def check(self) -> Iterator[Problem]:
-        """Yield the faults that no single field shows; override where there can be some."""
+        """Yield the faults that no single field shows; override where rules are not enough."""
+        with np.errstate(all="ignore"):
+            yield from (problem() for broken, problem in self.rules() if broken)
+
+    def rules(self) -> Rules:
+        """Yield the rules that numbers of several fields must keep.
+
+        They also hold for an object of columns in place of `self`: what is broken is then an array.
+        """
         return iter(())
 
 

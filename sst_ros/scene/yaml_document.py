@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML text to a checked document and back; reports every fault with its line.
+"""A document as YAML text, as nested values, and as a tree of numbers with keys.
 
-Between them stand nested dicts, whose values have keys, as in "star.inertia.zz" or
-"springs[0].rest".
+Text is read into nested dicts and lists, which are built into a checked `Section`, and back; every
+fault has its key and its line. A key is "star.inertia.zz" or "springs[0].rest"; a list without an
+index means all of its entries. A tree is a section, or an object like it that is not checked, whose
+numbers may be symbols, or columns of many scenarios. Every walk over a scene is here.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,6 +22,11 @@ from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
 
 S = TypeVar("S", bound=Section)
+
+Place = tuple[str | int, ...]
+"""Names and indices of a leaf from the root on."""
+
+NO_NUMBER = "must name a number, as star.mass does"
 
 LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
 """Characters, values and levels of nesting of a document: PyYAML reads 20,000 values in 0.5 s,
@@ -60,6 +68,10 @@ class _Loader(yaml.SafeLoader):
         return event
 
 
+class Switch(str):
+    """A word of YAML 1.1 for true or false, of which YAML 1.2 has those two."""
+
+
 def read(cls: type[S], source: str, origin: str) -> S:
     """Build `cls` from YAML text.
 
@@ -79,55 +91,57 @@ def read(cls: type[S], source: str, origin: str) -> S:
         line = None if mark is None else mark.line + 1
         reason = getattr(error, "problem", None) or str(error)
         raise InputError(origin, [Problem("", reason, "must be YAML", line)]) from None
+    lines: dict[str, int] = {}
     problems: list[Problem] = []
-    result = _build(cls, node, "", problems)
-    if problems or result is None:
-        raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
-    return result
+    return build(cls, _values(node, "", lines, problems), origin, lines=lines, known=problems)
 
 
-def from_values(cls: type[S], values: Mapping[str, Any], origin: str) -> S:
-    """Build `cls` from nested dicts and lists, as YAML text would have them; arrays are allowed.
+def dump(document: Section) -> str:
+    """Write a document as YAML that `read` turns into an equal one."""
+    return str(yaml.safe_dump(values_of(document), sort_keys=False, allow_unicode=True))
 
-    Raises:
-        InputError: the values break the schema; lists every fault.
 
+def line_of(source: str, key: str) -> int | None:
+    """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
+    lines: dict[str, int] = {}
+    _values(yaml.compose(source, Loader=_Loader), "", lines, [])
+    return line_at(lines, key)
+
+
+def _values(
+    node: yaml.Node | None, path: str, lines: dict[str, int], problems: list[Problem]
+) -> Any:
+    """Return a node as dicts, lists and text; note the lines of keys, and keys that come again.
+
+    Numbers stay text: YAML 1.1, which PyYAML reads, has others.
     """
-    try:
-        text = yaml.safe_dump(plain(values), sort_keys=False, allow_unicode=True)
-        return read(cls, text, origin)
-    except yaml.YAMLError as error:
-        allowed = f"must be text, numbers, lists and mappings ({error})"
-        raise InputError(origin, [Problem("", "values", allowed)]) from None
-    except InputError as error:
-        found = [dataclasses.replace(problem, line=None) for problem in error.problems]
-        raise InputError(origin, found) from None
+    if node is not None:
+        lines.setdefault(path, _line(node))
+    if isinstance(node, yaml.ScalarNode):
+        if node.tag.endswith(":null"):
+            return None
+        return Switch(node.value) if node.tag.endswith(":bool") else node.value
+    if isinstance(node, yaml.SequenceNode):
+        entries = enumerate(node.value)
+        return [_values(entry, f"{path}[{i}]", lines, problems) for i, entry in entries]
+    if not isinstance(node, yaml.MappingNode):
+        return None
+    found: dict[str, Any] = {}
+    for key_node, value_node in node.value:
+        name = str(_values(key_node, "", {}, []))
+        key = f"{path}.{name}" if path else name
+        line = lines.setdefault(key, _line(key_node))
+        value = _values(value_node, key, lines, problems)
+        if name in found:
+            allowed = f"is given twice, first on line {line}"
+            problems.append(Problem(key, value, allowed, _line(key_node)))
+        else:
+            found[name] = value
+    return found
 
 
-def values_of(document: Section) -> dict[str, Any]:
-    """Return a document as nested dicts and lists, which `from_values` takes."""
-    tree: dict[str, Any] = _tree(document)
-    return tree
-
-
-def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with other values; a list without an index means all of its entries.
-
-    So does a single value in place of a list of numbers.
-
-    A section that the document does not have is made; None takes a value or a section away.
-
-    Raises:
-        KeyError: a key does not fit the document; its argument is the key.
-
-    """
-    changed: dict[str, Any] = plain(document)
-    for key, value in values.items():
-        try:
-            _set(changed, str(key).split("."), plain(value))
-        except (AttributeError, IndexError, TypeError, ValueError):
-            raise KeyError(key) from None
-    return changed
+def _line(node: yaml.Node | yaml.Event) -> int:
+    return 1 if node.start_mark is None else int(node.start_mark.line) + 1
 
 
 def plain(value: Any) -> Any:
@@ -141,153 +155,311 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _set(section: dict[str, Any], words: list[str], value: Any) -> None:
-    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", words[0], re.A)
-    if parts is None:
-        raise ValueError(words[0])
-    name, index = parts.groups()
-    if len(words) == 1 and index is not None:
-        section[name][int(index)] = value
-        return
-    if len(words) == 1:
+def values_of(tree: Any) -> Any:
+    """Return a section as nested dicts and lists, which `build` takes."""
+    if isinstance(tree, Section):
+        pairs = ((name, spec, getattr(tree, name)) for name, spec in specs(type(tree)).items())
+        return {
+            name: dict(value) if spec.kind == "notes" else values_of(value)
+            for name, spec, value in pairs
+            if value is not None and value != ()
+        }
+    return [values_of(entry) for entry in tree] if isinstance(tree, tuple) else tree
+
+
+def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested dicts and lists with other values by key; a single one fills a list.
+
+    A section that the document does not have is made; None takes a value or a section away.
+
+    Raises:
+        KeyError: a key does not fit the document; its argument is the key.
+
+    """
+    changed: dict[str, Any] = plain(document)
+    for key, value in values.items():
+        try:
+            _set(changed, split(str(key)), value)
+        except (AttributeError, IndexError, TypeError, ValueError):
+            raise KeyError(key) from None
+    return changed
+
+
+def _set(section: dict[str, Any], words: list[tuple[str, int | None]], value: Any) -> None:
+    (name, index), *rest = words
+    if rest:
+        below = section.setdefault(name, {} if index is None else [])
+        entries = below if isinstance(below, list) else [below]
+        for entry in entries if index is None else [entries[index]]:
+            _set(entry, rest, value)
+    elif index is not None:
+        section[name][index] = value
+    elif value is None:
+        section.update({name: None})
+        del section[name]
+    else:
         known = section.get(name)
-        if isinstance(known, list) and isinstance(value, (int, float)):
+        if isinstance(known, list) and not isinstance(value, (str, list, tuple, Mapping)):
             value = [value] * len(known)
         section.update({name: value})
-        if value is None:
-            del section[name]
-        return
-    below = section.setdefault(name, {} if index is None else [])
-    entries = below if isinstance(below, list) else [below]
-    for entry in entries if index is None else [entries[int(index)]]:
-        _set(entry, words[1:], value)
 
 
-def dump(document: Section) -> str:
-    """Write a document as YAML that `read` turns into an equal one."""
-    return str(yaml.safe_dump(_tree(document), sort_keys=False, allow_unicode=True))
+def open_values(cls: type[Section], values: Mapping[str, Any]) -> Any:
+    """Return an object like a section with any values, which are not checked.
 
-
-def line_of(source: str, key: str) -> int | None:
-    """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
-    node = yaml.compose(source, Loader=_Loader)
-    return None if node is None else _line_at(node, key)
-
-
-def _tree(value: Any) -> Any:
-    if isinstance(value, Section):
-        pairs = ((name, spec, getattr(value, name)) for name, spec in specs(type(value)).items())
-        return {
-            name: dict(entry) if spec.kind == "notes" else _tree(entry)
-            for name, spec, entry in pairs
-            if entry is not None and entry != ()
-        }
-    return [_tree(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def _build(cls: type[S], node: yaml.Node | None, path: str, problems: list[Problem]) -> S | None:
-    if not isinstance(node, yaml.MappingNode):
-        problems.append(Problem(path, _plain(node), "must be a mapping", _line(node)))
-        return None
-    known = specs(cls)
-    values: dict[str, Any] = {}
-    lines: dict[str, int | None] = {}
-    before = len(problems)
-    for key_node, value_node in node.value:
-        name = str(_plain(key_node))
-        key = f"{path}.{name}" if path else name
-        if name not in known:
-            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
-            problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
-        elif name in lines:
-            allowed = f"is given twice, first on line {lines[name]}"
-            problems.append(Problem(key, _plain(value_node), allowed, _line(key_node)))
-        else:
-            lines[name] = _line(key_node)
-            values[name] = _convert(known[name], value_node, key, problems)
+    A number that a section must have and these values have not is zero.
+    """
+    found = {}
     for field in dataclasses.fields(cls):
-        if field.default is dataclasses.MISSING and field.name not in lines:
+        inner = field.metadata["spec"].section
+        value = values.get(field.name, field.default)
+        if isinstance(value, list):
+            value = tuple(open_values(inner, one) if inner else _freeze(one) for one in value)
+        elif isinstance(value, dict) and inner:
+            value = open_values(inner, value)
+        found[field.name] = 0.0 if value is dataclasses.MISSING else value
+    return SimpleNamespace(**found)
+
+
+def _freeze(value: Any) -> Any:
+    return tuple(map(_freeze, value)) if isinstance(value, list) else value
+
+
+def broken_rows(cls: type[Section], columns: Any) -> Any:
+    """Return whether rules across fields are broken, for an object of columns row by row."""
+    broken: Any = False
+    for name, spec in specs(cls).items():
+        value = getattr(columns, name)
+        for part in value if isinstance(value, tuple) else [value]:
+            if spec.section is not None and isinstance(part, SimpleNamespace):
+                broken = broken | broken_rows(spec.section, part)
+    with np.errstate(all="ignore"):
+        for wrong, _ in cls.rules(columns):
+            broken = broken | wrong
+    return broken
+
+
+def build(
+    cls: type[S],
+    values: Any,
+    origin: str,
+    *,
+    of_row: bool = False,
+    lines: Mapping[str, int] | None = None,
+    known: Sequence[Problem] = (),
+) -> S:
+    """Build a section from nested dicts and lists.
+
+    Args:
+        cls: the section.
+        values: by name; arrays are allowed.
+        origin: of the values, for messages.
+        of_row: leave out what has no effect, as a friction whose coefficients are zero; a document
+            that says such a thing is refused.
+        lines: of keys, for messages.
+        known: problems that were found before.
+
+    Raises:
+        InputError: lists every fault.
+
+    """
+    problems = list(known)
+    result = _build(cls, plain(values), "", problems, of_row)
+    if not problems and result is not None:
+        return result
+    if lines is not None:
+        problems = [
+            one if one.line else dataclasses.replace(one, line=line_at(lines, one.key))
+            for one in problems
+        ]
+    raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
+
+
+def line_at(lines: Mapping[str, int], key: str) -> int | None:
+    """Return the line of a key, or of the deepest part of it that has one."""
+    while key and key not in lines:
+        first = re.sub(r"\[\d+\]", "[0]", key)  # one entry may stand for all
+        key = first if first in lines else re.sub(r"(^|\.)\w+$|\[\d+\]$", "", key)
+    return lines.get(key)
+
+
+def _build(cls: type[S], values: Any, path: str, problems: list[Problem], of_row: bool) -> S | None:
+    if not isinstance(values, Mapping):
+        problems.append(Problem(path, values, "must be a mapping"))
+        return None
+    known, before = specs(cls), len(problems)
+    given: dict[str, Any] = {}
+    for name, value in values.items():
+        key = f"{path}.{name}" if path else name
+        if name in known:
+            given[name] = _convert(known[name], value, key, problems, of_row)
+        else:
+            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
+            problems.append(Problem(key, value, allowed))
+    for field in dataclasses.fields(cls):
+        if field.default is dataclasses.MISSING and field.name not in given:
             key = f"{path}.{field.name}" if path else field.name
-            allowed = "is missing; " + known[field.name].describe()
-            problems.append(Problem(key, None, allowed, _line(node)))
+            problems.append(Problem(key, None, "is missing; " + known[field.name].describe()))
     if len(problems) > before:
         return None
+    if of_row:
+        for name, spec in known.items():
+            if spec.acts_on and not any(_is_some(given.get(cause)) for cause in spec.acts_on):
+                given.pop(name, None)
+        if cls.EFFECTS and not any(_is_some(given.get(name)) for name in cls.EFFECTS):
+            return None
     try:
-        return cls(**values)
+        return cls(**given)
     except InputError as error:
         for problem in error.problems:
             key = ".".join(filter(None, [path, problem.key]))
-            line = _line_at(node, problem.key)
-            problems.append(dataclasses.replace(problem, key=key, line=line))
+            problems.append(dataclasses.replace(problem, key=key))
     return None
 
 
-def _convert(spec: Spec, node: yaml.Node, key: str, problems: list[Problem]) -> Any:
+def _convert(spec: Spec, value: Any, key: str, problems: list[Problem], of_row: bool) -> Any:
     if spec.kind == "section" and spec.section:
-        return _build(spec.section, node, key, problems)
-    if spec.kind == "sections" and spec.section and isinstance(node, yaml.SequenceNode):
-        entries = enumerate(node.value)
-        return tuple(
-            _build(spec.section, entry, f"{key}[{index}]", problems) for index, entry in entries
+        return _build(spec.section, value, key, problems, of_row)
+    if spec.kind == "sections" and spec.section and isinstance(value, list):
+        entries = (
+            _build(spec.section, entry, f"{key}[{index}]", problems, of_row)
+            for index, entry in enumerate(value)
         )
-    if spec.kind == "notes" and isinstance(node, yaml.MappingNode):
-        return _notes(node, key, problems)
-    value = _plain(node)
+        return tuple(entry for entry in entries if entry is not None or not of_row)
+    if spec.kind == "notes" and isinstance(value, dict):
+        for name, note in value.items():
+            try:
+                frozen_text(note)
+            except ValueError:
+                problems.append(Problem(f"{key}.{name}", note, "must be text"))
+        return value
+    if spec.kind == "number" and of_row and not _is_some(value):
+        return value  # the section refuses zero, or is left out
+    given = value
+    if spec.kind == "flag" and isinstance(value, Switch):
+        given = {"true": True, "false": False}.get(value.lower(), value)
+    elif spec.kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
+        given = int(value)
+    elif spec.kind == "text" and isinstance(value, (int, float)):
+        given = str(value)
     try:
-        return accept(spec, _read_scalar(spec, node, value))
+        return accept(spec, given)
     except ValueError:
-        problems.append(Problem(key, value, spec.describe(), _line(node)))
+        problems.append(Problem(key, value, spec.describe()))
         return None
 
 
-def _notes(node: yaml.MappingNode, path: str, problems: list[Problem]) -> dict[str, str]:
-    result: dict[str, str] = {}
-    for key_node, value_node in node.value:
-        name, note = str(_plain(key_node)), _plain(value_node)
-        if name in result:
-            problems.append(Problem(f"{path}.{name}", note, "is given twice", _line(key_node)))
-        try:
-            result[name] = frozen_text(note)
-        except ValueError:
-            problems.append(Problem(f"{path}.{name}", note, "must be text", _line(key_node)))
-    return result
+def _is_some(value: Any) -> bool:
+    return any(map(_is_some, value)) if isinstance(value, (list, tuple)) else bool(value)
 
 
-def _plain(node: yaml.Node | None) -> Any:
-    """Return the node's value; numbers stay text: YAML 1.1, which PyYAML reads, has others."""
-    if isinstance(node, yaml.ScalarNode):
-        return None if node.tag.endswith(":null") else node.value
-    if isinstance(node, yaml.SequenceNode):
-        return [_plain(entry) for entry in node.value]
-    if isinstance(node, yaml.MappingNode):
-        return {str(_plain(key)): _plain(value) for key, value in node.value}
-    return None
+def split(key: str) -> list[tuple[str, int | None]]:
+    """Return names and indices of a key; raises ValueError where it is none."""
+    found = []
+    for word in key.split("."):
+        parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", word, re.A)
+        if parts is None:
+            raise ValueError(word)
+        found.append((parts[1], None if parts[2] is None else int(parts[2])))
+    return found
 
 
-def _read_scalar(spec: Spec, node: yaml.Node, value: Any) -> Any:
-    """Convert the text of a plain flag or whole number, by the rules of YAML 1.2."""
-    if spec.kind == "flag" and node.tag.endswith(":bool"):
-        return {"true": True, "false": False}.get(value.lower(), value)
-    if spec.kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
-        return int(value)
-    return value
+def key_of(place: Place) -> str:
+    """Return a place as a key."""
+    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
 
 
-def _line(node: yaml.Node | yaml.Event | None) -> int | None:
-    return None if node is None or node.start_mark is None else int(node.start_mark.line) + 1
+def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Yield the place of each number or column of a tree, and what is there."""
+    if isinstance(tree, (float, np.ndarray)):
+        yield place, tree
+    for name, entry in _entries(tree):
+        yield from leaves(entry, (*place, name))
 
 
-def _line_at(node: yaml.Node, path: str) -> int | None:
-    """Line of the deepest part of a path, as in "links[0].centre", that the document has."""
-    pairs = node.value if isinstance(node, yaml.MappingNode) else []
-    for key_node, value_node in pairs:
-        name = str(_plain(key_node))
-        if path == name:
-            return _line(key_node)
-        if path.startswith(f"{name}."):
-            return _line_at(value_node, path[len(name) + 1 :])
-        if path.startswith(f"{name}[") and isinstance(value_node, yaml.SequenceNode):
-            index, _, rest = path[len(name) + 1 :].partition("]")
-            entries = value_node.value
-            return _line_at(entries[min(int(index), len(entries) - 1)], rest.removeprefix("."))
-    return _line(node)
+def rebuild(tree: Any, numbers: Mapping[Place, Any], place: Place = ()) -> Any:
+    """Return a tree with other numbers; its sections are objects that are not checked."""
+    if isinstance(tree, (float, np.ndarray)):
+        return numbers[place]
+    parts = {name: rebuild(entry, numbers, (*place, name)) for name, entry in _entries(tree)}
+    if isinstance(tree, tuple):
+        entries = parts.values()
+        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
+    return SimpleNamespace(**parts) if parts else tree
+
+
+def _entries(tree: Any) -> list[tuple[Any, Any]]:
+    if isinstance(tree, tuple):
+        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
+    return list(vars(tree).items()) if isinstance(tree, (Section, SimpleNamespace)) else []
+
+
+def addressed(
+    tree: Section, key: str, *, components: bool = False
+) -> Iterator[tuple[Place, Any, Spec]]:
+    """Yield the place of each field that a key names, its value, and what it allows.
+
+    Args:
+        tree: the document.
+        key: of a field.
+        components: an index may also pick a component of a vector.
+
+    Raises:
+        ValueError: there is no such field, or it is not in this scene.
+
+    """
+    try:
+        words = split(key)
+    except ValueError as error:
+        words = [(str(error), None)]
+    yield from _addressed(tree, words, components, ())
+
+
+def _addressed(
+    tree: Section, words: list[tuple[str, int | None]], components: bool, place: Place
+) -> Iterator[tuple[Place, Any, Spec]]:
+    (name, index), *rest = words
+    known = specs(type(tree))
+    if name not in known:
+        raise ValueError("unknown key; allowed are " + ", ".join(known))
+    spec, value, here = known[name], getattr(tree, name), (*place, name)
+    if not rest and index is None:
+        yield here, value, spec
+    elif not rest and components and spec.kind == "number" and value is not None:
+        if not spec.shape or index is None or index >= len(value):
+            raise ValueError(NO_NUMBER)
+        yield (*here, index), value[index], dataclasses.replace(spec, shape=spec.shape[1:])
+    elif rest and spec.kind == "section" and index is None:
+        if value is None:
+            raise ValueError(f"the scene has no {name}")
+        yield from _addressed(value, rest, components, here)
+    elif rest and spec.kind == "sections":
+        chosen = range(len(value)) if index is None else [index]
+        if not chosen or max(chosen) >= len(value):
+            raise ValueError(f"the scene has {len(value)} {name}")
+        for i in chosen:
+            yield from _addressed(value[i], rest, components, (*here, i))
+    else:
+        raise ValueError(NO_NUMBER)
+
+
+def numbers(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
+    """Yield each number of a section with the key of its field, and what the field allows."""
+    for name, spec in specs(type(tree)).items():
+        value, here = getattr(tree, name), (*place, name)
+        if isinstance(value, Section):
+            yield from numbers(value, here)
+        elif spec.kind == "sections":
+            for index, entry in enumerate(value):
+                yield from numbers(entry, (*here, index))
+        elif spec.kind == "number" and value is not None:
+            yield from ((key_of(here), float(x), spec) for x in np.ravel(value))
+
+
+def has(cls: type[Section], key: str) -> bool:
+    """Return whether documents of a class may have a key without indices."""
+    name, _, rest = key.partition(".")
+    spec = specs(cls).get(name)
+    if spec is None or not rest:
+        return spec is not None
+    return spec.section is not None and has(spec.section, rest)

@@ -26,10 +26,10 @@ import numpy as np
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.integration.scenarios import NO_NUMBER, addressed
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Section, Spec, specs
+from sst_ros.scene.yaml_document import NO_NUMBER, addressed, key_of
 
 KINDS = ("uniform", "normal", "grid", "linspace")
 
@@ -145,8 +145,8 @@ def targets_of(scene: Section, key: str) -> list[Target]:
 
     """
     found = []
-    for place, value, spec in addressed(scene, key.split(".")):
-        here = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place)[1:]
+    for place, value, spec in addressed(scene, key):
+        here = key_of(place)
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
         if isinstance(value, Inertia):
