@@ -26,8 +26,7 @@ from sst_ros.mechanism.generic_math import (
     tanh,
 )
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.bodies import entries_of
-from sst_ros.scene.scene import Friction, Link, Payload, Scene, Star, Stroke
+from sst_ros.scene.scene import Friction, Inertia, Link, Payload, Scene, Star, Stroke
 
 
 class Leg(NamedTuple):
@@ -115,11 +114,11 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     legs = []
     for k in range(3):
         w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
-        drive_zz = entries_of(scene.actuated_links[k].inertia)[2]
+        drive_zz = _tensor(scene.actuated_links[k].inertia)[2]
         if scene.actuators is not None:
             gear = scene.actuators.gear_ratio
             drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
-        xx, yy, zz, xy, xz, yz = entries_of(scene.intermediate_links[k].inertia)
+        xx, yy, zz, xy, xz, yz = _tensor(scene.intermediate_links[k].inertia)
         constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
         star = [
             part + xx * (float(i == j) - e[i] * e[j])
@@ -147,15 +146,21 @@ _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 def _star(scene: Scene) -> list[Scalar]:
     """Inertia of star and payload about O in {E}, in the order of `_PLACES`."""
-    star, payload = entries_of(scene.star.inertia), scene.payload
+    star, payload = _tensor(scene.star.inertia), scene.payload
     if payload is None:
         return star
     mass, c = payload.mass, payload.centre
     square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
     return [
         part + (own + mass * (square * float(i == j) - c[i] * c[j]))
-        for part, own, (i, j) in zip(star, entries_of(payload.inertia), _PLACES, strict=True)
+        for part, own, (i, j) in zip(star, _tensor(payload.inertia), _PLACES, strict=True)
     ]
+
+
+def _tensor(inertia: Inertia | None) -> list[Scalar]:
+    if inertia is None:
+        return [0.0] * 6
+    return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]
 
 
 def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:

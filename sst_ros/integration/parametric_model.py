@@ -25,7 +25,8 @@ from sst_ros.integration.limit_distances import limit_distances
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.scene.yaml_document import Place, leaves, rebuild
+from sst_ros.scene.schema import Place
+from sst_ros.scene.yaml_document import leaves, rebuild
 from sst_ros.state import Joints
 
 OUTPUTS = (*Joints._fields, "energy")

@@ -19,10 +19,9 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import LARGEST, SMALLEST, Scene
-from sst_ros.scene.schema import Spec
+from sst_ros.scene.schema import Place, Spec
 from sst_ros.scene.yaml_document import (
     NO_NUMBER,
-    Place,
     addressed,
     broken_rows,
     build,

@@ -64,7 +64,7 @@ class Inertia(Section):
         def told(allowed: str) -> Problem:
             return Problem("", np.linalg.eigvalsh(self.matrix).tolist(), allowed)
 
-        tensor = entries_of(self)
+        tensor = _entries(self)
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
         definite = _is_positive(tensor, -SMALLEST_MOMENT)
         yield (
@@ -152,7 +152,7 @@ class Link(Section):
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, centre, about_o = self.mass, self.centre, entries_of(self.inertia)
+        mass, centre, about_o = self.mass, self.centre, _entries(self.inertia)
         x, y, z = centre
         point = (y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z)
         own = [whole - mass * part for whole, part in zip(about_o, point, strict=True)]
@@ -217,7 +217,7 @@ class Payload(Section):
         return own + _of_point(self.mass, self.centre)
 
 
-def entries_of(inertia: Inertia | None) -> list[Any]:
+def _entries(inertia: Inertia | None) -> list[Any]:
     """Return xx, yy, zz, xy, xz and yz, zero without inertia; they may be columns or symbols."""
     if inertia is None:
         return [0.0] * 6

@@ -27,8 +27,18 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.motions import DesiredMotion
-from sst_ros.scene.schema import Rules, Section, notes, number, section, sections, text
-from sst_ros.scene.yaml_document import build, has, numbers, plain, read, replace_values, values_of
+from sst_ros.scene.schema import (
+    Rules,
+    Section,
+    has,
+    notes,
+    number,
+    numbers,
+    section,
+    sections,
+    text,
+)
+from sst_ros.scene.yaml_document import build, plain, read, replace_values, values_of
 
 Matrix = NDArray[np.float64]
 

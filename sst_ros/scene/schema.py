@@ -31,6 +31,10 @@ _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _TEXT = {"type": "string", "pattern": "\\S"}
 
 
+Place = tuple[str | int, ...]
+"""Names and indices of a leaf from the root on."""
+
+
 @dataclass(frozen=True)
 class Spec:
     """What a field may hold. `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows.
@@ -202,6 +206,33 @@ class Section:
 def specs(cls: type[Section]) -> dict[str, Spec]:
     """List the declared fields of a section, in order."""
     return {field.name: field.metadata["spec"] for field in dataclasses.fields(cls)}
+
+
+def numbers(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
+    """Yield each number of a section with the key of its field, and what the field allows."""
+    for name, spec in specs(type(tree)).items():
+        value, here = getattr(tree, name), (*place, name)
+        if isinstance(value, Section):
+            yield from numbers(value, here)
+        elif spec.kind == "sections":
+            for index, entry in enumerate(value):
+                yield from numbers(entry, (*here, index))
+        elif spec.kind == "number" and value is not None:
+            yield from ((key_of(here), float(x), spec) for x in np.ravel(value))
+
+
+def has(cls: type[Section], key: str) -> bool:
+    """Return whether documents of a class may have a key without indices."""
+    name, _, rest = key.partition(".")
+    spec = specs(cls).get(name)
+    if spec is None or not rest:
+        return spec is not None
+    return spec.section is not None and has(spec.section, rest)
+
+
+def key_of(place: Place) -> str:
+    """Return a place as a key."""
+    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
 
 
 def accept(spec: Spec, value: Any) -> Any:

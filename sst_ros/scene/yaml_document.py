@@ -4,7 +4,7 @@
 Text is read into nested dicts and lists, which are built into a checked `Section`, and back; every
 fault has its key and its line. A key is "star.inertia.zz" or "springs[0].rest"; a list without an
 index means all of its entries. A tree is a section, or an object like it that is not checked, whose
-numbers may be symbols, or columns of many scenarios. Every walk over a scene is here.
+numbers may be symbols, or columns of many scenarios.
 """
 
 from __future__ import annotations
@@ -19,12 +19,9 @@ import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.schema import Section, Spec, accept, frozen_text, specs
+from sst_ros.scene.schema import Place, Section, Spec, accept, frozen_text, specs
 
 S = TypeVar("S", bound=Section)
-
-Place = tuple[str | int, ...]
-"""Names and indices of a leaf from the root on."""
 
 NO_NUMBER = "must name a number, as star.mass does"
 
@@ -364,11 +361,6 @@ def split(key: str) -> list[tuple[str, int | None]]:
     return found
 
 
-def key_of(place: Place) -> str:
-    """Return a place as a key."""
-    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
-
-
 def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     """Yield the place of each number or column of a tree, and what is there."""
     if isinstance(tree, (float, np.ndarray)):
@@ -441,25 +433,3 @@ def _addressed(
             yield from _addressed(value[i], rest, components, (*here, i))
     else:
         raise ValueError(NO_NUMBER)
-
-
-def numbers(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
-    """Yield each number of a section with the key of its field, and what the field allows."""
-    for name, spec in specs(type(tree)).items():
-        value, here = getattr(tree, name), (*place, name)
-        if isinstance(value, Section):
-            yield from numbers(value, here)
-        elif spec.kind == "sections":
-            for index, entry in enumerate(value):
-                yield from numbers(entry, (*here, index))
-        elif spec.kind == "number" and value is not None:
-            yield from ((key_of(here), float(x), spec) for x in np.ravel(value))
-
-
-def has(cls: type[Section], key: str) -> bool:
-    """Return whether documents of a class may have a key without indices."""
-    name, _, rest = key.partition(".")
-    spec = specs(cls).get(name)
-    if spec is None or not rest:
-        return spec is not None
-    return spec.section is not None and has(spec.section, rest)

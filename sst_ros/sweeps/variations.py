@@ -28,8 +28,8 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
-from sst_ros.scene.schema import Section, Spec, specs
-from sst_ros.scene.yaml_document import NO_NUMBER, addressed, key_of
+from sst_ros.scene.schema import Section, Spec, key_of, specs
+from sst_ros.scene.yaml_document import NO_NUMBER, addressed
 
 KINDS = ("uniform", "normal", "grid", "linspace")
 
