@@ -61,7 +61,7 @@ class Inertia(Section):
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
 
-        def told(allowed: str) -> Problem:
+        def refusal(allowed: str) -> Problem:
             return Problem("", np.linalg.eigvalsh(self.matrix).tolist(), allowed)
 
         tensor = _entries(self)
@@ -69,14 +69,14 @@ class Inertia(Section):
         definite = _is_positive(tensor, -SMALLEST_MOMENT)
         yield (
             ~definite,
-            lambda: told(
+            lambda: refusal(
                 "principal moments of inertia must be > 0 (positive definite), "
                 f"at least {SMALLEST_MOMENT:g} kg m^2"
             ),
         )
         yield (
             definite & ~_is_positive([-part for part in tensor], largest),
-            lambda: told("no principal moment may exceed the sum of the other two"),
+            lambda: refusal("no principal moment may exceed the sum of the other two"),
         )
 
 

@@ -142,7 +142,7 @@ def _declare(spec: Spec, default: Any) -> Any:
 
 
 Rules: TypeAlias = "Iterator[tuple[Any, Callable[[], Problem]]]"
-"""Whether each rule is broken, and the problem that is told where it is."""
+"""Whether each rule is broken, and the problem that is reported where it is."""
 
 
 @dataclass(frozen=True)
