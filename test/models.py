@@ -67,6 +67,13 @@ class Sample:
     def state(self) -> tuple[float, ...]:
         return (*self.quaternion, *self.body_rate)
 
+    def gamma_ddot_of(self, body_acceleration) -> np.ndarray:
+        """Go back from W_dot by the paper: gamma_ddot = J^-1 (omega_dot - its bias)."""
+        at = self.posture
+        omega_dot = self.rotation @ np.array(body_acceleration)
+        bias = virtual_work.bias(at, self.gamma_dot).omega_dot
+        return np.linalg.solve(at.j, omega_dot - bias)
+
 
 def scene_of(v, alpha_deg, star, actuated, intermediate, **rest) -> Scene:
     """Build a scene from plain arrays."""

@@ -33,9 +33,10 @@ def test_it_gives_the_examples_of_the_paper(name):
 
 def test_loads_that_fit_into_the_equations_are_there():
     """Full inertias, payload, rotors, torque limit, constant moment and torques of a function."""
-    values = {"payload.mass": 0.5, "payload.centre": [0.1, 0, 0.2], "actuators.gear_ratio": 9.0,
-              "actuators.rotor_inertia": 1e-4, "actuators.torque_limit": 0.3}  # fmt: skip
-    scene = load_scene("general").with_values(values)
+    payload = {"payload.mass": 0.5, "payload.centre": [0.1, 0, 0.2]}
+    drive = {"gear_ratio": 9.0, "rotor_inertia": 1e-4, "torque_limit": 0.3}
+    drive = {f"actuators.{key}": value for key, value in drive.items()}
+    scene = load_scene("general").with_values(payload | drive)
     for moment in (Moment(value=(0.1, -0.2, 0.3)), Moment(topic=True)):
         one, other = pair(dataclasses.replace(scene, moment=moment), tolerance=1e-12)
         for torque in ((0.1, -0.5, 0.2), lambda t: (t, 0.1, -0.4)):

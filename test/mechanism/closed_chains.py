@@ -4,8 +4,8 @@
 Random manipulators and states; all assemblies as the eight complex zeros of three quadrics.
 """
 
-from dataclasses import dataclass
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, product
+from types import SimpleNamespace
 
 import numpy as np
 from lagrange import exact, solve
@@ -77,28 +77,23 @@ _SECOND = list(combinations_with_replacement(range(4), 2))
 _ROW = {monomial: row for row, monomial in enumerate(_FOURTH)}
 
 
-def _left(u):
-    """Matrix of q -> u q for pure quaternions u, shape (..., 3) -> (..., 4, 4)."""
-    x, y, z = np.moveaxis(u, -1, 0)
-    o = np.zeros_like(x)
-    return np.moveaxis(
-        np.array([[o, -x, -y, -z], [x, o, -z, y], [y, z, o, -x], [z, -y, x, o]]), (0, 1), (-2, -1)
-    )
-
-
-def _right(u):
-    """Matrix of q -> q u."""
-    x, y, z = np.moveaxis(u, -1, 0)
-    o = np.zeros_like(x)
-    return np.moveaxis(
-        np.array([[o, -x, -y, -z], [x, o, z, -y], [y, -z, o, x], [z, y, -x, o]]), (0, 1), (-2, -1)
-    )
+def _patterns():
+    """Symmetric P_ij with R_ij(q) = q . P_ij q for quaternions (w, x, y, z), (3, 3, 4, 4)."""
+    p = np.zeros((3, 3, 4, 4))
+    for i, j in product(range(3), repeat=2):
+        p[i, j, 1 + i, 1 + j] += 1.0
+        p[i, j, 1 + j, 1 + i] += 1.0
+        if i == j:
+            p[i, i] += np.diag([1.0, -1.0, -1.0, -1.0])
+        else:
+            k, sign = 3 - i - j, 1.0 if (j - i) % 3 == 1 else -1.0
+            p[i, j, 0, 1 + k] = p[i, j, 1 + k, 0] = -sign
+    return p
 
 
 def quadrics(r, e):
     """Symmetric Q_k with q . Q_k q = r_k . R(q) e_k; r and e (..., 3, 3) -> (..., 3, 4, 4)."""
-    product = np.swapaxes(_left(r), -1, -2) @ _right(np.broadcast_to(e, r.shape))
-    return 0.5 * (product + np.swapaxes(product, -1, -2))
+    return np.tensordot(r[..., :, None] * np.asarray(e)[..., None, :], _patterns(), 2)
 
 
 def complex_zeros(forms, seed=7):
@@ -198,19 +193,6 @@ def same_rotations(found, expected, tolerance):
     return int(np.sum(apart.min(axis=0) > tolerance)), int(np.sum(apart.min(axis=1) > tolerance))
 
 
-@dataclass(frozen=True)
-class Census:
-    """Figures of a comparison over many configurations."""
-
-    configurations: int
-    roots: int
-    admissible: int
-    missing: int
-    spurious: int
-    in_exact_numbers: int
-    nearest: float
-
-
 def census(solve, geometries, gammas, hardest):
     """Compare `solve(geometry, gammas)` -> (owner, rotations, admissible) with the zeros.
 
@@ -225,13 +207,13 @@ def census(solve, geometries, gammas, hardest):
     imaginary = np.abs(zeros.imag).max(axis=2)
     doubtful = np.where(imaginary > 1e-10, imaginary, np.inf).min(axis=1)
     order = np.argsort(np.minimum(gap, doubtful))
-    exact = set(order[:hardest]) | set(np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0])
+    exact_rows = set(order[:hardest]) | set(np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0])
     roots = admissible = missing = spurious = index = 0
     for geometry, gamma in zip(geometries, gammas, strict=True):
         owner, rotations, valid = solve(geometry, gamma)
         for row in range(len(gamma)):
             mine = owner == row
-            if index in exact:
+            if index in exact_rows:
                 expected = exact_rotations(r[index], e[index], zeros[index])
             else:
                 expected = real_rotations(zeros[index])
@@ -240,7 +222,15 @@ def census(solve, geometries, gammas, hardest):
             assert expected_valid == int(np.sum(valid[mine])), (geometry, gamma[row])
             roots, admissible = roots + len(expected), admissible + expected_valid
             missing, spurious, index = missing + lost, spurious + extra, index + 1
-    return Census(index, roots, admissible, missing, spurious, len(exact), float(gap.min()))
+    return SimpleNamespace(
+        configurations=index,
+        roots=roots,
+        admissible=admissible,
+        missing=missing,
+        spurious=spurious,
+        in_exact_numbers=len(exact_rows),
+        nearest=float(gap.min()),
+    )
 
 
 def _carriages(geometry, gamma):

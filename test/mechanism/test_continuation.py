@@ -29,16 +29,20 @@ def test_a_loop_in_gamma_comes_back_to_the_start():
     assert not branch.rotation.flags.writeable
 
 
-def test_the_edge_of_the_workspace_is_no_obstacle():
-    """Along s crossing P_1's leg, beta_1 goes through 0 and every joint stays smooth."""
+def towards_the_edge(share):
+    """Joint angles and rotations along s crossing the plane of P_1's leg, where beta_1 = 0."""
     home = kinematics.admissible(ISOTROPIC, [np.pi / 4] * 3)
     r1 = kinematics.carriage_directions(ISOTROPIC, [np.pi / 4] * 3)[0]
     axis = np.cross(home.rotation[:, 2], r1)
-    axis /= np.linalg.norm(axis)
-    angles = np.linspace(0, 1.3 * home.beta[0], 200)
-    rotations = np.array([Rotation.from_rotvec(a * axis).as_matrix() for a in angles])
-    rotations = rotations @ home.rotation
+    turns = np.multiply.outer(home.beta[0] * share, axis / np.linalg.norm(axis))
+    rotations = Rotation.from_rotvec(turns).as_matrix() @ home.rotation
     gamma, _, beta = kinematics.inverse(ISOTROPIC, rotations)
+    return gamma, beta, rotations
+
+
+def test_the_edge_of_the_workspace_is_no_obstacle():
+    """beta_1 goes through 0 and every joint stays smooth."""
+    gamma, beta, rotations = towards_the_edge(np.linspace(0.0, 1.3, 200))
     assert beta[0, 0] > 0 > beta[-1, 0]
     branch = continuation.follow(ISOTROPIC, gamma)
     np.testing.assert_allclose(branch.rotation, rotations, atol=1e-13)
@@ -47,14 +51,10 @@ def test_the_edge_of_the_workspace_is_no_obstacle():
 
 
 def test_exactly_on_the_edge():
-    home = kinematics.admissible(ISOTROPIC, [np.pi / 4] * 3)
-    r1 = kinematics.carriage_directions(ISOTROPIC, [np.pi / 4] * 3)[0]
-    axis = np.cross(home.rotation[:, 2], r1)
-    turn = Rotation.from_rotvec(home.beta[0] * axis / np.linalg.norm(axis)).as_matrix()
-    gamma, _, beta = kinematics.inverse(ISOTROPIC, turn @ home.rotation)
-    assert abs(beta[0]) < 1e-15
-    branch = continuation.follow(ISOTROPIC, [[np.pi / 4] * 3, gamma])
-    np.testing.assert_allclose(branch.rotation[1], turn @ home.rotation, atol=1e-14)
+    gamma, beta, rotations = towards_the_edge(np.array([0.0, 1.0]))
+    assert abs(beta[1, 0]) < 1e-15
+    branch = continuation.follow(ISOTROPIC, gamma)
+    np.testing.assert_allclose(branch.rotation[1], rotations[1], atol=1e-14)
 
 
 def test_a_parallel_singularity_ends_the_branch_and_says_so():

@@ -27,13 +27,11 @@ def zyz(theta, phi, psi):
 
 
 def about_z(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return zyz(angle, 0.0, 0.0)
 
 
 def about_y(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    return zyz(0.0, angle, 0.0)
 
 
 @FAST
@@ -111,13 +109,12 @@ def test_angle_between_is_the_angle_of_the_relative_rotation(theta, phi, psi, tu
     assert found == pytest.approx(abs(turn), abs=1e-7)
 
 
-def same(angles, rotations):
-    again = Rotation.from_euler("ZYZ", angles).as_matrix()
-    np.testing.assert_allclose(again, rotations, atol=1e-14)
-
-
 def trajectory(angles):
     return Rotation.from_euler("ZYZ", angles).as_matrix()
+
+
+def same(angles, rotations):
+    np.testing.assert_allclose(trajectory(angles), rotations, atol=1e-14)
 
 
 def test_many_turns_of_every_angle():
@@ -148,9 +145,9 @@ def test_resting_at_the_pole_keeps_theta_and_the_sum(pole):
     given[1:, 2] = [0.9, 1.0, 1.1] if pole == 0.0 else [-0.5, -0.4, -0.3]
     found = unwrap_zyz(given)
     np.testing.assert_allclose(found[1:, 0], 0.7)
-    kept = found[:, 0] + found[:, 2] if pole == 0.0 else found[:, 2] - found[:, 0]
-    np.testing.assert_allclose(kept, given[:, 2] + [0.7, 0, 0, 0] if pole == 0.0
-                               else given[:, 2] - [0.7, 0, 0, 0])  # fmt: skip
+    sign = 1.0 if pole == 0.0 else -1.0
+    kept = found[:, 2] + sign * found[:, 0]
+    np.testing.assert_allclose(kept, given[:, 2] + np.multiply(sign, [0.7, 0, 0, 0]))
     same(found, trajectory(given))
 
 

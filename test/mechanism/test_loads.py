@@ -113,13 +113,6 @@ def laden(sample):
     return replace(loaded(sample, 0.5), payload=None, moment=None, actuators=None, **FREE)
 
 
-def gamma_ddot_of(sample, body_acceleration):
-    """The paper's way back: J^-1 (omega_dot - its bias)."""
-    at = sample.posture
-    bias = virtual_work.bias(at, sample.gamma_dot).omega_dot
-    return np.linalg.solve(at.j, sample.rotation @ np.array(body_acceleration) - bias)
-
-
 @pytest.mark.parametrize("sample", seeded_samples(71, 3), ids=range(3))
 def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
     """Both lose some two digits of 1e-16 to M and J; the loads are of the size of the torques."""
@@ -128,7 +121,7 @@ def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
     loads = truth.loads(sample.gamma, sample.gamma_dot)
     expected = truth.acceleration(sample.gamma, sample.gamma_dot, sample.torque + loads)
     slope = Dynamics.of(scene).derivative(*sample.state, *sample.torque.tolist())
-    found = gamma_ddot_of(sample, slope[4:])
+    found = sample.gamma_ddot_of(slope[4:])
     assert np.abs(loads).max() > 1.0
     assert np.abs(found - expected).max() <= 1e-11 * np.abs(expected).max()
 
@@ -138,7 +131,7 @@ def extra_torque(sample, **terms):
     model = kernel.model_of(replace(sample.scene, **terms))
     rate = kernel.body_acceleration(model, sample.quaternion, sample.body_rate, REST)
     arguments = sample.mechanism, sample.posture, sample.gamma_dot
-    return virtual_work.inverse_dynamics(*arguments, gamma_ddot_of(sample, rate))
+    return virtual_work.inverse_dynamics(*arguments, sample.gamma_ddot_of(rate))
 
 
 @pytest.mark.parametrize("sample", seeded_samples(4, 4))

@@ -146,11 +146,9 @@ def test_the_bar_is_for_terminals_only(terminal, monkeypatch):
     assert ("100 %" in stream.getvalue()) == terminal
 
 
-def test_the_picture(tmp_path, isotropic, folding):
+def test_the_picture_has_three_maps_a_row(isotropic, folding):
     pytest.importorskip("matplotlib")
     from sst_ros.plot.workspace import plot_workspace
 
     figure = plot_workspace(isotropic, folding, titles=["isotropic", "general"])
     assert len(figure.axes) == 12  # six pictures, six colour bars
-    figure.savefig(tmp_path / "workspace.png", dpi=40)
-    assert (tmp_path / "workspace.png").stat().st_size > 10_000

@@ -8,7 +8,7 @@ import re
 from dataclasses import replace
 
 import pytest
-from mechanism.bare_kernel import program_of
+from dynamics.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics, compile_program
