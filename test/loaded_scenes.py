@@ -52,6 +52,12 @@ def viscous(coefficient: float, stiffness: float = 500.0) -> Scene:
     return replace(load("example2_heavy"), friction=friction, springs=tuple(springs))
 
 
+def start_of(scene: Scene, size: int = 7) -> list[float]:
+    """Quaternion and body rate at the start, and zeros for what else the state has."""
+    state = Simulation(scene).state
+    return [*state.quaternion, *state.body_rate, *(0.0,) * (size - 7)]
+
+
 def run(simulation: Simulation, seconds: float, period: float, torque=REST) -> Simulation:
     """Step through a time; `torque` may be three numbers or a function, held over each period."""
     count = round(seconds / period)

@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of method and step: work bounds, switches told, resets and budgets; events in time."""
+"""Choice of method and step: work bounds, switches told, resets and budgets."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from loaded_scenes import IGNORE, REST, run, viscous
-from scipy.integrate import solve_ivp
 
-from sst_ros.dynamics import kernel
-from sst_ros.errors import Diverged, StepBudgetExceeded, StrokeExceeded, WorkspaceLeft
+from sst_ros.errors import Diverged, StepBudgetExceeded, StrokeExceeded
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.scene.scene import Initial, Stroke, Workspace, load
 from sst_ros.simulation.simulation import Simulation
@@ -109,65 +106,6 @@ def test_a_budget_of_evaluations_ends_what_would_not_end():
         simulation.step(REST, 1_000_000_000)
     assert caught.value.state is simulation.state
     assert simulation.state.time_ns == 0
-
-
-def independent(scene, joint, end, span, torque=None):
-    """Time at which a joint's angle reaches `end`: SciPy at its tightest, on the kernel."""
-    model, profile = kernel.model_of(scene), torque or scene.torque.at
-    state = Simulation(scene).state
-
-    def angle(t, y):
-        return [x for triple in kernel.joints(model, tuple(y))[:3] for x in triple][joint] - end
-
-    angle.terminal = True
-    found = solve_ivp(
-        lambda t, y: kernel.derivative(model, tuple(y), profile(t)),
-        (0.0, span),
-        (*state.quaternion, *state.body_rate),
-        method="DOP853",
-        rtol=2.3e-14,
-        atol=1e-15,
-        max_step=0.004,
-        events=angle,
-    )
-    # Newton with the true rate from a step that ends beside the event, past SciPy's dense output.
-    t, y = found.t_events[0][0], found.y_events[0][0]
-    before = int(np.searchsorted(found.t, t)) - 1
-    for _ in range(3):
-        y = solve_ivp(
-            lambda t, y: kernel.derivative(model, tuple(y), profile(t)),
-            (found.t[before], t),
-            found.y[:, before],
-            method="DOP853",
-            rtol=2.3e-14,
-            atol=1e-15,
-        ).y[:, -1]
-        rates = [x for triple in kernel.joints(model, tuple(y))[3:] for x in triple]
-        t -= angle(t, y) / rates[joint]
-    return t
-
-
-def stopped(simulation, torque, error, limit=2000):
-    with pytest.raises(error) as caught:
-        for _ in range(limit):
-            simulation.step(torque, MILLISECOND)
-    return caught.value
-
-
-@pytest.mark.parametrize("method", ["dop853", "auto"])
-def test_the_end_of_a_stroke_is_met_within_a_picosecond(method):
-    scene = load("example2_stroke")
-    error = stopped(Simulation(scene, method, tolerance=1e-14), scene.torque.at, StrokeExceeded)
-    assert abs(error.time - independent(scene, 0, math.pi / 2, 0.95)) < 1e-12
-
-
-def test_the_edge_of_the_workspace_is_met_within_a_picosecond():
-    scene = replace(EXAMPLE2, stroke=Stroke(at_end="ignore"))
-    torque = (5.0, -5.0, 0.0)
-    error = stopped(Simulation(scene, "dop853", tolerance=1e-14), torque, WorkspaceLeft)
-    joint = 5 + int(error.reason.removeprefix("beta_")[0])
-    truth = independent(scene, joint, 0.0, error.time + 0.01, lambda t: torque)
-    assert abs(error.time - truth) < 1e-12
 
 
 def test_a_dip_beyond_an_end_inside_one_period_is_not_missed():

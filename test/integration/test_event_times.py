@@ -40,14 +40,14 @@ RATE = 3.0
 MILLISECOND = 1_000_000
 
 
-def turning(scene, axis):
+def turning(scene, axis, method="dop853"):
     """Simulation whose star turns about a fixed axis in {B} at RATE."""
     start = Simulation(replace(scene, initial=Initial(gamma=GAMMA))).state
     rotation = rotation_matrix(start.quaternion)
     at = virtual_work.posture(Geometry.of(scene), start.joints.gamma, rotation)
     gamma_dot = np.linalg.solve(at.j, RATE * axis)
     moving = Initial(gamma=GAMMA, gamma_dot=tuple(gamma_dot))
-    return Simulation(replace(scene, initial=moving), "dop853", tolerance=1e-13), at
+    return Simulation(replace(scene, initial=moving), method, tolerance=1e-13)
 
 
 def first_root(axis, moving, fixed):
@@ -73,7 +73,7 @@ def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
     axis = np.cross(at.t[leg], at.w[leg])
     size = np.linalg.norm(axis)
     mu = math.atan2(size, at.t[leg] @ at.w[leg])
-    simulation, _ = turning(FREE_STAR, axis / size)
+    simulation = turning(FREE_STAR, axis / size)
     stop = met(simulation, SingularityReached)
     assert stop.reason == f"serial singularity, mu_{leg + 1} = 0"
     assert abs(stop.time - (mu - SINGULAR_MU) / RATE) < 1e-12
@@ -85,19 +85,19 @@ def test_the_edge_of_the_workspace_is_met_when_e_lies_in_the_plane_of_an_arc(leg
     s = at.rotation[:, 2]
     axis = np.cross(s, -at.w[leg])
     axis /= np.linalg.norm(axis)
-    simulation, _ = turning(replace(FREE_STAR, workspace=EXAMPLE2.workspace), axis)
+    simulation = turning(replace(FREE_STAR, workspace=EXAMPLE2.workspace), axis)
     stop = met(simulation, WorkspaceLeft)
     assert stop.reason.startswith(f"beta_{leg + 1}")
     assert abs(stop.time - first_root(axis, s, at.w[leg])) < 1e-12
 
 
-@pytest.mark.parametrize("upper", [False, True])
-def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper):
+@pytest.mark.parametrize(("upper", "method"), [(False, "dop853"), (True, "dop853"), (True, "auto")])
+def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     """gamma_k has a value where t_k is at right angles to r_k there."""
     geometry = Geometry.of(EXAMPLE2)
     at = virtual_work.posture(geometry, *admissible())
     axis = at.rotation[:, 2] * (1.0 if upper else -1.0)
-    simulation, _ = turning(replace(FREE_STAR, stroke=Stroke()), axis)
+    simulation = turning(replace(FREE_STAR, stroke=Stroke()), axis, method)
     stop = met(simulation, StrokeExceeded)
     k = int(stop.reason.removeprefix("gamma_")[0]) - 1
     ends = kinematics.carriage_directions(geometry, geometry.arc if upper else np.zeros(3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runge-Kutta methods against all their order conditions and against the motion of example 2.
+"""Runge-Kutta methods against all their order conditions; their estimates on example 2.
 
 Coefficients are rounded in their last digit and sums of DOP853 pass through numbers up to 1e2, so
 a condition may be missed by some 1e-14; a wrong digit anywhere misses one by far more than 1e-13.
@@ -12,13 +12,12 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
-from integration.explicit_method import ExplicitMethod
-from scipy.integrate import solve_ivp
+from loaded_scenes import start_of
 
 from sst_ros.dynamics import kernel
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, Tableau
+from sst_ros.integration import codegen
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, Tableau
 from sst_ros.scene.scene import load
-from sst_ros.simulation.simulation import Simulation
 
 CONDITION = 1e-13
 EXPLICIT = [method for method in METHODS.values() if isinstance(method, Tableau)]
@@ -115,55 +114,37 @@ TORQUE = SCENE.torque.at
 SPAN = 0.4
 
 
-def rates(t, y):
-    return kernel.derivative(MODEL, tuple(y), TORQUE(t))
+def rates(t, *y):
+    return kernel.derivative(MODEL, y, TORQUE(t))
 
 
-def start():
-    state = Simulation(SCENE).state
-    return (*state.quaternion, *state.body_rate)
+def stepper(tableau, derivative, size=7):
+    """One step by the text that runs: the new state, and its error estimate by number."""
+    names = {"rhs": derivative, "sqrt": math.sqrt}
+    exec(codegen.explicit_step(tableau, size, 0), names)
 
+    def step(t, h, y):
+        found = names["step"](t, h, *y)
+        return found[:size], np.linalg.norm(found[size:])
 
-@pytest.fixture(scope="module")
-def reference():
-    """SciPy at its tightest tolerance, in steps short enough that rounding alone is left."""
-    run = solve_ivp(
-        rates, (0.0, SPAN), start(), method="DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.002
-    )
-    return run.y[:, -1]
-
-
-def run(tableau, steps):
-    method, y, h, estimate = ExplicitMethod(tableau), start(), SPAN / steps, 0.0
-    for k in range(steps):
-        y, error = method.step(rates, k * h, y, h)
-        estimate += error
-    return np.array(y), estimate
-
-
-def slope(coarse, fine, ratio=2.0):
-    return math.log(coarse / fine) / math.log(ratio)
+    return step
 
 
 @pytest.mark.parametrize(
-    ("tableau", "steps"),
-    [(RK4, 128), (DORMAND_PRINCE, 128), (DOP853, 16)],
-    ids=["rk4", "dopri5", "dop853"],
+    ("tableau", "steps"), [(DORMAND_PRINCE, 64), (DOP853, 48)], ids=["dopri5", "dop853"]
 )
-def test_measured_order_of_convergence(tableau, steps, reference):
-    """Steps short enough for the leading term to rule, and errors well above rounding (4e-15)."""
-    coarse, fine = (np.linalg.norm(run(tableau, n)[0] - reference) for n in (steps, 2 * steps))
-    assert fine > 1e-14
-    assert slope(coarse, fine) == pytest.approx(tableau.order, abs=0.1)
+def test_estimates_shrink_by_their_order(tableau, steps):
+    """In the median: where a weight of DOP853's passes zero a step has an estimate of order 6."""
 
+    def median(count):
+        step, y, h, estimates = stepper(tableau, rates), start_of(SCENE), SPAN / count, []
+        for k in range(count):
+            y, estimate = step(k * h, h, y)
+            estimates.append(estimate)
+        return np.median(estimates)
 
-@pytest.mark.parametrize(
-    ("tableau", "steps"), [(DORMAND_PRINCE, 64), (DOP853, 24)], ids=["dopri5", "dop853"]
-)
-def test_summed_estimates_shrink_by_their_order(tableau, steps):
-    """Each is of order h^(p+1); there are 1/h of them."""
-    coarse, fine = (run(tableau, n)[1] for n in (steps, 2 * steps))
-    assert slope(coarse, fine) == pytest.approx(tableau.error_order, abs=0.05)
+    order = math.log2(median(steps) / median(2 * steps))
+    assert order == pytest.approx(tableau.error_order + 1, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -171,42 +152,25 @@ def test_summed_estimates_shrink_by_their_order(tableau, steps):
 )
 def test_estimate_bounds_the_true_error_of_each_step(tableau, steps):
     """Truth: 8 small steps of DOP853, 8^8 times finer than its one and exact to rounding."""
-    method, fine = ExplicitMethod(tableau), ExplicitMethod(DOP853)
-    y, h = start(), SPAN / steps
+    step, fine = stepper(tableau, rates), stepper(DOP853, rates)
+    y, h = start_of(SCENE), SPAN / steps
     for k in range(steps):
-        moved, estimate = method.step(rates, k * h, y, h)
+        moved, estimate = step(k * h, h, y)
         truth = y
         for i in range(8):
-            truth = fine.step(rates, k * h + i * h / 8, truth, h / 8).y
+            truth, _ = fine(k * h + i * h / 8, h / 8, truth)
         error = np.linalg.norm(np.subtract(moved, truth))
         assert 0.0 < error < estimate < 1e-4
         y = moved
-
-
-def test_rk4_has_no_estimate():
-    assert math.isnan(ExplicitMethod(RK4).step(lambda t, y: (y[0],), 0.0, (1.0,), 0.1).error)
 
 
 @every_method
 def test_times_of_the_stages_are_those_of_the_nodes(tableau):
     seen = []
 
-    def derivative(t, y):
+    def derivative(t, *y):
         seen.append(t)
-        return (0.0,)
+        return 0.0, 0.0
 
-    ExplicitMethod(tableau).step(derivative, 2.0, (1.0,), 0.5)
+    assert stepper(tableau, derivative, 2)(2.0, 0.5, (1.0, 2.0)) == ((1.0, 2.0), 0.0)
     np.testing.assert_allclose(seen, 2.0 + 0.5 * np.array(tableau.c), rtol=1e-15)
-
-
-@every_method
-def test_a_polynomial_of_the_order_is_integrated_exactly(tableau):
-    """y' = t^(p-1) is pure quadrature: exact but for a few roundings."""
-    p = tableau.order
-    end = ExplicitMethod(tableau).step(lambda t, y: (t ** (p - 1),), 0.0, (0.0,), 1.0).y[0]
-    assert end == pytest.approx(1.0 / p, abs=1e-14)
-
-
-def test_no_motion_has_no_error():
-    step = ExplicitMethod(DOP853).step(lambda t, y: (0.0, 0.0), 0.0, (1.0, 2.0), 0.1)
-    assert step == ((1.0, 2.0), 0.0)
