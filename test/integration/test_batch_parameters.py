@@ -6,129 +6,23 @@ import dataclasses
 import numpy as np
 import pytest
 from loaded_scenes import IGNORE, REST, loaded
-from models import seeded_samples
 
-from sst_ros import Simulation, load_scene
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compile_program
-from sst_ros.errors import AssemblyError, InputError, RunStopped
+from sst_ros import load_scene
+from sst_ros.dynamics.traced_dynamics import compile_program
+from sst_ros.errors import InputError
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.initial_states import NO_RATE
-from sst_ros.integration.methods import DORMAND_PRINCE, RK4
+from sst_ros.integration.methods import RK4
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Actuators, Initial, Link, Spring
+from sst_ros.scene.scene import Actuators, Link, Spring
 
 pytest.importorskip("numba", reason="a batch needs numba")
 
 EXAMPLE2 = load_scene("example2_heavy")
 HOME = np.pi / 4
-N = batch_source.SIMD_WIDTH + 5
-TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
-
-
-def tensors(name, samples, body):
-    return {
-        f"{name}.inertia.{key}": [getattr(body(one.scene).inertia, key) for one in samples]
-        for key in TENSOR
-    }
-
-
-@pytest.fixture(scope="module")
-def samples():
-    inside = [
-        one
-        for one in seeded_samples(7, 2 * N)
-        if np.all((one.gamma > 0.0) & (one.gamma < one.geometry.arc))
-    ]
-    assert len(inside) > N
-    return inside[:N]
-
-
-@pytest.fixture(scope="module")
-def manipulators(samples):
-    """Random base triangles, stars and inertias: all numbers differ."""
-    parameters = {
-        "base.v": [one.scene.base.v for one in samples],
-        "star.alpha_deg": [one.scene.star.alpha_deg for one in samples],
-        **tensors("star", samples, lambda scene: scene.star),
-    }
-    for links in ("actuated_links", "intermediate_links"):
-        for k in range(3):
-            parameters |= tensors(
-                f"{links}[{k}]", samples, lambda scene, links=links, k=k: getattr(scene, links)[k]
-            )
-    return Batch(samples[0].scene, DORMAND_PRINCE, parameters=parameters)
-
-
-def starts(samples):
-    gamma, gamma_dot, torque = (
-        np.array([getattr(one, name) for one in samples])
-        for name in ("gamma", "gamma_dot", "torque")
-    )
-    return gamma, 0.5 * gamma_dot, 0.1 * torque
-
-
-@pytest.fixture(scope="module")
-def result(manipulators, samples):
-    return manipulators.run(*starts(samples), step=2e-3, count=100, threads=3)
-
-
-def test_a_row_is_the_scene_with_these_numbers(manipulators, samples):
-    assert [manipulators.scenario(n) for n in range(N)] == [one.scene for one in samples]
-
-
-def alone(scene, gamma, gamma_dot, torque):
-    """A run by variable steps of a simulation of its own."""
-    scene = dataclasses.replace(scene, initial=Initial(gamma=gamma, gamma_dot=gamma_dot))
-    try:
-        simulation = Simulation(scene, "dop853")
-    except AssemblyError:
-        return None, "no unique admissible assembly", 0.0
-    try:
-        simulation.step(tuple(torque), 200_000_000)
-    except RunStopped as stopped:
-        return None, stopped.reason, stopped.time
-    return simulation.state, "", None
-
-
-def test_a_row_goes_as_a_simulation_of_its_scene(result, samples):
-    for n, at in list(enumerate(zip(*starts(samples), strict=True)))[::2]:
-        state, reason, time = alone(samples[n].scene, *at)
-        assert result.message[n] == (reason or "reached the end")
-        if state is None:
-            assert abs(result.fault_time[n] - time) < 1e-8
-        else:
-            sign = np.sign(result.quaternion[n] @ state.quaternion)
-            np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=1e-9)
-            np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=1e-8)
-
-
-def test_faults_stay_with_their_row_and_tell_its_own_end(result):
-    """What is told is what the row's own simulation says, see above; here: of different ends."""
-    told = [result.message[n] for n in np.flatnonzero(~result.success)]
-    assert 0 < len(told) < N
-    assert len({text for text in told if ">" in text}) > 1
-    assert np.all(np.isfinite(result.quaternion))
-
-
-def test_a_row_has_the_bits_of_steps_of_its_scene(manipulators, samples, result):
-    gamma, gamma_dot, torque = starts(samples)
-    y, _ = manipulators.start(gamma, gamma_dot)
-    for n in np.flatnonzero(result.success)[:4].tolist():
-        system = ODE(Dynamics.of(manipulators.scenario(n)))
-        machine = CompiledMethod(system, DORMAND_PRINCE, compiled=False)
-        ended = machine.step_fixed(0.0, 2e-3, 100, y[:, n].tolist(), torque[n].tolist())
-        assert ended == [*result.quaternion[n], *result.body_rate[n]]
-
-
-def test_threads_change_no_bit(manipulators, samples, result):
-    again = manipulators.run(*starts(samples), step=2e-3, count=100, threads=1)
-    assert np.array_equal(again.quaternion, result.quaternion)
-    assert np.array_equal(again.body_rate, result.body_rate)
-    assert again.message == result.message
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loaded_scenes import IGNORE, loaded, viscous
+from loaded_scenes import IGNORE, loaded, start_of, viscous
 from models import seeded_samples
 
 from sst_ros.dynamics.expression import trace, with_jacobian
@@ -19,16 +19,10 @@ from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
 from sst_ros.scene.scene import load
-from sst_ros.simulation.simulation import Simulation
 
 DRIVE = (3.0, -2.0, 1.0)
 MOMENT = (0.1, 0.2, 0.3)
 EXAMPLE2 = load("example2_heavy")
-
-
-def start(scene, size):
-    state = Simulation(scene).state
-    return [*state.quaternion, *state.body_rate, *(0.0,) * (size - 7)]
 
 
 def system_of(scene, torque=None, work=False):
@@ -38,7 +32,7 @@ def system_of(scene, torque=None, work=False):
 def both(scene, method):
     """Two pairs, then a march through contact and sliding, in plain Python and under numba."""
     system = system_of(scene, work=True)
-    y, drive = start(scene, len(system.state)), (*DRIVE, *MOMENT)[: len(system.drive)]
+    y, drive = start_of(scene, len(system.state)), (*DRIVE, *MOMENT)[: len(system.drive)]
     results = []
     for by_numba in (False, True):
         machine = CompiledMethod(system, method, compiled=by_numba)
@@ -50,13 +44,6 @@ def both(scene, method):
 
 
 needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
-
-
-@needs_numba
-def test_numba_gives_the_bits_of_plain_python():
-    plain, fast = both(loaded(), DORMAND_PRINCE)
-    assert plain == fast
-    assert max(map(abs, plain[2])) > 0.1
 
 
 class Top(ODE):
@@ -110,7 +97,7 @@ ORDERS = [
 def truth_of(scene, span, torque):
     """DOP853 in steps that err below rounding, for two lengths of them agree."""
     system = system_of(scene, torque)
-    y, drive = start(scene, 7), () if torque else (1000.0, -500.0, 700.0)
+    y, drive = start_of(scene), () if torque else (1000.0, -500.0, 700.0)
     machine = CompiledMethod(system, DOP853, compiled=False)
     few, many = (machine.step_fixed(0.0, span / n, n, y, drive) for n in (100, 200))
     assert math.dist(few[:4], many[:4]) < 2e-14
@@ -153,7 +140,7 @@ def test_jacobians_are_exact(what, seed):
     (sample,) = seeded_samples(seed + 80, 1)
     scene = loaded() if what == "loaded" else sample.scene
     dynamics = Dynamics.of(scene)
-    y = [*start(scene, 7)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
+    y = [*start_of(scene)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
     y = [x + 0.003 * (seed + 1) * (-1) ** i for i, x in enumerate(y)]
     slope, by_time, matrix = linearised(scene, None, 0.0, [*y, 0.0], (*DRIVE, *MOMENT))
     moment = MOMENT if dynamics.has_moment_topic else None
@@ -175,7 +162,7 @@ def test_jacobians_are_exact(what, seed):
 def test_the_derivative_by_time_is_exact():
     """With M_dot = 0 it is M^-1 J^T tau_dot: linear in tau, so two exact torques give it."""
     t, torque = 0.13, EXAMPLE2.torque
-    y = [*start(EXAMPLE2, 7)[:4], 0.3, -0.2, 0.4, 0.0]
+    y = [*start_of(EXAMPLE2)[:4], 0.3, -0.2, 0.4, 0.0]
     slope, by_time, _ = linearised(EXAMPLE2, torque, t, y, ())
     rows = list(zip(torque.amplitude, torque.frequency, torque.phase, strict=True))
     model = Dynamics.of(EXAMPLE2).model
@@ -189,7 +176,7 @@ def test_the_derivative_by_time_is_exact():
 
 def test_a_step_without_a_finite_result_has_an_infinite_error():
     machine = CompiledMethod(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
-    y = start(EXAMPLE2, 7)
+    y = start_of(EXAMPLE2)
     assert machine.step_pair(0.0, 1e-3, y, y, (1e308, 1e308, 0.0))[2] == math.inf
 
 

@@ -8,7 +8,7 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from loaded_scenes import loaded
+from loaded_scenes import loaded, start_of
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
@@ -17,11 +17,9 @@ from sst_ros.errors import InputError
 from sst_ros.integration.gauss import Collocation, tables
 from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
-from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")
-START = Simulation(EXAMPLE2).state
-STATE = [*START.quaternion, *START.body_rate]
+STATE = start_of(EXAMPLE2)
 
 
 @pytest.mark.parametrize("nodes", [2, 4, 8])
@@ -139,8 +137,7 @@ def test_every_term_lag_and_a_drive_are_carried_along():
 
     scene = loaded()
     system = ODE(Dynamics.of(scene), work=True)
-    state = Simulation(scene).state
-    y = [*state.quaternion, *state.body_rate, *(0.0,) * (len(system.state) - 7)]
+    y = start_of(scene, len(system.state))
     drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]
     wanted = CompiledMethod(system, DOP853, compiled=False).step_fixed(0.0, 2.5e-4, 80, y, drive)
     method = Collocation(system, compiled=False)
