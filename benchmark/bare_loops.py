@@ -15,14 +15,13 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
-import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import mean, median
@@ -30,12 +29,12 @@ from typing import Any
 
 import rclpy
 
-from benchmark.measure import format_markdown
-from benchmark.nodes import Process, Watch, start_simulator, wait_for
+from benchmark.nodes import Client, Process, start_simulator, wait_for
 from sst_ros.host import scheduling
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
 from sst_ros.nodes.topics import Reader
+from sst_ros.report.results import markdown, table
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
@@ -179,21 +178,11 @@ def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
         counts[2] = max(counts[2], pacer.late_ns)
 
 
-@contextmanager
-def record() -> Iterator[None]:
-    """Record whatever is published, into a folder that is deleted."""
-    folder = Path(tempfile.mkdtemp())
-    process = Process("recorder", output=folder / "bag")
-    try:
-        yield
-    finally:
-        process.end()
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> dict[str, float]:
+def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> dict[str, float]:
     """Measure a loop, or the node, in a process of its own, with this cpu_dma_latency."""
-    with record():
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        stack.callback(Process("recorder", output=folder / "bag").end)
         if name != NODE:
             command = [sys.executable, "-m", "benchmark.bare_loops", "--loop", name]
             command += ["--seconds", str(seconds), "--cpu-dma-latency", str(latency_us)]
@@ -203,7 +192,7 @@ def measure(watch: Watch, name: str, seconds: float, latency_us: int = -1) -> di
         watch.values.clear()
         simulator = start_simulator(scene="swing", compiled=True, cpu_dma_latency=latency_us)
         try:
-            watch.wait_for(lambda: watch.phase(full) == "running", "run")
+            watch.wait_for_runs(full)
             watch.spin(2.5)
             before, used, began = watch.values[full], simulator.processor_s(), time.monotonic()
             watch.spin(seconds)
@@ -222,7 +211,7 @@ def explain_refusal(latency_us: int) -> str | None:
     return said if scheduling.NO_LIMIT in said else None
 
 
-def compare(watch: Watch, seconds: float, rounds: int) -> str:
+def compare(watch: Client, seconds: float, rounds: int) -> str:
     """Measure all in turn; Markdown, a row for each, a table for each cpu_dma_latency."""
     settings = {-1: "no limit of the exit latency, the default"}
     if (said := explain_refusal(0)) is None:
@@ -236,15 +225,20 @@ def compare(watch: Watch, seconds: float, rounds: int) -> str:
     tables = []
     for latency_us, title in settings.items():
         least = [run["processor"] for run in found[latency_us, LEAST]]
-        rows = [[title, "processor [% of a core]", "of each run", "times the least", "missed [%]"]]
+        rows = []
         for name in (NODE, *LOOPS):
             runs = found[latency_us, name]
             used = [run["processor"] for run in runs]
-            each = ", ".join(f"{one:.1f}" for one in used)
             ratio = median(a / b for a, b in zip(used, least, strict=True))
-            missed = mean(run["missed"] for run in runs)
-            rows.append([name, f"{median(used):.1f}", each, f"{ratio:.2f}", f"{missed:.3f}"])
-        tables.append(format_markdown(rows))
+            row = {
+                title: name,
+                "processor [% of a core]": f"{median(used):.1f}",
+                "of each run": ", ".join(f"{one:.1f}" for one in used),
+                "times the least": f"{ratio:.2f}",
+                "missed [%]": f"{mean(run['missed'] for run in runs):.3f}",
+            }
+            rows.append(row)
+        tables.append(markdown(table(rows)))
     if said is not None:
         tables.append(f"With `cpu_dma_latency` 0: {said}.")
     return "\n\n".join(tables)
@@ -262,7 +256,7 @@ def main() -> None:
     if options.loop:
         print(json.dumps(run_loop(options.loop, options.seconds, options.cpu_dma_latency)))
         return
-    with Watch.start() as watch:
+    with Client.start() as watch:
         print(compare(watch, options.seconds, options.rounds))
 
 

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,15 @@ _TICK = os.sysconf("SC_CLK_TCK")
 def own_domain(*, compiled: bool = True) -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on localhost."""
     before = os.environ.pop("SST_ROS_NUMBA", None)
-    with child_process.own_domain() as number:
-        if not compiled:
-            os.environ["SST_ROS_NUMBA"] = "0"
-        try:
+    if not compiled:
+        os.environ["SST_ROS_NUMBA"] = "0"
+    try:
+        with child_process.own_domain() as number:
             yield number
-        finally:
-            os.environ.pop("SST_ROS_NUMBA", None)
-            if before is not None:
-                os.environ["SST_ROS_NUMBA"] = before
+    finally:
+        os.environ.pop("SST_ROS_NUMBA", None)
+        if before is not None:
+            os.environ["SST_ROS_NUMBA"] = before
 
 
 class Process(subprocess.Popen[str]):
@@ -117,23 +118,29 @@ def wait_for(condition: Callable[[], object], what: str, timeout: float = 120.0)
         time.sleep(0.1)
 
 
-class Watch:
-    """Receives the diagnostics of every simulator.
+class Client:
+    """A node of this process that publishes, calls and receives the diagnostics of simulators.
 
     Attributes:
-        values: of the last message, by full name of the node.
+        node: the node, in a context of its own.
+        values: of the last diagnostics, by full name of the simulator.
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, number: int) -> None:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import QoSProfile
 
-        self.node = rclpy.create_node("benchmark")
+        # Replies to all clients of a service arrive at each: ten, the default, displace its own.
+        self.qos = QoSProfile(depth=1000)
         self.values: dict[str, dict[str, str]] = {}
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
+        self._rclpy, self._context = rclpy, rclpy.Context()
+        rclpy.init(context=self._context, domain_id=number)
+        self.node = rclpy.create_node("benchmark", context=self._context)
+        self.executor = SingleThreadedExecutor(context=self._context)
+        self.executor.add_node(self.node)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive, 100)
 
     def _receive(self, message: Any) -> None:
@@ -142,33 +149,52 @@ class Watch:
 
     @classmethod
     @contextmanager
-    def start(cls) -> Iterator[Watch]:
-        """Watch a domain that nothing else on this machine uses."""
-        import rclpy
+    def start(cls) -> Iterator[Client]:
+        """Give a client in a domain that nothing else on this machine uses."""
+        with own_domain() as number, closing(cls(number)) as client:
+            yield client
 
-        with own_domain():
-            rclpy.init()
-            watch = cls()
-            try:
-                yield watch
-            finally:
-                watch.node.destroy_node()
-                rclpy.try_shutdown()
+    def close(self) -> None:
+        """Leave the graph."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self._rclpy.try_shutdown(context=self._context)
 
     def spin(self, seconds: float) -> None:
         """Receive for so long."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
+        self.until(lambda: False, seconds)
 
-    def wait_for(self, condition: Any, what: str, timeout: float = 120.0) -> None:
-        """Receive until a condition holds."""
-        end = time.monotonic() + timeout
+    def until(self, condition: Callable[[], Any], timeout: float = 20.0) -> bool:
+        """Receive until a condition holds; False after the time-out."""
+        deadline = time.monotonic() + timeout
         while not condition():
-            if time.monotonic() > end:
-                raise SystemExit(f"no {what} within {timeout:g} s")
-            self._executor.spin_once(timeout_sec=0.1)
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self.executor.spin_once(timeout_sec=min(left, 0.02))
+        return True
 
-    def phase(self, name: str) -> str:
-        """Phase that a simulator last said, empty before."""
-        return self.values.get(name, {}).get("phase", "")
+    def wait_for(self, condition: Callable[[], Any], what: str, timeout: float = 120.0) -> None:
+        """Receive until a condition holds."""
+        if not self.until(condition, timeout):
+            raise SystemExit(f"no {what} within {timeout:g} s")
+
+    def wait_for_runs(self, *names: str) -> None:
+        """Wait until simulators, by their full names, say that they run."""
+
+        def are_running() -> bool:
+            return all(self.values.get(name, {}).get("phase") == "running" for name in names)
+
+        self.wait_for(are_running, f"run of {', '.join(names)}", 240.0)
+
+    def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> tuple[Any, float]:
+        """Call a service; return the reply, or None, and how long it took [s]."""
+        client: Any = self.node.create_client(kind, name, qos_profile=self.qos)
+        try:
+            if not self.until(client.service_is_ready):
+                return None, math.inf
+            future, began = client.call_async(kind.Request(**fields)), time.monotonic()
+            done = self.until(future.done, timeout)
+            return (future.result() if done else None), time.monotonic() - began
+        finally:
+            self.node.destroy_client(client)

@@ -39,7 +39,7 @@ from benchmark.measure import (
     format_columns,
     join_line,
 )
-from benchmark.nodes import Process, Watch, start_simulator
+from benchmark.nodes import Client, Process, start_simulator
 from sst_ros.nodes.topics import NeverSpun
 
 TITLES = {
@@ -58,7 +58,7 @@ Figures = dict[str, str]
 
 
 @contextmanager
-def command(watch: Watch, topic: str, readers: int) -> Iterator[None]:
+def command(watch: Client, topic: str, readers: int) -> Iterator[None]:
     """Publish zero torques at 100 Hz to a simulator, and perhaps a recorder."""
     commands = watch.node.create_publisher(Float64MultiArray, topic, 10)
     watch.wait_for(lambda: commands.get_subscription_count() >= readers, f"readers of {topic}")
@@ -78,7 +78,7 @@ def command(watch: Watch, topic: str, readers: int) -> Iterator[None]:
         watch.node.destroy_publisher(commands)
 
 
-def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
+def keep_time(watch: Client, minutes: float, given: dict[str, Any]) -> Figures:
     """1 kHz with the recorder attached."""
     name, folder = "/sst_simulator", Path(tempfile.mkdtemp())
     watch.values.clear()
@@ -97,7 +97,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
             counts.append((int(said["ticks"]), int(said["ticks_missed"]), *loop.counts))
 
         with command(watch, f"{name}/commands", readers=2):
-            watch.wait_for(lambda: watch.phase(name) == "running", "run")
+            watch.wait_for_runs(name)
             with Beside(int(given["realtime_priority"])) as loop:
                 watch.spin(3.0)  # until all have begun
                 count()
@@ -129,7 +129,7 @@ def keep_time(watch: Watch, minutes: float, given: dict[str, Any]) -> Figures:
 
 
 def free_run(
-    watch: Watch, seconds: float, publish_rate: int, given: dict[str, Any], *, read: bool
+    watch: Client, seconds: float, publish_rate: int, given: dict[str, Any], *, read: bool
 ) -> Figures:
     """As fast as possible, without a recorder, and without or with a reader of joint_states."""
     name = "/sst_simulator"
@@ -140,7 +140,7 @@ def free_run(
     )
     simulator = start_simulator(real_time_factor=0.0, publish_rate=publish_rate, **given)
     try:
-        watch.wait_for(lambda: watch.phase(name) == "running", "run")
+        watch.wait_for_runs(name)
         watch.spin(seconds)
         said = watch.values[name]
         return {
@@ -155,7 +155,7 @@ def free_run(
         watch.spin(1.5)  # its last diagnostics are not those of the next run
 
 
-def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str, Any]) -> Figures:
+def fleet(watch: Client, number: int, rate: int, seconds: float, given: dict[str, Any]) -> Figures:
     """Namespaced simulators side by side, each publishing at its rate."""
     names = [f"/sst_{k}/sst_simulator" for k in range(number)]
     watch.values.clear()
@@ -164,9 +164,7 @@ def fleet(watch: Watch, number: int, rate: int, seconds: float, given: dict[str,
         for name in names
     ]
     try:
-        watch.wait_for(
-            lambda: all(watch.phase(name) == "running" for name in names), "fleet", 240.0
-        )
+        watch.wait_for_runs(*names)
         watch.spin(5.0)  # until all have found each other
         before, used = dict(watch.values), sum(node.processor_s() for node in nodes)
         watch.spin(seconds)
@@ -251,7 +249,7 @@ def main() -> None:
     if not options.plain:
         made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
-    with Watch.start() as watch:
+    with Client.start() as watch:
         parts = dict(_measure(watch, options, given))
     if options.write:
         none = dict.fromkeys(TITLES, "not measured")
@@ -259,7 +257,7 @@ def main() -> None:
 
 
 def _measure(
-    watch: Watch, options: argparse.Namespace, given: dict[str, Any]
+    watch: Client, options: argparse.Namespace, given: dict[str, Any]
 ) -> Iterator[tuple[str, str]]:
     """Yield the parts of the page by name, and print each."""
 

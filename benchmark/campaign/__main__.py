@@ -54,7 +54,7 @@ def main() -> int:
     found: dict[str, Ledger] = {}
     with ThreadPoolExecutor(options.processes) as pool:
         # The longest first: `bits` compiles 200 scenes, then the nodes.
-        long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part] != "nodes"))
+        long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part][0] != "nodes"))
         waiting = {
             pool.submit(run_apart, part, options.share, options.seed): part for part in long_first
         }

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+import math
 import os
-import random
 import subprocess
 import sys
 import tempfile
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmark.campaign.ledger import Budget, Ledger
+from benchmark.campaign.ledger import Ledger
 from benchmark.nodes import own_domain
 
 COMMAND_BOUND_S = 30.0
@@ -52,7 +52,7 @@ def sst_ros(
         ledger.tried -= 1
         ledger.notes.append(f"not started: {name!r}: {error}")
         return None
-    ledger.longest_s = max(ledger.longest_s, time.perf_counter() - began)
+    ledger.time(time.perf_counter() - began, math.inf, name)
     if "Traceback (most recent call last)" in done.stderr:
         ledger.found("tracebacks", f"{name}: {done.stderr.strip().splitlines()[-1]}")
     elif fails is not None and fails == (done.returncode == 0):
@@ -108,30 +108,27 @@ WRONG += [
 ]
 
 
-def command_lines(budget: Budget, seed: int) -> Ledger:
+def command_lines(ledger: Ledger) -> None:
     """Give wrong words to every verb: one line and a status other than 0, or usage."""
-    ledger, rng = budget.ledger("command lines"), random.Random(seed)
+    rng = ledger.rng
     with own_domain(compiled=False), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
         (folder / "empty.yaml").write_text("")
         (folder / "binary.yaml").write_bytes(os.urandom(300))
-        wrong = list(WRONG)
-        count = budget.cases(150, least=8)
-        for words in wrong if budget.share >= 1 else rng.sample(wrong, min(len(wrong), len(count))):
+        count = len(ledger.numbers(150, least=8))
+        for words in WRONG if ledger.share >= 1 else rng.sample(WRONG, min(len(WRONG), count)):
             sst_ros(ledger, words, folder=folder, fails=True)
         words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]
         words_of += ["--out", "--force", "--scene", "\x1b[31m", "a" * 300, "../..", "~", "'"]
-        for _ in range(len(count) - ledger.tried):
+        for _ in range(count - ledger.tried):
             verb = rng.choice(VERBS)
             words = [verb, "--nosuchoption", *rng.choices(words_of, k=rng.randint(0, 3))]
             sst_ros(ledger, words, folder=folder, fails=True)
-    return ledger
 
 
-def surroundings(budget: Budget, seed: int) -> Ledger:
+def surroundings(ledger: Ledger) -> None:
     """Run commands without a home, with a full disk, in plain ASCII, as another user."""
-    ledger = budget.ledger("surroundings: home, disk, locale, user")
     nobody = 65534 if os.geteuid() == 0 else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -152,8 +149,8 @@ def surroundings(budget: Budget, seed: int) -> Ledger:
             "no columns": ("scene list", {"COLUMNS": "0", "TERM": "dumb"}, None),
         }
         labels = [*cases]
-        random.Random(seed).shuffle(labels)
-        for label in labels[: len(budget.cases(len(cases), least=4))]:
+        ledger.rng.shuffle(labels)
+        for label in labels[: len(ledger.numbers(len(cases), least=4))]:
             words, env, user = cases[label]
             before = len(ledger.notes)
             sst_ros(ledger, words.split(), folder=folder, env=env, user=user, bound=60.0)
@@ -167,4 +164,3 @@ def surroundings(budget: Budget, seed: int) -> Ledger:
             if "Traceback" in done.stderr:
                 note = f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
                 ledger.found("tracebacks", note)
-    return ledger

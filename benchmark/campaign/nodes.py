@@ -7,25 +7,24 @@ import math
 import os
 import random
 import signal
+import subprocess
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmark.campaign.ledger import Budget, Ledger
-from benchmark.campaign.processes import (
-    FAULT_S,
-    NODE,
-    REPLY_S,
-    Client,
-    is_alive,
-    running,
-    start,
-    stop,
-)
+from benchmark.campaign.ledger import Ledger
 from benchmark.campaign.scenes import needle
-from benchmark.nodes import own_domain
+from benchmark.nodes import Client, Process, own_domain
+
+FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
+"""Within this time a step that does not end is a fault, a node answers a service, and it ends."""
+
+NODE = "/sst_simulator"
 
 ENDLESS = """
 from sst_ros.simulation.simulation import Simulation
@@ -39,13 +38,62 @@ Simulation.advance = endless
 """All steps but the first never end."""
 
 
-def messages(budget: Budget, seed: int) -> Ledger:
+def start(command: str, patch: str = "", **given: Any) -> Process:
+    """Start a plain node, with parameters; `patch` is code that it runs first."""
+    program = f"{patch}\nimport sys\nfrom sst_ros.__main__ import main\n"
+    program += f"sys.exit(main([{command!r}, *sys.argv[1:]]))"
+    return Process(
+        program if patch else command, python=bool(patch), stderr=subprocess.STDOUT, **given
+    )
+
+
+@contextmanager
+def running(patch: str = "", **given: object) -> Iterator[tuple[Process, Client]]:
+    """Give a running simulator and a client of it."""
+    with own_domain(compiled=False) as number:
+        process = start("simulator", patch, **{"scene": "swing", "duration": 0.0, **given})
+        client = Client(number)
+        try:
+            yield process, client
+        finally:
+            client.close()
+            process.end(signal.SIGKILL, 20.0)
+
+
+def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bool:
+    """Count a node that has died or does not answer."""
+    from std_srvs.srv import SetBool
+
+    if process.poll() is not None:
+        said = process.end(0, 20.0)[1][-300:]
+        ledger.found("tracebacks", f"the node ended after {after}: {said}")
+        return False
+    reply, took = client.call(SetBool, f"{NODE}/pause", data=False)
+    if reply is None:
+        ledger.found("lost", f"no reply after {after}")
+    else:
+        ledger.time(took, REPLY_S, f"a reply after {after}")
+    return True
+
+
+def stop(ledger: Ledger, process: Process, number: int = signal.SIGINT) -> None:
+    began = time.monotonic()
+    status, text = process.end(number, 20.0)
+    if time.monotonic() - began > CLOSE_S * ledger.patience:
+        ledger.found("hangs", f"it took {time.monotonic() - began:.1f} s to close")
+    if status not in (0, 1):
+        ledger.found("tracebacks", f"exit status {status}")
+    if "Traceback" in text:
+        ledger.found("tracebacks", text[-300:])
+
+
+def messages(ledger: Ledger) -> None:
     """Send commands of every wrong kind: no state that is published is ever not finite."""
     from geometry_msgs.msg import WrenchStamped
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
-    ledger, rng = budget.ledger("hostile messages"), random.Random(seed)
+    rng = ledger.rng
     odd = (0.0, -0.0, 1e308, -1e308, 5e-324, math.nan, math.inf, -math.inf, 1.0, 1e9)
     names = ["gamma_1", "gamma_2", "gamma_3", "", "mu_1", "x" * 1000, "é"]
     with running(command_timeout=0.0) as (process, client):
@@ -60,8 +108,7 @@ def messages(budget: Budget, seed: int) -> Ledger:
 
         client.node.create_subscription(JointState, "/joint_states", check, 10)
         client.until(lambda: plain.get_subscription_count() and stamped.get_subscription_count())
-        for number in budget.cases(1200, least=60):
-            ledger.tried += 1
+        for number in ledger.cases(1200, least=60):
             kind = rng.randrange(3)
             data = [rng.choice(odd) for _ in range(rng.choice((0, 1, 3, 3, 3, 9, 2000)))]
             if kind == 0:
@@ -77,19 +124,18 @@ def messages(budget: Budget, seed: int) -> Ledger:
                 wrench.publish(message)
             client.executor.spin_once(timeout_sec=0.0)
             if number % 200 == 0 and not is_alive(ledger, process, client, f"message {number}"):
-                return ledger
+                return
         is_alive(ledger, process, client, "all messages")
         if bad:
             ledger.found("silent", f"a state is not finite: {bad[0]}", len(bad))
         stop(ledger, process)
-    return ledger
 
 
-def floods(budget: Budget, seed: int) -> Ledger:
+def floods(ledger: Ledger) -> None:
     """Publish as fast as three threads can, for seconds: the node keeps answering."""
     from std_msgs.msg import Float64MultiArray
 
-    ledger, sent = budget.ledger("messages of three floods"), [0, 0, 0]
+    sent = [0, 0, 0]
     with running() as (process, client):
         enough = threading.Event()
         publishers = [
@@ -104,34 +150,28 @@ def floods(budget: Budget, seed: int) -> Ledger:
                 publishers[index].publish(message)
                 sent[index] += 1
 
-        threads = [threading.Thread(target=flood, args=(index,)) for index in range(3)]
-        for thread in threads:
-            thread.start()
-        end = time.monotonic() + max(1.0, 20.0 * budget.share)
-        while time.monotonic() < end:
-            if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
-                break
-        enough.set()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(3) as pool:
+            pool.map(flood, range(3))
+            end = time.monotonic() + max(1.0, 20.0 * ledger.share)
+            while time.monotonic() < end:
+                if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
+                    break
+            enough.set()
         ledger.tried = sum(sent)
         stop(ledger, process, signal.SIGTERM)
-    del seed
-    return ledger
 
 
-def services(budget: Budget, seed: int) -> Ledger:
+def services(ledger: Ledger) -> None:
     """Call services from four clients at once, in any order: every call is answered."""
     from std_srvs.srv import SetBool, Trigger
 
-    ledger = budget.ledger("service calls of four clients")
     lock = threading.Lock()
     with running() as (process, client):
         is_alive(ledger, process, client, "the start")
         number = int(os.environ["ROS_DOMAIN_ID"])
 
         def work(index: int) -> None:
-            rng, caller = random.Random(seed + index), Client(number)
+            rng, caller = random.Random(ledger.seed + index), Client(number)
             kinds: list[tuple[Any, str, dict[str, bool]]]
             kinds = [(SetBool, "pause", {"data": data}) for data in (True, False)]
             kinds += [(Trigger, "step", {}), (Trigger, "reset", {})]
@@ -141,7 +181,7 @@ def services(budget: Budget, seed: int) -> Ledger:
                 clients[name] = caller.node.create_client(kind, service, qos_profile=caller.qos)
             for one in clients.values():
                 caller.until(one.service_is_ready)
-            for _ in budget.cases(1000, least=15):
+            for _ in ledger.numbers(1000, least=15):
                 kind, name, fields = rng.choice(kinds)
                 began = time.monotonic()
                 future = clients[name].call_async(kind.Request(**fields))
@@ -149,58 +189,49 @@ def services(budget: Budget, seed: int) -> Ledger:
                 took = time.monotonic() - began
                 with lock:
                     ledger.tried += 1
-                    ledger.longest_s = max(ledger.longest_s, took)
+                    ledger.time(took, REPLY_S, name)
                     if not done:
                         ledger.found("lost", f"no reply of {name} within 10 s")
-                    elif took > REPLY_S * ledger.patience:
-                        ledger.found("hangs", f"{name} took {took:.2f} s")
             caller.close()
 
-        threads = [threading.Thread(target=work, args=(index,)) for index in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(work, range(4)))
         stop(ledger, process)
-    return ledger
 
 
-def parameters(budget: Budget, seed: int) -> Ledger:
+def parameters(ledger: Ledger) -> None:
     """Set parameters of a running simulator to hostile values: refused, or taken; never a fall."""
     from rcl_interfaces.srv import ListParameters, SetParameters
     from rclpy.parameter import Parameter
 
-    ledger, rng = budget.ledger("parameters set at run time"), random.Random(seed)
+    rng = ledger.rng
     values: list[Any] = [True, 0, -1, 2**62, 0.0, -0.0, 5e-324, 1e308, math.nan, math.inf]
     values += ["", "x", [1.0], ["a"], []]
     with running() as (process, client):
         reply, _ = client.call(ListParameters, f"{NODE}/list_parameters")
         if reply is None:
             ledger.found("lost", "no list of parameters")
-            return ledger
-        for number in budget.cases(300, least=20):
-            ledger.tried += 1
+            return
+        for number in ledger.cases(300, least=20):
             name, value = rng.choice(list(reply.result.names)), rng.choice(values)
             try:
                 message = Parameter(name, value=value).to_parameter_msg()
             except (TypeError, AssertionError, OverflowError):
                 continue
             done, took = client.call(SetParameters, f"{NODE}/set_parameters", parameters=[message])
+            ledger.time(took, math.inf, name)
             if done is None:
                 ledger.found("lost", f"no reply to {name} = {value}")
-            ledger.longest_s = max(ledger.longest_s, took if math.isfinite(took) else 0.0)
             if number % 50 == 0 and not is_alive(ledger, process, client, f"{name} = {value}"):
-                return ledger
+                return
         is_alive(ledger, process, client, "all parameters")
         stop(ledger, process)
-    return ledger
 
 
-def node_kills(budget: Budget, seed: int) -> Ledger:
+def node_kills(ledger: Ledger) -> None:
     """Kill the player and the controller beside a simulator: it goes on and ends when asked."""
-    ledger, rng = budget.ledger("players and controllers killed with -9"), random.Random(seed)
-    for number in budget.cases(66, least=1):
-        ledger.tried += 1
+    rng = ledger.rng
+    for number in ledger.cases(66, least=1):
         with running(wait_for_command=True) as (process, client), TemporaryDirectory() as folder:
             table = Path(folder) / "torques.csv"
             table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
@@ -213,14 +244,12 @@ def node_kills(budget: Budget, seed: int) -> Ledger:
             other.communicate()
             is_alive(ledger, process, client, f"the kill of {kind}")
             stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
-    return ledger
 
 
-def stuck(budget: Budget, seed: int) -> Ledger:
+def stuck(ledger: Ledger) -> None:
     """Run a step that does not end, or only by its budget: a fault, and the node still answers."""
-    ledger, rng = budget.ledger("steps that do not end"), random.Random(seed)
-    for number in budget.cases(20, least=2):
-        ledger.tried += 1
+    rng = ledger.rng
+    for number in ledger.cases(20, least=2):
         with TemporaryDirectory() as folder:
             path = Path(folder) / "needle.yaml"
             path.write_text(needle())
@@ -228,7 +257,6 @@ def stuck(budget: Budget, seed: int) -> Ledger:
             with running(**case, wait_for_command=True) as (process, client):
                 _time_fault(ledger, client)
                 stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
-    return ledger
 
 
 def _time_fault(ledger: Ledger, client: Client) -> None:
@@ -247,27 +275,20 @@ def _time_fault(ledger: Ledger, client: Client) -> None:
     commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
     began = time.monotonic()
     client.until(lambda: phases[-1].startswith("fault"))
-    times = [(time.monotonic() - began, FAULT_S, "the fault")]
-    calls: tuple[tuple[Any, str, dict[str, Any]], ...]
-    calls = (SetBool, "pause", {"data": True}), (Trigger, "reset", {})
-    for kind, name, fields in calls:
-        times.append((client.call(kind, f"{NODE}/{name}", **fields)[1], REPLY_S, name))
-    for took, bound, what in times:
-        ledger.longest_s = max(ledger.longest_s, took)
-        if took > bound * ledger.patience:
-            ledger.found("hangs", f"{what} after {took:.2f} s")
+    ledger.time(time.monotonic() - began, FAULT_S, "the fault")
+    ledger.time(client.call(SetBool, f"{NODE}/pause", data=True)[1], REPLY_S, "pause")
+    ledger.time(client.call(Trigger, f"{NODE}/reset")[1], REPLY_S, "reset")
 
 
-def clock(budget: Budget, seed: int) -> Ledger:
+def clock(ledger: Ledger) -> None:
     """Give a clock that jumps, stops and runs back: the node goes on or waits, and ends."""
     from rosgraph_msgs.msg import Clock
 
-    ledger, rng = budget.ledger("jumps of /clock under use_sim_time"), random.Random(seed)
+    rng = ledger.rng
     with running(use_sim_time=True) as (process, client):
         publisher = client.node.create_publisher(Clock, "/clock", 1)
         now = 1.0
-        for _ in budget.cases(300, least=30):
-            ledger.tried += 1
+        for _ in ledger.cases(300, least=30):
             now = max(0.0, now + rng.choice((0.001, 0.01, 0.01, 0.1, 5.0, -2.0, 0.0, 1e6, -1e6)))
             message = Clock()
             message.clock.sec, message.clock.nanosec = int(min(now, 2**31 - 1)), int(now % 1 * 1e9)
@@ -275,15 +296,13 @@ def clock(budget: Budget, seed: int) -> Ledger:
             client.executor.spin_once(timeout_sec=0.005)
         is_alive(ledger, process, client, "the jumps")
         stop(ledger, process)
-    return ledger
 
 
-def starts(budget: Budget, seed: int) -> Ledger:
+def starts(ledger: Ledger) -> None:
     """Start and stop nodes at random moments: one line or none, nothing left in /dev/shm."""
-    ledger, rng = budget.ledger("starts and stops"), random.Random(seed)
+    rng = ledger.rng
     before = _shared_memory()
-    for number in budget.cases(200, least=4):
-        ledger.tried += 1
+    for number in ledger.cases(200, least=4):
         with own_domain(compiled=False):
             kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[number % 4]
             bag = {"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
@@ -299,7 +318,6 @@ def starts(budget: Budget, seed: int) -> Ledger:
     left = _shared_memory() - before
     if len(left) > 4:
         ledger.found("lost", f"{len(left)} files left in /dev/shm: {sorted(left)[:3]}", len(left))
-    return ledger
 
 
 def _shared_memory() -> set[str]:

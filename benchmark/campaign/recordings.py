@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import random
 import shutil
 import signal
 import tempfile
@@ -15,16 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.campaign.ledger import Budget, Ledger
-from benchmark.campaign.processes import start
-from benchmark.nodes import Process, own_domain
+from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.nodes import start
+from benchmark.nodes import own_domain
 from sst_ros.errors import SstError
 from sst_ros.recording import bag_writer
 from sst_ros.recording.recording import Recording, read
 
 SAMPLE_NS = 2_000_000
-LAST_CHUNK_NS = 1_000_000_000
-"""What a recorder may lose when it is killed: the chunk that it has not yet flushed."""
 
 
 @contextmanager
@@ -52,33 +49,32 @@ def _same(one: Recording, other: Recording) -> bool:
     )
 
 
-def damages(budget: Budget, seed: int) -> Ledger:
+def damages(ledger: Ledger) -> None:
     """Flip single bytes of a recording and cut it: no number may change without a word."""
-    ledger, rng = budget.ledger("recordings: flipped bytes and cuts"), random.Random(seed)
+    rng = ledger.rng
     with _recorded(2.0) as bag:
         whole = read(bag)
         (file,) = bag.glob("*.mcap")
         data = file.read_bytes()
-        for number in budget.cases(500, least=10):
+        for number in ledger.numbers(500, least=10):
             place, bit = rng.randrange(len(data)), 1 << rng.randrange(8)
             changed = bytearray(data)
             changed[place] ^= bit
             _try(ledger, f"flip {number} of byte {place}", bag, file, bytes(changed), whole)
-        for number in budget.cases(100, least=3):
+        for number in ledger.numbers(100, least=3):
             length = rng.randrange(len(data))
             _try(ledger, f"cut {number} at byte {length}", bag, file, data[:length], whole)
-    return ledger
 
 
 def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: Recording) -> None:
     file.write_bytes(data)
-    with ledger.case(f"read, {name}", (SstError,), bound=10.0):
+    with ledger.case(f"read, {name}", bound=10.0):
         found = read(bag)
         if not _same(found, whole):
             ledger.found("silent", f"{name}: numbers differ")
     saved = bag.with_name("bag_recovered")
     shutil.rmtree(saved, ignore_errors=True)
-    with ledger.case(f"recover, {name}", (SstError,), bound=10.0):
+    with ledger.case(f"recover, {name}", bound=10.0):
         result = bag_writer.recover(bag)
         again = read(result.bag)
         # What was saved has to be a part of what was recorded, bit by bit. Times of a recording
@@ -92,39 +88,31 @@ def _try(ledger: Ledger, name: str, bag: Path, file: Path, data: bytes, whole: R
     shutil.rmtree(saved, ignore_errors=True)
 
 
-def recorder_kills(budget: Budget, seed: int) -> Ledger:
+def recorder_kills(ledger: Ledger) -> None:
     """Kill the recorder at random moments: all but the last chunk comes back."""
-    ledger, rng = budget.ledger("recorders killed with -9"), random.Random(seed)
-    for number in budget.cases(34, least=1):
-        ledger.tried += 1
+    for number in ledger.cases(34):
         with tempfile.TemporaryDirectory() as name, own_domain(compiled=False):
             bag = Path(name) / "bag"
             recorder = start("recorder", output=bag)
             simulator = start("simulator", scene="swing", duration=0.0)
             try:
-                _kill(ledger, f"kill {number}", rng.uniform(1.5, 4.0), recorder, bag)
+                deadline = time.monotonic() + 30
+                while time.monotonic() < deadline and _size(bag) < 50_000:
+                    time.sleep(0.01)
+                # The wait is the experiment: the moment of the kill is random.
+                time.sleep(ledger.rng.uniform(1.5, 4.0))
+                size = _size(bag)
+                recorder.kill()
+                recorder.wait()
+                steps = np.diff(read(bag_writer.recover(bag).bag).time_ns)
+                if not np.all(steps == SAMPLE_NS):
+                    note = f"kill {number}: gaps inside what was recovered, {size} bytes"
+                    ledger.found("lost", note)
             except SstError as error:
                 ledger.found("lost", f"kill {number}: {error}")
             finally:
                 for process in (simulator, recorder):
                     process.end(signal.SIGKILL, 20.0)
-    return ledger
-
-
-def _kill(ledger: Ledger, name: str, after: float, recorder: Process, bag: Path) -> None:
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and _size(bag) < 50_000:
-        time.sleep(0.01)
-    # The wait is the experiment: the moment of the kill is random.
-    time.sleep(after)
-    size = _size(bag)
-    recorder.kill()
-    recorder.wait()
-    result = bag_writer.recover(bag)
-    run = read(result.bag)
-    steps = np.diff(run.time_ns)
-    if len(steps) and not np.all(steps == SAMPLE_NS):
-        ledger.found("lost", f"{name}: gaps inside what was recovered, {size} bytes")
 
 
 def _size(bag: Path) -> int:

@@ -13,9 +13,9 @@ from typing import Any
 
 import yaml
 
-from benchmark.campaign.ledger import Budget, Ledger
+from benchmark.campaign.ledger import Ledger
 from sst_ros import Simulation
-from sst_ros.errors import InputError, SstError
+from sst_ros.errors import InputError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import Scene, names, text_of
 from sst_ros.scene.yaml_document import read
@@ -29,7 +29,6 @@ OTHERS: tuple[Any, ...] = (
 Changes = dict[tuple[Any, ...], object]
 """Values by their paths in a scene."""
 PERIOD_NS = 1_000_000
-CALIBRATION_STEPS = 50
 STEP_BOUND_S = 0.4
 """A step may take 0.2 s on an idle core of this machine; twice that beside other work."""
 FIRST_STEP_BOUND_S = 2.0
@@ -60,9 +59,9 @@ def _text(tree: Any) -> str:
     return yaml.dump(tree, allow_unicode=False)
 
 
-def documents(budget: Budget, seed: int) -> Ledger:
+def documents(ledger: Ledger) -> None:
     """Read documents with wrong values, wrong structure and hostile sizes."""
-    ledger, rng, known = budget.ledger("scene documents"), random.Random(seed), trees()
+    rng, known = ledger.rng, trees()
     large = {
         "200,000 base directions": _text({"base": {"v": [[1, 0, 0]] * 200_000}}),
         "20,000 unknown keys": _text({f"key_{n}": n for n in range(20_000)}),
@@ -75,18 +74,17 @@ def documents(budget: Budget, seed: int) -> Ledger:
     }
     for name, source in large.items():
         # PyYAML alone takes a second for the 300 kB of 20,000 keys.
-        with ledger.case(name, (SstError,), bound=2.0):
+        with ledger.case(name, bound=2.0):
             _read(ledger, name, source)
-    for number in budget.cases(256):
+    for number in ledger.numbers(256):
         name = rng.choice(sorted(known))
         tree = copy.deepcopy(known[name])
         for _ in range(rng.choice((1, 1, 2, 4))):
             path = rng.choice(list(places(tree)))
             put(tree, path, rng.choice(NUMBERS + OTHERS))
-        label = f"document {number} (seed {seed})"
-        with ledger.case(label, (SstError,), bound=2.0):
+        label = f"document {number} (seed {ledger.seed})"
+        with ledger.case(label, bound=2.0):
             _read(ledger, label, _text(tree))
-    return ledger
 
 
 def _read(ledger: Ledger, name: str, source: str) -> None:
@@ -132,12 +130,11 @@ def needle() -> str:
     return _text({**tree, "stroke": {"at_end": "ignore"}, "workspace": {"at_edge": "ignore"}})
 
 
-def extremes(budget: Budget, seed: int) -> Ledger:
+def extremes(ledger: Ledger) -> None:
     """Step extreme scenes: each step bounded, each state finite, each error one of ours."""
-    ledger, rng = budget.ledger("extreme scenes, 20 steps each"), random.Random(seed)
-    cases = list(_extremes().items())
-    for number in budget.cases(2 * len(cases), least=6):
-        name, changes = cases[number % len(cases)] if budget.share >= 1 else rng.choice(cases)
+    cases, whole = list(_extremes().items()), ledger.share >= 1
+    for number in ledger.numbers(2 * len(cases), least=6):
+        name, changes = cases[number % len(cases)] if whole else ledger.rng.choice(cases)
         ignored = number >= len(cases)
         tree = copy.deepcopy(trees()["swing"])
         for path, value in changes.items():
@@ -145,25 +142,18 @@ def extremes(budget: Budget, seed: int) -> Ledger:
         if ignored:
             tree["stroke"] = {"at_end": "ignore"}
             tree["workspace"] = {"at_edge": "ignore"}
-        with ledger.case(name, (SstError,), bound=60.0):
+        with ledger.case(name, bound=60.0):
             simulation = Simulation(read(Scene, _text(tree), "scene"))
             torque = (1.0, 2.0, -1.0) if number % 2 else (0.01, 0.0, 0.0)
             for step in range(20):
                 bound = STEP_BOUND_S if step else FIRST_STEP_BOUND_S
-                _bounded(ledger, name, simulation, torque, bound)
-    return ledger
-
-
-def _bounded(ledger: Ledger, name: str, simulation: Simulation, torque: Any, bound: float) -> None:
-    began = time.process_time()
-    try:
-        state = simulation.step(torque, PERIOD_NS)
-    finally:
-        took = time.process_time() - began
-        ledger.longest_s = max(ledger.longest_s, took)
-        if took > bound * ledger.patience:
-            ledger.found("hangs", f"{name}: a step took {took:.2f} s of processor time")
-    _finite(ledger, name, state)
+                began = time.process_time()
+                try:
+                    state = simulation.step(torque, PERIOD_NS)
+                finally:
+                    took = time.process_time() - began
+                    ledger.time(took, bound, f"{name}: processor time of a step")
+                _finite(ledger, name, state)
 
 
 def _finite(ledger: Ledger, name: str, state: Any) -> None:
@@ -198,50 +188,48 @@ def random_scene(rng: random.Random) -> Scene:
     return read(Scene, _text(tree), "scene")
 
 
-def invariants(budget: Budget, seed: int) -> Ledger:
+def invariants(ledger: Ledger) -> None:
     """Simulate random scenes: finite, closed, energy balanced, error estimated."""
-    ledger, rng = budget.ledger("random scenes: invariants over 0.1 s"), random.Random(seed)
-    for number in budget.cases(434, least=8):
-        name = f"scene {number} (seed {seed})"
-        with ledger.case(name, (SstError,), bound=20.0):
+    rng = ledger.rng
+    for number in ledger.numbers(434, least=8):
+        name = f"scene {number} (seed {ledger.seed})"
+        with ledger.case(name, bound=20.0):
             scene = random_scene(rng)
             fine = Simulation(scene, tolerance=1e-13)
             plain = Simulation(scene, tolerance=1e-9)
-            torque = rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
+            torque = _draw_torque(rng)
             for _ in range(100):
                 _finite(ledger, name, plain.step(torque, PERIOD_NS))
                 fine.step(torque, PERIOD_NS)
             if not plain.closure_residual < 1e-14:
                 ledger.found("silent", f"{name}: closure {plain.closure_residual:.1e}")
-            if not abs(plain.energy_residual) < 1e-7 * (1 + _energy(fine)):
+            energy = sum(abs(x) for x in fine.state.body_rate) ** 2
+            if not abs(plain.energy_residual) < 1e-7 * (1 + energy):
                 ledger.found("silent", f"{name}: energy residual {plain.energy_residual:.1e} J")
             error = float(angle_between(plain.state.quaternion, fine.state.quaternion))
             if error > 1e-12 and error > 30 * plain.error_estimate + 30 * fine.error_estimate:
                 note = f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
                 ledger.found("silent", note)
-    return ledger
 
 
-def _energy(simulation: Simulation) -> float:
-    return sum(abs(x) for x in simulation.state.body_rate) ** 2
+def _draw_torque(rng: random.Random) -> tuple[float, float, float]:
+    return rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
 
 
-def bits(budget: Budget, seed: int) -> Ledger:
+def bits(ledger: Ledger) -> None:
     """Simulate random scenes interpreted and compiled: not one bit may differ."""
-    ledger = budget.ledger("random scenes: compiled against interpreted")
-    rng = random.Random(seed + 1)
-    for number in budget.cases(200, least=1):
-        name = f"scene {number} (seed {seed + 1})"
+    rng = random.Random(ledger.seed + 1)
+    for number in ledger.numbers(200):
+        name = f"scene {number} (seed {ledger.seed + 1})"
         # Compiling takes seconds, for `auto` that of three methods.
         method = rng.choice(("rk4", "dopri5", "dop853", "rodas4")) if number % 10 else "auto"
-        with ledger.case(f"{name} {method}", (SstError,), bound=120.0), warnings.catch_warnings():
+        with ledger.case(f"{name} {method}", bound=120.0), warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = random_scene(rng)
             runs = [Simulation(scene, method, compiled=compiled) for compiled in (False, True)]
-            torque = rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
+            torque = _draw_torque(rng)
             for _ in range(40):
                 plain, fast = (run.step(torque, PERIOD_NS) for run in runs)
                 if plain != fast:
                     ledger.found("silent", f"{name} {method}: bits differ at {plain.time_ns} ns")
                     break
-    return ledger

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from benchmark.measure import DOCS
-from benchmark.peers import picture, results
+from benchmark.peers import results
 from benchmark.peers.floor import find_floor
 from benchmark.peers.study import TARGETS, Series, run_study, solve_task
 from benchmark.peers.task import Task
@@ -57,7 +57,6 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)
         results.write(result, options.out)
-        picture.draw(options.out)
         print(f"\nWritten: {options.out}/peers.md, .png, .csv, .json")
         if options.out == DOCS and not (options.quick or options.only):
             results.write_readme()

@@ -7,11 +7,12 @@ them over a step and is of order 1, whatever the step.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
+from benchmark.peers.study import Engine, Series, list_steps
 from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
 
 ENGINE, PACKAGE = "Drake", "drake"
@@ -24,13 +25,12 @@ def series(task: Task, quick: bool) -> list[Series]:
     Its ties are soft over some tens of steps, so its acceleration is the change of rate over the
     300 steps of 1 us after the first 300.
     """
-    counts = make_ladder(100, 6400 if quick else 20000, 2.0)
-    settings = [_setting(task, steps) for steps in counts]
+    settings = list_steps(100, 6400 if quick else 20000, 2.0, partial(_Model, task))
     gate = _Model(task, round(1.0 / GATE_STEP))
     return [Series(ENGINE, "SAP, discrete", "nowhere", TOLERANCE, gate.acceleration, settings)]
 
 
-class _Model:
+class _Model(Engine):
     def __init__(self, task: Task, steps: int) -> None:
         from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
         from pydrake.multibody.tree import (
@@ -43,7 +43,7 @@ class _Model:
         from pydrake.systems.framework import DiagramBuilder
         from pydrake.systems.primitives import Sine
 
-        self.task = task
+        self.task, self.steps = task, steps
         builder: Any = DiagramBuilder()
         self.plant = plant = builder.AddSystem(MultibodyPlant(1.0 / steps))
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
@@ -90,31 +90,12 @@ class _Model:
         mean = (np.array(rates[1]) - rates[0]) / (SETTLED * GATE_STEP)
         return self.task.at_once(at, mean, SETTLED * GATE_STEP, 2 * SETTLED * GATE_STEP)
 
-    def pose(self) -> Pose:
+    def run(self) -> None:
+        self.start()
+        # Half a step more: the last update is sure to be in, and the next is not.
+        self.simulator.AdvanceTo(DURATION + 0.5 / self.steps)
+
+    def pose(self, end: None) -> Pose:
         turned = self.plant.EvalBodyPoseInWorld(self.inner, self.star).rotation().matrix()
-        if not np.all(np.isfinite(turned)):
-            raise Failed("not finite")
         turn = np.array([self.joints[f"g{k}"].get_angle(self.inner) for k in range(3)])
         return Pose(turned @ self.task.frames["s"], self.task.gamma + turn)
-
-
-def _setting(task: Task, steps: int) -> Setting:
-    def prepare() -> Run:
-        model = _Model(task, steps)
-
-        def whole() -> None:
-            model.start()
-            # Half a step more: the last update is sure to be in, and the next is not.
-            model.simulator.AdvanceTo(DURATION + 0.5 / steps)
-
-        def poses(pieces: int) -> list[Pose]:
-            model.start()
-            found = []
-            for piece in range(pieces):
-                model.simulator.AdvanceTo((piece + 1) * DURATION / pieces + 0.5 / steps)
-                found.append(model.pose())
-            return found
-
-        return Run(whole, poses)
-
-    return Setting(f"{steps} steps", steps, prepare)

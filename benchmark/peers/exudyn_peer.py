@@ -8,11 +8,12 @@ which Exudyn evaluates in C++ without Python.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
+from benchmark.peers.study import Engine, Failed, Series, list_steps
 from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
 
 ENGINE, PACKAGE = "Exudyn", "exudyn"
@@ -22,45 +23,43 @@ GATE_STEP = 1e-5
 
 def series(task: Task, quick: bool) -> list[Series]:
     """Two implicit methods; the acceleration is the change of rate over steps of 10 us."""
-    counts = make_ladder(40, 1000 if quick else 8000, 2.0)
     found = []
     for name, kind, radius in (
         ("generalised-alpha, index 3", "GeneralizedAlpha", 0.9),
         ("trapezoidal, index 2", "TrapezoidalIndex2", 1.0),
     ):
-        settings = [_setting(task, kind, radius, steps) for steps in counts]
-        gate = _Gate(task, kind, radius)
-        found.append(Series(ENGINE, name, "nowhere", TOLERANCE, gate.acceleration, settings))
+        make = partial(_Model, task, kind, radius)
+        settings = list_steps(40, 1000 if quick else 8000, 2.0, make)
+        gate = partial(_find_acceleration, task, kind, radius)
+        found.append(Series(ENGINE, name, "nowhere", TOLERANCE, gate, settings))
     return found
 
 
-class _Model:
-    """The mechanism at a state; Exudyn starts where its nodes say."""
+class _Model(Engine):
+    """The mechanism at a state, at rest at the start by default."""
 
-    def __init__(self, task: Task, kind: str, radius: float, at: Moving | None = None) -> None:
+    def __init__(
+        self, task: Task, kind: str, radius: float, steps: int, at: Moving | None = None
+    ) -> None:
         import exudyn
 
         self.exudyn: Any = exudyn
-        self.task, self.kind, self.radius = task, kind, radius
+        self.task, self.kind, self.radius, self.steps = task, kind, radius, steps
         self.system = exudyn.SystemContainer()
         self.mbs: Any = self.system.AddSystem()
-        self.markers: dict[Any, Any] = {}
-        self.nodes: dict[Any, Any] = {}
-        self.turned: dict[Any, Any] = {}
+        self.nodes: dict[str, Any] = {}
         self._add_bodies(at)
         self._add_joints()
         self._add_torques()
         self.mbs.Assemble()
         self.settings = self._settings()
-        self.begin = at.time if at else 0.0
 
     def _add_bodies(self, at: Moving | None) -> None:
         import exudyn.itemInterface as items
         from exudyn.rigidBodyUtilities import AngularVelocity2EulerParameters_t as rates_of
         from exudyn.rigidBodyUtilities import RotationMatrix2EulerParameters as parameters_of
 
-        ground = self.mbs.AddObject(items.ObjectGround())
-        self.ground, self.bodies = ground, {BASE: ground}
+        self.bodies = {BASE: self.mbs.AddObject(items.ObjectGround())}
         placed = {BASE: (np.eye(3), np.zeros(3))}
         for body in list_bodies(self.task):
             above, spin = placed[body.parent]
@@ -145,15 +144,15 @@ class _Model:
         settings.displayStatistics = False
         return settings
 
+    def run(self) -> None:
+        self.solve(0.0, DURATION, self.steps)
+
     def solve(self, begin: float, end: float, steps: int) -> None:
-        settings = self.settings
-        settings.timeIntegration.startTime = begin
-        settings.timeIntegration.endTime = end
-        settings.timeIntegration.numberOfSteps = steps
-        kind = getattr(self.exudyn.DynamicSolverType, self.kind)
+        time = self.settings.timeIntegration
+        time.startTime, time.endTime, time.numberOfSteps = begin, end, steps
         done = self.mbs.SolveDynamic(
-            settings, solverType=kind, updateInitialValues=False, showHints=False,
-            autoAssemble=False,
+            self.settings, solverType=getattr(self.exudyn.DynamicSolverType, self.kind),
+            updateInitialValues=False, showHints=False, autoAssemble=False,
         )  # fmt: skip
         if done is False:
             raise Failed("its Newton iteration does not converge")
@@ -162,48 +161,22 @@ class _Model:
         variable = getattr(self.exudyn.OutputVariableType, what)
         return np.array(self.mbs.GetNodeOutput(self.nodes[name], variable))
 
-    def pose(self) -> Pose:
-        turned = self.output("s", "RotationMatrix").reshape(3, 3)
+    def pose(self, end: None) -> Pose:
         task, gamma = self.task, []
         for k in range(3):
             moved = self.output(f"a{k}", "RotationMatrix").reshape(3, 3) @ task.r[k]
             across = np.cross(task.w[k], task.r[k])
             gamma.append(task.gamma[k] + np.arctan2(moved @ across, moved @ task.r[k]))
+        turned = self.output("s", "RotationMatrix").reshape(3, 3)
         return Pose(turned @ task.frames["s"], np.array(gamma))
 
 
-class _Gate:
-    def __init__(self, task: Task, kind: str, radius: float) -> None:
-        self.task, self.kind, self.radius = task, kind, radius
-
-    def acceleration(self, at: Moving) -> np.ndarray:
-        model = _Model(self.task, self.kind, self.radius, at)
-        rates = [self._rates(model, at)]
-        model.solve(at.time, at.time + GATE_STEP, 4)
-        rates.append(self._rates(model, None))
-        return self.task.at_once(at, (rates[1] - rates[0]) / GATE_STEP, 0.0, GATE_STEP)
-
-    def _rates(self, model: _Model, at: Moving | None) -> np.ndarray:
-        if at is not None:
-            return np.array([at.velocity[f"g{k}"] for k in range(3)])
-        w = model.task.w
-        return np.array([w[k] @ model.output(f"a{k}", "AngularVelocity") for k in range(3)])
-
-
-def _setting(task: Task, kind: str, radius: float, steps: int) -> Setting:
-    def prepare() -> Run:
-        model = _Model(task, kind, radius)
-
-        def whole() -> None:
-            model.solve(0.0, DURATION, steps)
-
-        def poses(pieces: int) -> list[Pose]:
-            whole()
-            return [model.pose()]
-
-        return Run(whole, poses)
-
-    return Setting(f"{steps} steps", steps, prepare, samples=False)
+def _find_acceleration(task: Task, kind: str, radius: float, at: Moving) -> np.ndarray:
+    model = _Model(task, kind, radius, 4, at)
+    before = np.array([at.velocity[f"g{k}"] for k in range(3)])
+    model.solve(at.time, at.time + GATE_STEP, 4)
+    after = np.array([task.w[k] @ model.output(f"a{k}", "AngularVelocity") for k in range(3)])
+    return task.at_once(at, (after - before) / GATE_STEP, 0.0, GATE_STEP)
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:

@@ -59,9 +59,7 @@ def _needed(task: Task, target: float) -> int:
         states = _states(machine, task.start, times)
         slopes = [names["rhs"](t, *y)[4:7] for t, y in zip(times, states, strict=True)]
         fit = np.linalg.solve(legendre.legvander(nodes, count - 1), np.array(slopes))
-        rate = np.array([np.zeros(3)] * _MOST)
-        for k in range(3):
-            rate[:, k] = DURATION / 2.0 * legendre.Legendre(fit[:, k]).integ(lbnd=-1)(x)
+        rate = DURATION / 2.0 * legendre.legval(x, legendre.legint(fit, lbnd=-1)).T
         # The error of the orientation, to first order: what the error of W adds up to in {B}.
         off = np.einsum("i,ijk,ik->j", w, turned, rate + task.start[4:7] - truth[:, 4:7])
         if float(np.linalg.norm(off)) <= target:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """MuJoCo: equality constraints; its integrators, softness and time steps swept.
 
-Torques reach it in three ways: by a compiled callback (nothing of Python in the loop, exact times
+Torques reach it in three ways: by a callback in C (nothing of Python in the loop, exact times
 at all stages), by a Python callback (the same times), and by `rollout` with a table of torques
 held over each step (their values at its middle, which makes any integrator of order 2 at most).
 
@@ -14,13 +14,16 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Iterable
-from functools import cache
+import tempfile
+from collections.abc import Iterable
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmark.peers.study import Failed, Run, Series, Setting, make_ladder
+from benchmark import c_floor
+from benchmark.peers.study import Engine, Failed, Series, list_steps
 from benchmark.peers.task import (
     BASE,
     DURATION,
@@ -32,6 +35,53 @@ from benchmark.peers.task import (
     list_bodies,
     list_ties,
 )
+
+ENGINE, PACKAGE = "MuJoCo", "mujoco"
+MOBILITIES, SETTLES = (0.01, 0.1, 1.0, 10.0), (0.003, 0.01, 0.03, 0.1)
+TOLERANCE = 1e-3
+CALLBACK = """
+#include <math.h>
+double *t, *force;
+void torques(const void *model, void *data) {{
+{lines}
+}}
+"""
+"""MuJoCo hands no user data to a callback: it reads and writes where `t` and `force` point."""
+
+
+def series(task: Task, quick: bool) -> list[Series]:
+    """RK4 with three sources of torque; the other integrators with the fastest source."""
+    factor = 1.6 if quick else 1.25
+    grid = [
+        (mobility, settle)
+        for mobility in (MOBILITIES[1:3] if quick else MOBILITIES)
+        for settle in (SETTLES[1:3] if quick else SETTLES)
+    ]
+    few = [pair for pair in grid if pair[1] <= 0.03]
+    found = []
+
+    def add(name: str, kind: type[_Steps], integrator: str, last: int,
+            pairs: list[tuple[float, float]]) -> None:  # fmt: skip
+        settings, gates = [], []
+        for mobility, settle in pairs:
+            given = task, integrator, mobility, settle
+            gates.append(model_of(*given, False))
+            note = f", solref {settle:g}, mobility {mobility:g}"
+            settings += list_steps(40, last, factor, partial(kind, *given), note)
+
+        def find_worst(at: Moving) -> np.ndarray:
+            answers = [gate.acceleration(at) for gate in gates]
+            return max(answers, key=lambda answer: find_relative(answer, at.answer))
+
+        found.append(Series(ENGINE, name, kind.PYTHON, TOLERANCE, find_worst, settings))
+
+    add("RK4, compiled torques", _Compiled, "RK4", 6400 if quick else 16000, grid)
+    add("RK4, Python torques", _Steps, "RK4", 3200, few)
+    add("RK4, rollout", _Rollout, "RK4", 6400, few)
+    for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST"):
+        name = f"{integrator.lower()}, compiled torques"
+        add(name, _Compiled, integrator, 16000, grid[:: 1 if quick else 3])
+    return found
 
 
 class Model:
@@ -65,6 +115,7 @@ class Model:
         self.star = model.body("s").id
         self.place = {name: int(model.joint(name).dofadr[0]) for name in JOINTS}
         self.drives = [self.place[f"g{k}"] for k in range(3)]
+        self.sines = list(zip(self.drives, task.sines(), strict=True))
 
     def reset(self, steps: int) -> None:
         self.mujoco.mj_resetData(self.model, self.data)
@@ -84,83 +135,6 @@ class Model:
         data.qfrc_applied[self.drives] = at.torque
         mujoco.mj_forward(self.model, data)
         return np.array(data.qacc[self.drives])
-
-
-def python_callback(model: Model) -> Callable[[Any, Any], None]:
-    """Torques at the time of every evaluation, by Python."""
-    rows = [(at, *sine) for at, sine in zip(model.drives, model.task.sines(), strict=True)]
-    sin = math.sin
-
-    def callback(_: Any, data: Any) -> None:
-        t, force = data.time, data.qfrc_applied
-        for at, amplitude, frequency, phase in rows:
-            force[at] = amplitude * sin(frequency * t + phase)
-
-    return callback
-
-
-class NativeCallback:
-    """The same compiled by numba, as a C function pointer that MuJoCo calls itself.
-
-    MuJoCo hands no user data to a callback, so the addresses of the time and of the force that it
-    reads and writes are kept in a small table, which `aim` fills.
-    """
-
-    def __init__(self, model: Model) -> None:
-        import numba
-        from numba import types
-        from numba.np.numpy_support import carray
-
-        self._table = np.zeros(2, dtype=np.int64)
-        table = int(self._table.ctypes.data)
-        words, doubles = _pointer(types.int64), _pointer(types.float64)
-        (p0, p1, p2), sines = model.drives, tuple(model.task.sines())
-        (a0, f0, s0), (a1, f1, s1), (a2, f2, s2) = sines
-
-        @numba.cfunc(types.void(types.intp, types.intp))
-        def callback(_model: Any, _data: Any) -> None:
-            addresses = carray(words(table), 2)
-            t = carray(doubles(addresses[0]), 1)[0]
-            force = carray(doubles(addresses[1]), 7)
-            force[p0] = a0 * math.sin(f0 * t + s0)
-            force[p1] = a1 * math.sin(f1 * t + s1)
-            force[p2] = a2 * math.sin(f2 * t + s2)
-
-        self._kept = callback
-        assert callback.address is not None
-        kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-        self.function = kind(callback.address)
-
-    def aim(self, model: Model) -> None:
-        """Work on this model's data from now on."""
-        data = model.data
-        # In mjData the energies follow the time; make sure of it.
-        address = int(data.energy.ctypes.data) - 8
-        kept, data.time = data.time, 0.123456789
-        found = ctypes.c_double.from_address(address).value
-        data.time = kept
-        if found != 0.123456789:
-            raise RuntimeError("this MuJoCo keeps the time elsewhere: no native callback")
-        self._table[:] = address, data.qfrc_applied.ctypes.data
-
-
-def _pointer(kind: Any) -> Any:
-    """A function for compiled code: address -> pointer to numbers of that kind."""
-    import numba
-    from numba.extending import intrinsic
-
-    types: Any = numba.types
-
-    @intrinsic
-    def pointer(_context: Any, address: Any) -> Any:
-        signature = types.CPointer(kind)(types.int64)
-
-        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
-
-        return signature, generate
-
-    return pointer
 
 
 def _xml(task: Task, settle: float, motors: bool) -> str:
@@ -196,142 +170,107 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-ENGINE, PACKAGE = "MuJoCo", "mujoco"
-
-MOBILITIES, SETTLES = (0.01, 0.1, 1.0, 10.0), (0.003, 0.01, 0.03, 0.1)
-TOLERANCE = 1e-3
-
 model_of = cache(Model)
 
 
-def series(task: Task, quick: bool) -> list[Series]:
-    """RK4 with three sources of torque; the other integrators with the fastest source."""
-    factor = 1.6 if quick else 1.25
-    mobilities = MOBILITIES[1:3] if quick else MOBILITIES
-    settles = SETTLES[1:3] if quick else SETTLES
-    grid = [(mobility, settle) for mobility in mobilities for settle in settles]
-    few = [pair for pair in grid if pair[1] <= 0.03]
-    found = []
+class _Steps(Engine):
+    """Steps with torques by a callback in Python."""
 
-    def add(name: str, python: str, make: Callable[..., Setting], integrator: str, last: int,
-            pairs: list[tuple[float, float]]) -> None:  # fmt: skip
-        settings = [
-            make(task, integrator, mobility, settle, steps)
-            for mobility, settle in pairs
-            for steps in make_ladder(40, last, factor)
-        ]
-        gates = [model_of(task, integrator, *pair, False) for pair in pairs]
+    PYTHON, MOTORS = "the torques", False
 
-        def worst(at: Moving) -> np.ndarray:
-            answers = [gate.acceleration(at) for gate in gates]
-            return max(answers, key=lambda answer: find_relative(answer, at.answer))
+    def __init__(
+        self, task: Task, integrator: str, mobility: float, settle: float, steps: int
+    ) -> None:
+        self.model = model_of(task, integrator, mobility, settle, self.MOTORS)
+        self.mujoco, self.steps = self.model.mujoco, steps
+        self.prepare()
 
-        found.append(Series(ENGINE, name, python, TOLERANCE, worst, settings))
+    def prepare(self) -> None:
+        """Make what `run` needs besides the model."""
 
-    last = 6400 if quick else 16000
-    add("RK4, compiled torques", "nowhere", _native, "RK4", last, grid)
-    add("RK4, Python torques", "the torques", _python, "RK4", 3200, few)
-    add("RK4, rollout", "nowhere", _rollout, "RK4", 6400, few)
-    for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST"):
-        name = f"{integrator.lower()}, compiled torques"
-        add(name, "nowhere", _native, integrator, 16000, grid[:: 1 if quick else 3])
-    return found
+    def callback(self) -> Any:
+        """Return what MuJoCo calls for the torques at the time of every evaluation."""
+        rows, sin = [(at, *sine) for at, sine in self.model.sines], math.sin
+
+        def torques(_: Any, data: Any) -> None:
+            t, force = data.time, data.qfrc_applied
+            for at, amplitude, frequency, phase in rows:
+                force[at] = amplitude * sin(frequency * t + phase)
+
+        return torques
+
+    def run(self) -> None:
+        self.model.reset(self.steps)
+        self.mujoco.set_mjcb_control(self.callback())
+        self.mujoco.mj_step(self.model.model, self.model.data, nstep=self.steps)
+        self.mujoco.set_mjcb_control(None)
+
+    def pose(self, end: None) -> Pose:
+        if abs(self.model.data.time - DURATION) > 1e-6:
+            raise Failed(f"ended at {self.model.data.time:.3f} s: it reset itself")
+        return self.model.pose()
+
+
+class _Compiled(_Steps):
+    """The same in C."""
+
+    PYTHON = "nowhere"
+
+    def prepare(self) -> None:
+        self.library, self.function = _compile(tuple(self.model.sines))
+        # In mjData the energies follow the time; make sure of it.
+        data = self.model.data
+        self.address = int(data.energy.ctypes.data) - 8
+        data.time = 0.123456789
+        if ctypes.c_double.from_address(self.address).value != 0.123456789:
+            raise RuntimeError("this MuJoCo keeps the time elsewhere: no compiled callback")
+        self.force = int(data.qfrc_applied.ctypes.data)
+
+    def callback(self) -> Any:
+        for name, address in (("t", self.address), ("force", self.force)):
+            ctypes.c_void_p.in_dll(self.library, name).value = address
+        return self.function
 
 
 @cache
-def _callback(task: Task) -> NativeCallback:
-    return NativeCallback(model_of(task, "RK4", MOBILITIES[0], SETTLES[1], False))
+def _compile(sines: tuple[tuple[int, tuple[float, float, float]], ...]) -> tuple[Any, Any]:
+    """Return the library of the callback, and its function."""
+    if not c_floor.has_gcc():
+        raise Failed("there is no gcc")
+    lines = [f"force[{at}] = {a!r} * sin({f!r} * *t + {s!r});" for at, (a, f, s) in sines]
+    with tempfile.TemporaryDirectory() as folder:
+        text = CALLBACK.format(lines="\n".join(lines))
+        library, _ = c_floor.compile_c(text, Path(folder), "torques", "-O3")
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+    return library, kind(("torques", library))
 
 
-def _native(task: Task, integrator: str, mobility: float, settle: float, steps: int) -> Setting:
-    def prepare() -> Run:
-        model, callback = model_of(task, integrator, mobility, settle, False), _callback(task)
-        callback.aim(model)
+class _Rollout(_Steps):
+    """MuJoCo's own loop over a table of torques."""
 
-        def ready() -> None:
-            callback.aim(model)
-            model.mujoco.set_mjcb_control(callback.function)
+    PYTHON, MOTORS = "nowhere", True
 
-        return _stepping(model, steps, ready)
-
-    return Setting(_label(steps, mobility, settle), steps, prepare)
-
-
-def _python(task: Task, integrator: str, mobility: float, settle: float, steps: int) -> Setting:
-    def prepare() -> Run:
-        model = model_of(task, integrator, mobility, settle, False)
-        callback = python_callback(model)
-        return _stepping(model, steps, lambda: model.mujoco.set_mjcb_control(callback))
-
-    return Setting(_label(steps, mobility, settle), steps, prepare)
-
-
-def _stepping(model: Model, steps: int, ready: Callable[[], None]) -> Run:
-    mujoco: Any = model.mujoco
-
-    def whole() -> None:
-        model.reset(steps)
-        ready()
-        mujoco.mj_step(model.model, model.data, nstep=steps)
-        mujoco.set_mjcb_control(None)
-
-    def poses(pieces: int) -> list[Pose]:
-        model.reset(steps)
-        ready()
-        found = []
-        try:
-            for _ in range(pieces):
-                mujoco.mj_step(model.model, model.data, nstep=steps // pieces)
-                found.append(model.pose())
-        finally:
-            mujoco.set_mjcb_control(None)
-        return _checked(found, model.data.time)
-
-    return Run(whole, poses)
-
-
-def _rollout(task: Task, integrator: str, mobility: float, settle: float, steps: int) -> Setting:
-    def prepare() -> Run:
+    def prepare(self) -> None:
         from mujoco import rollout
 
-        model = model_of(task, integrator, mobility, settle, True)
+        model, data, steps = self.model.model, self.model.data, self.steps
         middles = (np.arange(steps) + 0.5) * (DURATION / steps)
-        controls = np.array([task.torque_at(t) for t in middles])[None]
-        model.reset(steps)
-        kind = model.mujoco.mjtState.mjSTATE_FULLPHYSICS
-        start = np.zeros(model.mujoco.mj_stateSize(model.model, kind))
-        model.mujoco.mj_getState(model.model, model.data, start, kind)
-        states = np.empty((1, steps, len(start)))
-        sensors = np.empty((1, steps, 0))
+        controls = np.array([self.model.task.torque_at(t) for t in middles])[None]
+        self.model.reset(steps)
+        self.kind = self.mujoco.mjtState.mjSTATE_FULLPHYSICS
+        start = np.zeros(self.mujoco.mj_stateSize(model, self.kind))
+        self.mujoco.mj_getState(model, data, start, self.kind)
+        self.states = np.empty((1, steps, len(start)))
+        self.rollout = partial(
+            rollout.rollout, model, data, start[None], controls, nstep=steps, state=self.states,
+            sensordata=np.empty((1, steps, 0)),
+        )  # fmt: skip
 
-        def whole() -> None:
-            model.reset(steps)
-            rollout.rollout(
-                model.model, model.data, start[None], controls, nstep=steps, state=states,
-                sensordata=sensors,
-            )  # fmt: skip
+    def run(self) -> None:
+        self.model.reset(self.steps)
+        self.rollout()
 
-        def poses(pieces: int) -> list[Pose]:
-            whole()
-            found = []
-            for piece in range(pieces):
-                row = states[0, (piece + 1) * (steps // pieces) - 1]
-                model.mujoco.mj_setState(model.model, model.data, row, kind)
-                found.append(model.pose())
-            return _checked(found, model.data.time)
-
-        return Run(whole, poses)
-
-    return Setting(_label(steps, mobility, settle), steps, prepare)
-
-
-def _checked(poses: list[Pose], time: float) -> list[Pose]:
-    if not np.all(np.isfinite(poses[-1].rotation)):
-        raise Failed("not finite")
-    if abs(time - DURATION) > 1e-6:
-        raise Failed(f"ended at {time:.3f} s: it reset itself")
-    return poses
-
-
-def _label(steps: int, mobility: float, settle: float) -> str:
-    return f"{steps} steps, solref {settle:g}, mobility {mobility:g}"
+    def pose(self, end: None) -> Pose:
+        data = self.model.data
+        self.mujoco.mj_setState(self.model.model, data, self.states[0, -1], self.kind)
+        return super().pose(end)

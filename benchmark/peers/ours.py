@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from benchmark.peers.study import Run, Series, Setting, make_ladder
+from benchmark.peers.study import Engine, Series, Setting, list_steps
 from benchmark.peers.task import DURATION, Moving, Pose, Task
-from sst_ros import prepare
+from sst_ros import Trajectory, prepare
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4, Tableau
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
 
 ENGINE, PACKAGE = "sst_ros", "numba"
 PUBLIC = "prepare().run()"
@@ -26,93 +28,78 @@ METHODS = {
 
 def series(task: Task, quick: bool) -> list[Series]:
     """`simulate` itself, the methods inside of it under numba, and DOP853 without."""
-    factor = 1.6 if quick else 1.15
-    found = [_public(task)]
+
+    def acceleration(at: Moving) -> np.ndarray:
+        return task.kernel_answer(at.y, at.torque)
+
+    def add(name: str, settings: list[Setting], python: str = "nowhere") -> None:
+        found.append(Series(ENGINE, name, python, 1e-12, acceleration, settings))
+
+    found: list[Series] = []
+    public = [
+        Setting(f"tolerance {tolerance:.1e} rad", 0, partial(_Public, task, tolerance))
+        for tolerance in (10.0 ** -np.arange(3.0, 13.1, 0.5)).tolist()
+    ]
+    add(f"{PUBLIC}, Gauss collocation of order 16, numba", public)
     for name, (tableau, first, last) in METHODS.items():
-        found.append(
-            _series(task, f"{name}, numba", tableau, True, make_ladder(first, last, factor))
-        )
-    found += [_collocation(task, nodes) for nodes in (8, 12)]
-    plain = make_ladder(5, 80, 2.0 if quick else 1.3)
-    return [*found, _series(task, "DOP853, plain Python", DOP853, False, plain)]
+        machine = CompiledMethod(task.system, tableau, compiled=True)
+        ladder = (first, last, 1.6 if quick else 1.15)
+        add(f"{name}, numba", list_steps(*ladder, partial(_Steps, task, machine)))
+    for nodes in (8, 12):
+        method = Collocation(task.system, nodes)
+        few = [
+            Setting(f"{n} steps of {m} iterations", n * m, partial(_Few, task, method, n, m))
+            for n in range(2, 13)
+            for m in range(1, 9)
+        ]
+        add(f"Gauss collocation, order {2 * nodes}, numba", few)
+    plain = partial(_Steps, task, CompiledMethod(task.system, DOP853, compiled=False))
+    ladder = (5, 80, 2.0 if quick else 1.3)
+    add("DOP853, plain Python", list_steps(*ladder, plain), "everywhere")
+    return found
 
 
-def _public(task: Task) -> Series:
+class _Public(Engine):
     """What a user calls again and again, with a `Trajectory` returned.
 
     The motion is prepared before, as other engines have their data laid out.
     """
 
-    def acceleration(at: Moving) -> np.ndarray:
-        return task.kernel_answer(at.y, at.torque)
+    def __init__(self, task: Task, tolerance: float) -> None:
+        prepared = prepare(task.scene, duration=DURATION, method="gauss", tolerance=tolerance)
+        self._task, self.run = task, prepared.run
+        self.run()
 
-    def setting(tolerance: float) -> Setting:
-        def setup() -> Run:
-            run = prepare(task.scene, duration=DURATION, method="gauss", tolerance=tolerance).run
-
-            def poses(pieces: int) -> list[Pose]:
-                motion = run()
-                return [task.pose_of([*motion.quaternion[-1], *motion.body_rate[-1]])]
-
-            run()
-            return Run(run, poses)
-
-        return Setting(f"tolerance {tolerance:.1e} rad", 0, setup, samples=False)
-
-    settings = [setting(10.0**-power) for power in np.arange(3.0, 13.1, 0.5)]
-    name = f"{PUBLIC}, Gauss collocation of order 16, numba"
-    return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)
+    def pose(self, end: Trajectory) -> Pose:
+        return self._task.pose_of([*end.quaternion[-1], *end.body_rate[-1]])
 
 
-def _collocation(task: Task, nodes: int) -> Series:
-    """Few long steps; how often each is iterated is part of the setting.
+class _Few(Engine):
+    """Few long steps of collocation; how often each is iterated is part of the setting.
 
     Numbers are laid out before, as MuJoCo's and Pinocchio's data are; `run` is the whole second,
     from the start, torques at all nodes included, in one call from Python.
     """
-    method = Collocation(task.system, nodes)
 
-    def acceleration(at: Moving) -> np.ndarray:
-        return task.kernel_answer(at.y, at.torque)
+    def __init__(self, task: Task, method: Collocation, steps: int, iterations: int) -> None:
+        h = DURATION / steps
+        self._motion = method.prepare(0.0, h, steps, task.start, iterations=iterations)
+        self._task, self.run = task, self._motion.run
 
-    def setting(steps: int, iterations: int) -> Setting:
-        def prepare() -> Run:
-            motion = method.prepare(0.0, DURATION / steps, steps, task.start, iterations=iterations)
-
-            def poses(pieces: int) -> list[Pose]:
-                motion.run()
-                return [task.pose_of(motion.end)]
-
-            return Run(motion.run, poses)
-
-        label = f"{steps} steps of {iterations} iterations"
-        return Setting(label, steps * iterations, prepare, samples=False)
-
-    settings = [setting(n, m) for n in range(2, 13) for m in range(1, 9)]
-    name = f"Gauss collocation, order {2 * nodes}, numba"
-    return Series(ENGINE, name, "nowhere", 1e-12, acceleration, settings)
+    def pose(self, end: object) -> Pose:
+        return self._task.pose_of(self._motion.end)
 
 
-def _series(task: Task, name: str, tableau: Tableau, compiled: bool, counts: list[int]) -> Series:
-    machine = CompiledMethod(task.system, tableau, compiled=compiled)
+class _Steps(Engine):
+    """Fixed steps of a method."""
 
-    def acceleration(at: Moving) -> np.ndarray:
-        return task.kernel_answer(at.y, at.torque)
+    def __init__(self, task: Task, machine: CompiledMethod, steps: int) -> None:
+        self._task, self._machine, self._steps = task, machine, steps
 
-    def setting(steps: int) -> Setting:
-        def whole() -> list[float]:
-            return machine.step_fixed(0.0, DURATION / steps, steps, task.start, [])
+    def run(self) -> list[float]:
+        return self._machine.step_fixed(
+            0.0, DURATION / self._steps, self._steps, self._task.start, []
+        )
 
-        def poses(pieces: int) -> list[Pose]:
-            y, found = task.start, []
-            for piece in range(pieces):
-                y = machine.step_fixed(
-                    piece * DURATION / pieces, DURATION / steps, steps // pieces, y, []
-                )
-                found.append(task.pose_of(y))
-            return found
-
-        return Setting(f"{steps} steps", steps, lambda: Run(whole, poses))
-
-    where = "nowhere" if compiled else "everywhere"
-    return Series(ENGINE, name, where, 1e-12, acceleration, [setting(n) for n in counts])
+    def pose(self, end: list[float]) -> Pose:
+        return self._task.pose_of(end)

@@ -1,33 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the study found, as tables, in the pages that show it, as CSV and as JSON.
+"""What the study found, as tables, in the pages that show it, as CSV, as JSON and as a picture.
 
-`python -m benchmark.peers.results` brings the README's table up to date from docs/peers.json.
+`python -m benchmark.peers.results` draws the picture and brings the README's table up to date from
+docs/peers.csv and docs/peers.json.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pandas import DataFrame
+import pandas as pd
+from matplotlib.figure import Figure
 
-from benchmark.measure import (
-    DOCS,
-    describe_machine,
-    fill,
-    fill_page,
-    format_markdown,
-    join_line,
-    write_json,
-)
+from benchmark.measure import DOCS, describe_machine, fill, fill_page, join_line, write_json
 from benchmark.peers.floor import Floor
 from benchmark.peers.ours import ENGINE as OURS
 from benchmark.peers.ours import PUBLIC
-from benchmark.peers.study import TARGETS, Curve, Reached, Reference, reach
+from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
+from sst_ros.plot.style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, save_figure, styled
+from sst_ros.report.results import markdown
 
 PACKAGES = ("numpy", "numba", "mujoco", "pin", "drake", "exudyn", "scipy", "mpmath")
 
@@ -41,13 +38,22 @@ CLAIMS = (
 
 README = DOCS.parent / "README.md"
 README_ROWS = {
-    "sst_ros": "sst_ros, {}",
+    "sst_ros": "sst_ros, a run of `prepare`",
     "MuJoCo": "MuJoCo, best setting",
     "Pinocchio": "Pinocchio, DOP853 in a Python loop",
     "SciPy on the paper's form": "SciPy on the paper's equations in NumPy",
 }
-Rows = list[list[str]]
-"""Cells of a table, heads first."""
+STYLES = {
+    "sst_ros": (BLUE, "o"),
+    "MuJoCo": (VERMILION, "s"),
+    "Pinocchio": (GREEN, "D"),
+    "Drake": (PURPLE, "^"),
+    "Exudyn": (ORANGE, "v"),
+    "SciPy on the paper's form": (INK, "P"),
+}
+"""Colour and marker of each engine, in the order of the legend."""
+SMALLEST, LARGEST = 2e-14, 1.0
+"""Range of the errors in the picture [rad]."""
 
 
 @dataclass
@@ -68,60 +74,62 @@ class Results:
         """Names of the engines that passed, ours first."""
         return list(dict.fromkeys(c.series.engine for c in self.curves if c.passed))
 
-    def best(self, engine: str, target: float, method: str = "") -> Reached:
-        """How soon an engine reaches an error by any of its series, or by those of a method.
+    def best(self, engine: str, target: float, method: str = "") -> Point | None:
+        """Return the setting by which an engine reaches an error soonest, by a method or by any.
 
-        Ours by the public call alone, overhead included.
+        Ours is the public call alone, overhead included.
         """
         method = method or (PUBLIC if engine == OURS else "")
         curves = [c for c in self.curves if c.series.engine == engine]
         return reach([c for c in curves if c.series.name.startswith(method)], target)
 
-    def ratio(self, other: Reached, target: float) -> float | None:
+    def ratio(self, other: Point | None, target: float) -> float | None:
         """How many times faster we reach it: median of the quotients of each round."""
-        ours = self.best(OURS, target).point
-        if ours is None or other.point is None:
+        ours = self.best(OURS, target)
+        if ours is None or other is None:
             return None
-        return median(a / b for a, b in zip(other.point.seconds, ours.seconds, strict=True))
+        return median(a / b for a, b in zip(other.seconds, ours.seconds, strict=True))
 
-    def cell(self, found: Reached, target: float) -> str:
-        """Time [ms], and how many times ours that is."""
-        ratio = self.ratio(found, target)
-        if found.time is None:
-            return "-"
-        return f"{1e3 * found.time:.3g}" + ("" if ratio is None else f" ({_round(ratio)} x)")
+    def cells(self, found: Iterable[Point | None]) -> dict[str, str]:
+        """Time to each target [ms], and how many times ours that is."""
+        cells = {}
+        for target, point in zip(TARGETS, found, strict=True):
+            ratio = self.ratio(point, target)
+            text = "-" if point is None else f"{1e3 * point.time:.3g}"
+            cells[_head(target)] = text + ("" if ratio is None else f" ({_round(ratio)} x)")
+        return cells
 
-    def series_rows(self) -> Rows:
-        """A row a series."""
-        found = [["engine", "method", "Python runs", "gate", *_heads(TARGETS)]]
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All series, the best of each engine, and those beside the floor, by name of the part."""
+        series = []
         for curve in self.curves:
-            series = curve.series
-            gate = f"{curve.gate:.0e}" if curve.passed else f"{curve.gate:.0e} FAILED"
-            cells = [self.cell(reach([curve], target), target) for target in TARGETS]
-            found.append([series.engine, series.name, series.python, gate, *cells])
-        return found
-
-    def best_rows(self) -> Rows:
-        """The best of each engine."""
-        found = [["engine, best of all settings", *_heads(TARGETS)]]
+            one, failed = curve.series, "" if curve.passed else " FAILED"
+            head = {"engine": one.engine, "method": one.name, "Python runs": one.python}
+            cells = self.cells(reach([curve], target) for target in TARGETS)
+            series.append({**head, "gate": f"{curve.gate:.0e}{failed}", **cells})
+        name, best = "engine, best of all settings", []
         for engine in self.engines:
-            cells = [self.cell(self.best(engine, target), target) for target in TARGETS]
-            found.append([engine, *cells])
-        return found + [[engine, *["not installed"] * len(TARGETS)] for engine in self.missing]
+            cells = self.cells(self.best(engine, target) for target in TARGETS)
+            best.append({name: engine, **cells})
+        absent = dict.fromkeys(map(_head, TARGETS), "not installed")
+        best += [{name: engine, **absent} for engine in self.missing]
+        rows = {"series": series, "best": best, "floor": self._list_floor()}
+        return {part: pd.DataFrame(listed) for part, listed in rows.items()}
 
-    def floor_rows(self) -> Rows:
+    def _list_floor(self) -> list[dict[str, str]]:
         """What a program that evaluates one acceleration at a time can do at most, and peers."""
         counts, cost = self.floor.evaluations, self.floor.seconds
-        found = [["", *_heads(counts)], ["evaluations, at least", *map(str, counts.values())]]
+        rows = [{"": "evaluations, at least", **{_head(t): str(n) for t, n in counts.items()}}]
         if cost is None:
-            return found
-        times = {t: n * cost for t, n in counts.items()}
-        found.append(["in C [ms]", *(f"{1e3 * x:.3g}" for x in times.values())])
+            return rows
+        times = {target: count * cost for target, count in counts.items()}
+        rows.append({"": "in C [ms]", **{_head(t): f"{1e3 * x:.3g}" for t, x in times.items()}})
         for engine in self.engines:
-            own = {target: self.best(engine, target).time for target in times}
-            cells = ["-" if x is None else f"{_round(x / times[t])} x" for t, x in own.items()]
-            found.append([f"{engine} over that", *cells])
-        return found
+            own = {target: self.best(engine, target) for target in times}
+            cells = {_head(t): "-" if p is None else f"{_round(p.time / times[t])} x"
+                     for t, p in own.items()}  # fmt: skip
+            rows.append({"": f"{engine} over that", **cells})
+        return rows
 
     def verdicts(self) -> list[str]:
         """One sentence for each claim on an engine that is here."""
@@ -133,7 +141,7 @@ class Results:
                 if ratio is not None:
                     met = "met" if ratio >= asked else "NOT met"
                     verdict = f"{_round(ratio)} times faster than {name} (target {asked:,}: {met})"
-                found.append(f"{target:.0e} rad: {verdict}")
+                found.append(f"{_head(target)}: {verdict}")
         return found
 
     def settings(self) -> list[str]:
@@ -142,10 +150,10 @@ class Results:
         for engine in self.engines:
             parts = []
             for target in TARGETS:
-                point = self.best(engine, target).point
+                point = self.best(engine, target)
                 if point is not None:
                     method = next(c.series.name for c in self.curves if point in c.points)
-                    parts.append(f"{target:.0e} rad: {method}, {point.setting.label}")
+                    parts.append(f"{_head(target)}: {method}, {point.setting.label}")
             lines.append(f"{engine}: {'; '.join(parts) or 'none'}")
         return lines
 
@@ -165,25 +173,30 @@ class Results:
 
 def write_table(results: Results) -> str:
     """Text for the terminal."""
-    texts = [
-        str(DataFrame(rows[1:], columns=rows[0]).to_string(index=False))
-        for rows in (results.series_rows(), results.best_rows(), results.floor_rows())
-    ]
+    texts = {part: str(rows.to_string(index=False)) for part, rows in results.tables().items()}
     head = (
         "One second of Example 2. Processor time [ms] to an error of the orientation at the end,\n"
         "and how many times that is ours. '-': not reached by any setting tried."
     )
-    verdicts, missing = "\n".join(results.verdicts()), "\n".join(results.missing_lines())
-    return "\n\n".join(
-        [head, *texts[:2], verdicts, texts[2], "\n".join(filter(None, [results.run(), missing]))]
-    )
+    end = "\n".join([results.run(), *results.missing_lines()])
+    verdicts = "\n".join(results.verdicts())
+    return "\n\n".join([head, texts["series"], texts["best"], verdicts, texts["floor"], end])
 
 
 def write(results: Results, folder: Path) -> None:
-    """Write peers.md, peers.csv, one row a setting that was timed or failed, and peers.json."""
+    """Write peers.md, .png, .csv, a row for each setting timed or failed, and peers.json."""
     rows = [row for curve in results.curves for row in _list_points(curve)]
-    DataFrame(rows).to_csv(folder / "peers.csv", index=False, lineterminator="\n")
-    curves = [(c.series.engine, c.series.name, [c]) for c in results.curves]
+    pd.DataFrame(rows).to_csv(folder / "peers.csv", index=False, lineterminator="\n")
+    reached = [
+        (engine, "best of all", target, results.best(engine, target))
+        for engine in results.engines
+        for target in TARGETS
+    ]
+    reached += [
+        (curve.series.engine, curve.series.name, target, reach([curve], target))
+        for curve in results.curves
+        for target in TARGETS
+    ]
     document = {
         "machine": results.machine,
         "rounds": results.rounds,
@@ -199,14 +212,15 @@ def write(results: Results, folder: Path) -> None:
             for c in results.curves
         },
         "reached": [
-            _describe_reached(engine, "best of all", results.best(engine, target), results, target)
-            for engine in results.engines
-            for target in TARGETS
-        ]
-        + [
-            _describe_reached(engine, method, reach(own, target), results, target)
-            for engine, method, own in curves
-            for target in TARGETS
+            {
+                "engine": engine,
+                "method": method,
+                "error_rad": target,
+                "ms": None if point is None else 1e3 * point.time,
+                "setting": None if point is None else point.setting.label,
+                "over_ours": results.ratio(point, target),
+            }
+            for engine, method, target, point in reached
         ],
         "verdicts": results.verdicts(),
         "floor": {
@@ -217,15 +231,13 @@ def write(results: Results, folder: Path) -> None:
     write_json(folder / "peers.json", document)
     lines = ["The settings behind the best times:", "", *(f"- {x}." for x in results.settings())]
     missing = [line for text in results.missing_lines() for line in (text, "")]
-    parts = {
-        "best": format_markdown(results.best_rows()),
+    parts = {part: markdown(rows) for part, rows in results.tables().items()} | {
         "verdicts": "\n".join(f"- {line}." for line in results.verdicts()),
-        "floor": format_markdown(results.floor_rows()),
-        "series": format_markdown(results.series_rows()),
         "settings": "\n".join([*missing, *lines]),
         "run": results.run(),
     }
     fill_page(DOCS / "peers.md", parts, folder / "peers.md")
+    draw(folder)
 
 
 def _list_points(curve: Curve) -> list[dict[str, Any]]:
@@ -236,7 +248,6 @@ def _list_points(curve: Curve) -> list[dict[str, Any]]:
             "setting": point.setting.label,
             "steps": point.setting.steps or "",
             "error_at_end_rad": _format(point.error),
-            "largest_error_rad": _format(point.largest),
             "gamma_error_at_end_rad": _format(point.gamma),
             "median_ms": _format(1e3 * point.time),
             "min_ms": _format(1e3 * min(point.seconds)) if point.seconds else "",
@@ -247,22 +258,8 @@ def _list_points(curve: Curve) -> list[dict[str, Any]]:
     ]
 
 
-def _describe_reached(
-    engine: str, method: str, found: Reached, results: Results, target: float
-) -> dict[str, Any]:
-    return {
-        "engine": engine,
-        "method": method,
-        "error_rad": target,
-        "ms": None if found.time is None else 1e3 * found.time,
-        "interpolated_ms": None if found.between is None else 1e3 * found.between,
-        "setting": None if found.point is None else found.point.setting.label,
-        "over_ours": results.ratio(found, target),
-    }
-
-
-def _heads(targets: Any) -> list[str]:
-    return [f"{target:.0e} rad" for target in targets]
+def _head(target: float) -> str:
+    return f"{target:.0e} rad"
 
 
 def _round(ratio: float) -> str:
@@ -271,6 +268,46 @@ def _round(ratio: float) -> str:
 
 def _format(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else ""
+
+
+def draw(folder: Path) -> None:
+    """Write peers.png beside peers.csv and peers.json."""
+    rows = pd.read_csv(folder / "peers.csv")
+    rows = rows[rows.median_ms.notna() & rows.failed.isna()]
+    machine = json.loads((folder / "peers.json").read_text(encoding="utf-8"))["machine"]
+    note = f"Thin: single methods. {machine['processor']}, one core, {machine['date']}."
+    save_figure(draw_engines(rows, note), folder / "peers.png")
+
+
+@styled
+def draw_engines(rows: pd.DataFrame, note: str) -> Figure:
+    """Draw one thin curve a method, and the best of all; of sst_ros that of the public call."""
+    figure = Figure(figsize=(10.5, 5.4), layout="constrained")
+    axes = figure.subplots()
+    for engine, (colour, marker) in STYLES.items():
+        own = rows[rows.engine == engine]
+        for _, group in own.groupby("method"):
+            axes.plot(*find_front(group), color=colour, linewidth=1.0, alpha=0.3)
+        public = own[own.method.str.startswith(PUBLIC)]
+        best = find_front(own if public.empty else public)
+        label = engine if len(own) else ""
+        axes.plot(*best, color=colour, marker=marker, markersize=5, label=label, zorder=3)
+    for error in (1e-6, 1e-9):  # which the tables name
+        axes.axhline(error, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
+    axes.set(xscale="log", yscale="log", ylim=(0.5 * SMALLEST, LARGEST))
+    axes.set_xlabel("processor time of one simulated second [ms], median")
+    axes.set_ylabel("error of the orientation at t = 1 s [rad]")
+    axes.set_title("Work-precision diagram: Example 2 of the paper", loc="left")
+    figure.legend(loc="outside right upper", fontsize=9.5, title="best of all settings")
+    figure.supxlabel(note, fontsize=8.5, color="#444444")
+    return figure
+
+
+def find_front(rows: pd.DataFrame) -> tuple[list[float], list[float]]:
+    """Times [ms] and errors [rad] that no faster one is as accurate as, in order of time."""
+    sorted_rows = rows.sort_values(["median_ms", "error_at_end_rad"])
+    best = sorted_rows[sorted_rows.error_at_end_rad.cummin().diff().fillna(-1.0) < 0.0]
+    return best.median_ms.tolist(), best.error_at_end_rad.clip(lower=SMALLEST).tolist()
 
 
 def fill_readme(text: str, results: dict[str, Any]) -> str:
@@ -292,7 +329,7 @@ def fill_readme(text: str, results: dict[str, Any]) -> str:
     lines.append("| --- | ---: | ---: |")
     for engine, name in README_ROWS.items():
         cells = " | ".join(cell(best.get((engine, target))) for target in (1e-6, 1e-9))
-        lines.append(f"| {name.format('a run of `prepare`')} | {cells} |")
+        lines.append(f"| {name} | {cells} |")
     return fill(text, {"speed": "\n".join(lines)})
 
 
@@ -304,4 +341,5 @@ def write_readme() -> None:
 
 
 if __name__ == "__main__":
+    draw(DOCS)
     write_readme()

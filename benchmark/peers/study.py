@@ -11,9 +11,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from functools import partial
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,27 +22,25 @@ from benchmark.peers.task import DURATION, Moving, Pose, Task, find_relative, tu
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 
 TARGETS = (1e-3, 1e-6, 1e-9)
-SAMPLES = 20
-"""The reference is known at the multiples of DURATION / SAMPLES."""
 
 Progress = Callable[[str, int, int], None]
 
 
-class Run(NamedTuple):
-    """A setting that is ready to go; both start anew each time.
+class Failed(Exception):
+    """A run that has no result; says why."""
+
+
+class Engine:
+    """An engine with the mechanism in it at one setting; all that it needs is made beforehand.
 
     Attributes:
-        whole: do the second, leave the end in the engine's own terms. This is what is timed.
-        poses: do it in so many equal pieces and tell the pose at the end of each.
+        run: do the second from its start; this is timed.
+        pose: where a run has ended, of what `run` returned.
 
     """
 
-    whole: Callable[[], Any]
-    poses: Callable[[int], list[Pose]]
-
-
-class Failed(Exception):
-    """A run that has no result; says why."""
+    run: Callable[[], Any]
+    pose: Callable[[Any], Pose]
 
 
 @dataclass(frozen=True)
@@ -52,15 +50,13 @@ class Setting:
     Attributes:
         label: for people.
         steps: how many, all of one length; 0 where they are adaptive.
-        prepare: builds what is needed; it is not timed.
-        samples: False where only the pose at the end can be had.
+        make: gives the engine, ready to run.
 
     """
 
     label: str
     steps: int
-    prepare: Callable[[], Run]
-    samples: bool = True
+    make: Callable[[], Engine]
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ class Series:
     python: str
     tolerance: float
     acceleration: Callable[[Moving], np.ndarray]
-    settings: Sequence[Setting] = field(default_factory=list)
+    settings: Sequence[Setting] = ()
 
     def gate(self, task: Task) -> float:
         """Largest relative difference to the paper's equations at the moving states."""
@@ -90,22 +86,25 @@ class Series:
         return largest if math.isfinite(largest) else math.inf
 
 
-def make_ladder(first: float, last: float, factor: float) -> list[int]:
-    """Step counts from first to last, each about `factor` times the one before."""
+def list_steps(
+    first: float, last: float, factor: float, make: Callable[[int], Engine], note: str = ""
+) -> list[Setting]:
+    """Return settings from the first number of steps to the last, each about `factor` finer."""
     counts, now = [], float(first)
     while now <= last * 1.001:
-        count = round(now) if now < 40 else 20 * round(now / 20)
-        if count not in counts:
-            counts.append(count)
+        counts.append(round(now) if now < 40 else 20 * round(now / 20))
         now *= factor
-    return counts
+    return [
+        Setting(f"{count} steps{note}", count, partial(make, count))
+        for count in dict.fromkeys(counts)
+    ]
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Poses by sample number 1 .. SAMPLES, their own error [rad], and how they were found."""
+    """The pose at the end, its own error [rad], and how it was found."""
 
-    poses: dict[int, Pose]
+    pose: Pose
     error: float
     how: str
 
@@ -113,13 +112,11 @@ class Reference:
 def solve_task(task: Task) -> Reference:
     """Solve the task in extended precision."""
     problem = InitialValueProblem(task.scene)
-    if (problem.count, problem.seconds) != (SAMPLES, DURATION):
-        raise RuntimeError("the reference is known at other times")
+    if problem.seconds != DURATION:
+        raise RuntimeError("the reference is known at another time")
     found = solve_reference(problem, compiled=True)
-    poses = {
-        k: task.pose_of(found.states[k, :7].astype(float).tolist()) for k in range(1, SAMPLES + 1)
-    }
-    return Reference(poses, found.own.orientation, found.how)
+    end = task.pose_of(found.states[-1, :7].astype(float).tolist())
+    return Reference(end, found.own.orientation, found.how)
 
 
 @dataclass
@@ -128,16 +125,14 @@ class Point:
 
     Attributes:
         error: of the orientation at the end [rad].
-        largest: of the orientation at all samples that steps and reference share [rad].
         gamma: largest error of an actuator angle at the end [rad].
         seconds: processor time of the whole second, one a round; empty for what was not timed.
 
     """
 
     setting: Setting
-    error: float
-    largest: float
-    gamma: float
+    error: float = math.inf
+    gamma: float = math.inf
     failed: str = ""
     seconds: list[float] = field(default_factory=list)
 
@@ -159,15 +154,6 @@ class Curve:
     def passed(self) -> bool:
         return self.gate <= self.series.tolerance
 
-    @property
-    def front(self) -> list[Point]:
-        """Timed points, fastest first, without those that are slower and no better."""
-        found: list[Point] = []
-        for point in sorted((p for p in self.points if p.seconds), key=lambda p: p.time):
-            if not found or point.error < found[-1].error:
-                found.append(point)
-        return found
-
 
 def run_study(
     task: Task, reference: Reference, series: list[Series], rounds: int, progress: Progress
@@ -175,21 +161,21 @@ def run_study(
     """Gate all, run all settings for their errors, then time the worthwhile ones in rounds."""
     curves = [Curve(one, one.gate(task)) for one in series]
     passed = [curve for curve in curves if curve.passed]
-    total = sum(len(curve.series.settings) for curve in passed)
+    total, done = sum(len(curve.series.settings) for curve in passed), 0
     calls: dict[int, Callable[[], Any]] = {}
     points: dict[int, Point] = {}
     for curve in passed:
-        runs: dict[int, Run] = {}
+        tried = []
         for setting in curve.series.settings:
-            done = sum(len(one.points) for one in passed) + 1
+            done += 1
             progress(f"errors: {curve.series.engine}", done, total)
-            curve.points.append(_try(setting, reference, runs))
+            tried.append(_try(setting, reference))
         best = math.inf
-        for point in sorted(curve.points, key=lambda p: (p.setting.steps, p.error)):
-            beaten = point.setting.steps and point.error >= best
-            if id(point.setting) in runs and not beaten:
-                calls[id(point)], points[id(point)] = runs[id(point.setting)].whole, point
+        for point, engine in sorted(tried, key=lambda both: (both[0].setting.steps, both[0].error)):
+            if engine is not None and (not point.setting.steps or point.error < best):
+                calls[id(point)], points[id(point)] = engine.run, point
             best = min(best, point.error)
+        curve.points += [point for point, _ in tried]
     seconds = time_in_turn(
         calls,
         rounds,
@@ -201,52 +187,22 @@ def run_study(
     return curves
 
 
-def _try(setting: Setting, reference: Reference, runs: dict[int, Run]) -> Point:
-    """Run a setting once for its errors; keep what was prepared in `runs`."""
-    nothing = (math.inf, math.inf, math.inf)
+def _try(setting: Setting, reference: Reference) -> tuple[Point, Engine | None]:
+    """Run a setting once for its errors; also return what was made for it."""
     try:
-        run = setting.prepare()
-        pieces = math.gcd(setting.steps, SAMPLES) if setting.samples else 1
-        found = run.poses(pieces)
+        engine = setting.make()
+        found = engine.pose(engine.run())
+        if not np.all(np.isfinite(found.rotation)):
+            raise Failed("not finite")
     except (Failed, ArithmeticError, ValueError, RuntimeError) as error:
-        return Point(setting, *nothing, failed=str(error) or type(error).__name__)
-    expected = [reference.poses[(piece + 1) * SAMPLES // pieces] for piece in range(pieces)]
-    angles = [turn_between(a.rotation, b.rotation) for a, b in zip(found, expected, strict=True)]
-    if not np.all(np.isfinite(angles)):
-        return Point(setting, *nothing, failed="not finite")
-    runs[id(setting)] = run
-    turn = found[-1].gamma - expected[-1].gamma
+        return Point(setting, failed=str(error) or type(error).__name__), None
+    turn = found.gamma - reference.pose.gamma
     turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
-    return Point(setting, angles[-1], max(angles), float(np.abs(turn).max()))
+    angle = turn_between(found.rotation, reference.pose.rotation)
+    return Point(setting, angle, float(np.abs(turn).max())), engine
 
 
-@dataclass(frozen=True)
-class Reached:
-    """How soon an error is reached.
-
-    Attributes:
-        time: of the fastest setting that is as good or better [s]; None where there is none.
-        between: where the straight line in the log-log plot crosses the error [s], or None.
-        point: that setting.
-
-    """
-
-    time: float | None
-    between: float | None
-    point: Point | None
-
-
-def reach(curves: list[Curve], target: float) -> Reached:
-    """Best over some curves."""
-    good = [p for curve in curves for p in curve.front if p.error <= target]
-    if not good:
-        return Reached(None, None, None)
-    point = min(good, key=lambda p: p.time)
-    crossings = []
-    for curve in curves:
-        for rough, fine in pairwise(curve.front):
-            if rough.error > target >= fine.error:
-                share = math.log(rough.error / target) / math.log(rough.error / fine.error)
-                crossings.append(float(rough.time * (fine.time / rough.time) ** share))
-                break
-    return Reached(point.time, min(crossings, default=None), point)
+def reach(curves: list[Curve], target: float) -> Point | None:
+    """Return the fastest setting of some curves whose error is at most the target."""
+    good = [p for curve in curves for p in curve.points if p.seconds and p.error <= target]
+    return min(good, key=lambda point: point.time, default=None)

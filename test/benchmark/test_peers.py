@@ -69,7 +69,8 @@ def test_short_runs_converge_to_each_other(peers, task):
     for module in ("ours", "pinocchio_peer"):
         series = [s for s in peers(module).series(task, quick=True) if s.name.startswith("DOP853")]
         setting = next(s for s in series[0].settings if s.steps >= 20)
-        ends.append(setting.prepare().poses(1)[0])
+        engine = setting.make()
+        ends.append(engine.pose(engine.run()))
     assert peers("task").turn_between(ends[0].rotation, ends[1].rotation) < 1e-7
     assert np.abs(ends[0].gamma - ends[1].gamma).max() < 1e-7
 
@@ -82,7 +83,7 @@ def test_our_headline_is_the_public_call(peers, task):
     first, *others = ours.series(task, quick=True)
     assert first.name.startswith(ours.PUBLIC)
     assert not any(series.name.startswith(ours.PUBLIC) for series in others)
-    ends = [setting.prepare().poses(1)[0].rotation for setting in first.settings]
+    ends = [(engine := setting.make()).pose(engine.run()).rotation for setting in first.settings]
     for setting, end in zip(first.settings, ends, strict=True):
         tolerance = float(setting.label.split()[1])
         assert peers("task").turn_between(end, ends[-1]) <= tolerance + 1e-13
@@ -90,14 +91,14 @@ def test_our_headline_is_the_public_call(peers, task):
 
 def test_the_table_has_times_and_their_ratio_to_ours(peers, task):
     study, results = peers("study"), peers("results")
-    truth = study.Reference({}, 0.0, "")
+    truth, floor = study.Reference(None, 0.0, ""), peers("floor").Floor({}, None)
     rows = []
     for module, seconds in (("ours", 1e-5), ("scipy_peer", 1e-3)):
         series = peers(module).series(task, quick=True)[0]
-        point = study.Point(series.settings[0], 1e-12, 1e-12, 1e-12, seconds=[seconds] * 3)
+        point = study.Point(series.settings[0], 1e-12, 1e-12, seconds=[seconds] * 3)
         rows.append(study.Curve(series, 0.0, [point]))
-    found = results.Results(rows, {}, truth, 3, True, 1.0, None)
-    ours, other = found.series_rows()[1:]
+    found = results.Results(rows, {}, truth, 3, True, 1.0, floor).tables()["series"]
+    ours, other = found.to_numpy().tolist()
     assert set(ours[4:]) == {"0.01 (1 x)"} and set(other[4:]) == {"1 (100 x)"}
 
 
@@ -116,10 +117,10 @@ def test_the_readme_has_the_table_of_the_published_results(peers):
 def test_the_picture_shows_the_best_settings(peers, tmp_path):
     pytest.importorskip("matplotlib")
     pandas = pytest.importorskip("pandas")
-    picture = peers("picture")
+    results = peers("results")
     rows = pandas.DataFrame({"median_ms": [2.0, 1.0, 3.0], "error_at_end_rad": [1.0, 3.0, 2.0]})
-    assert picture.find_front(rows) == ([1.0, 2.0], [3.0, 1.0])
+    assert results.find_front(rows) == ([1.0, 2.0], [3.0, 1.0])
     for name in ("peers.csv", "peers.json"):
         shutil.copy(ROOT / "docs" / name, tmp_path)
-    picture.draw(tmp_path)
+    results.draw(tmp_path)
     assert (tmp_path / "peers.png").stat().st_size > 30_000
