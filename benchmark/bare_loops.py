@@ -13,7 +13,6 @@ Each is measured as the machine is, and where it is asked to let no core sleep (
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import subprocess
 import sys
@@ -43,38 +42,14 @@ TICK_NS = 1_000_000
 LOG_TICKS = LOG_NS // TICK_NS
 NODE = "the node"
 LEAST = "and looks for commands on 2 topics"
-LOOPS: dict[str, tuple[int, str, int, int]] = {
-    "sleeps every tick": (1, "python", 0, 0),
-    "the same, in C": (1, "libc", 0, 0),
-    "sleeps every sample": (2, "python", 0, 0),
-    "and publishes 3 topics": (2, "python", 3, 0),
-    "the same, sleep in C": (2, "libc", 3, 0),
-    "and publishes 4 topics": (2, "python", 4, 0),
-    LEAST: (2, "python", 4, 2),
+LOOPS: dict[str, tuple[int, int, int]] = {
+    "sleeps every tick": (1, 0, 0),
+    "sleeps every sample": (2, 0, 0),
+    "and publishes 3 topics": (2, 3, 0),
+    "and publishes 4 topics": (2, 4, 0),
+    LEAST: (2, 4, 2),
 }
-"""Ticks from one deadline to the next, what sleeps, how many topics are published and read."""
-
-
-class _Timespec(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
-
-
-def sleep_in_python(until_ns: int) -> None:
-    """Sleep until a monotonic time [ns] by time.sleep."""
-    if (left := until_ns - time.monotonic_ns()) > 0:
-        time.sleep(left / 1e9)
-
-
-def make_libc_sleep() -> Callable[[int], None]:
-    """Return a function that sleeps until a monotonic time [ns] by clock_nanosleep."""
-    sleep, at, absolute = ctypes.CDLL(None).clock_nanosleep, _Timespec(), 1
-    given = time.CLOCK_MONOTONIC, absolute, ctypes.byref(at), None
-
-    def sleep_until(until_ns: int) -> None:
-        at.seconds, at.nanoseconds = divmod(until_ns, 1_000_000_000)
-        sleep(*given)
-
-    return sleep_until
+"""Ticks from one deadline to the next, how many topics are published and read."""
 
 
 def exchange(number: int, read: int) -> Callable[[int], None]:
@@ -112,9 +87,8 @@ def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
     latency = scheduling.CpuDmaLatency()
     latency.request(latency_us)
-    ticks, sleeper, number, read = LOOPS[name]
+    ticks, number, read = LOOPS[name]
     publish = exchange(number, read) if number else None
-    sleep = sleep_in_python if sleeper == "python" else make_libc_sleep()
     time.sleep(1.0)  # until discovery is quiet
     scheduling.schedule(20, threading.get_native_id())
     scheduling.quiet()
@@ -122,7 +96,8 @@ def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     began = deadline = time.monotonic_ns()
     while deadline < began + seconds * 1e9:
         deadline += step_ns
-        sleep(deadline)
+        if (left := deadline - time.monotonic_ns()) > 0:
+            time.sleep(left / 1e9)
         late = time.monotonic_ns() - deadline
         if late >= TICK_NS:
             missed += late // TICK_NS

@@ -14,13 +14,12 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import describe_machine, divide, join_line, judge, time_in_turn, write_json
+from benchmark.measure import Costs, describe_machine, join_line, time_in_turn, write_json
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.batch import Batch
@@ -69,15 +68,28 @@ def main(arguments: list[str] | None = None) -> int:
     host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
-    rows = _rows(seconds, options.scenarios)
+    counts = {
+        (name, who): (1 if who in (COLUMNS, TRACED) else STEPS) * options.scenarios
+        * len(METHODS[name].b)
+        for name, who in seconds
+    }  # fmt: skip
+    costs = Costs(seconds, counts, FLOOR)
     print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {SIMD_WIDTH} lanes.")
     print("Time per evaluation and scenario: a step with limits and error, over its stages.")
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
     print("\n".join(work.notes), "\n")
-    _print(rows, seconds)
+    costs.print()
+    for name in METHODS:
+        for floor in (FLOOR, PLAIN):
+            costs.judge(name, ONE, floor, AT_MOST_C)
+        for who in (STAR, BODIES):
+            print(f"{name}: {who} over fixed {costs.ratio(name, who, ONE):.2f}")
+        for ours in (ALL, ONE):
+            for who in (COLUMNS, TRACED):
+                costs.judge(name, who, ours, AT_LEAST_COLUMNS, least=True)
     print("\n" + join_line(host))
-    document = {"machine": host, "scene": options.scene, "rows": rows, "notes": work.notes}
-    write_json(options.json, document)
+    found = {"scene": options.scene, "rows": costs.rows(), "notes": work.notes}
+    write_json(options.json, {"machine": host, **found})
     return 0
 
 
@@ -230,38 +242,6 @@ def _step(method: Tableau, slope: Callable[..., State], t: float, y: State) -> S
     new = [x + STEP * combined(method.b, j) for j, x in enumerate(y)]
     length = np.sqrt(sum(x * x for x in new[:4]))
     return tuple(x / length for x in new[:4]) + tuple(new[4:])
-
-
-def _rows(seconds: dict[tuple[str, str], list[float]], number: int) -> list[dict[str, Any]]:
-    rows = []
-    for name, who in seconds:
-        steps = 1 if who in (COLUMNS, TRACED) else STEPS
-        count = steps * number * len(METHODS[name].b)
-        row = {"method": name, "who": who, "ns": 1e9 * median(seconds[name, who]) / count}
-        if (name, FLOOR) in seconds:
-            share = divide(seconds, (name, who), (name, FLOOR))
-            row["over_c"] = share * STEPS / steps
-        rows.append(row)
-    return rows
-
-
-def _print(rows: list[dict[str, Any]], seconds: dict[tuple[str, str], list[float]]) -> None:
-    print(f"{'method':10}{'who':32}{'ns':>10}{'over C SIMD':>14}")
-    for row in rows:
-        over = f"{row['over_c']:.2f}" if "over_c" in row else ""
-        print(f"{row['method']:10}{row['who']:32}{row['ns']:10.1f}{over:>14}")
-    print()
-    for name in METHODS:
-        for floor in (FLOOR, PLAIN):
-            if (name, floor) in seconds:
-                to_c = divide(seconds, (name, ONE), (name, floor))
-                print(judge(f"{name}: numba over {floor}, 1 thread each", to_c, AT_MOST_C))
-        for who in (STAR, BODIES):
-            print(f"{name}: {who} over fixed {divide(seconds, (name, who), (name, ONE)):.2f}")
-        for ours in (ALL, ONE):
-            for who in (COLUMNS, TRACED):
-                times = STEPS * divide(seconds, (name, who), (name, ours))
-                print(judge(f"{name}: {who} over {ours}", times, AT_LEAST_COLUMNS, least=True))
 
 
 if __name__ == "__main__":

@@ -8,59 +8,53 @@ Example 2 at 1e-9 rad by collocation, compiled; the command is `sst-ros scene li
 
 from __future__ import annotations
 
-import resource
+import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from statistics import median
 
-from sst_ros import Simulation, Trajectory, load_scene, prepare, simulate
+from benchmark.measure import divide, time_in_turn
+from sst_ros import Simulation, load_scene, prepare, simulate
 from sst_ros.simulation.simulate_gauss import GaussMotion
 
-ROUNDS, CALLS, STARTS = 50, 10, 9
+ROUNDS, STARTS = 50, 9
+LIST, NUMPY = ("-m", "sst_ros", "scene", "list"), ("-c", "import numpy")
 
 
-def seconds(call: Callable[[], object]) -> float:
-    """Time of a call, mean of several [s]."""
-    began = time.perf_counter()
-    for _ in range(CALLS):
-        call()
-    return (time.perf_counter() - began) / CALLS
-
-
-def processor_seconds(*words: str) -> float:
-    """Processor time of one start of Python [s]."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def start(*words: str) -> None:
+    """Start Python."""
     subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True, timeout=60)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def used_by_children() -> float:
+    """Processor time of all processes that were started [s]."""
+    used = os.times()
+    return used.children_user + used.children_system
 
 
 def main() -> None:
     scene = load_scene("example2_heavy")
     state = Simulation(scene).state
     assert scene.torque is not None
-    motion = GaussMotion(scene, scene.torque, [*state.quaternion, *state.body_rate], 1.0, 1e-9)
-
-    def whole() -> Trajectory:
-        return simulate(scene, method="gauss", tolerance=1e-9)
-
-    prepared = prepare(scene, method="gauss", tolerance=1e-9).run
-    times = [(seconds(motion.run), seconds(prepared), seconds(whole)) for _ in range(ROUNDS)]
-    alone, again, all_of_it = (1e6 * median(column) for column in zip(*times, strict=True))
+    whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
+    calls: dict[str, Callable[[], object]] = {
+        "integration": GaussMotion(
+            scene, scene.torque, [*state.quaternion, *state.body_rate], 1.0, 1e-9
+        ).run,
+        "prepare().run()": prepare(scene, method="gauss", tolerance=1e-9).run,
+        "simulate()": whole,
+    }
     print(whole())
-    print(f"integration {alone:.1f} us, prepare().run() {again:.1f}, simulate() {all_of_it:.0f}")
-    ratio = median(b / a for a, b, _ in times)
+    times = time_in_turn(calls, ROUNDS)
+    print(", ".join(f"{name} {1e6 * median(taken):.1f} us" for name, taken in times.items()))
+    ratio = divide(times, "prepare().run()", "integration")
     print(f"overhead {ratio - 1.0:.2f} times the integration (median of {ROUNDS} rounds)")
-    starts = [
-        (
-            processor_seconds("-m", "sst_ros", "scene", "list"),
-            processor_seconds("-c", "import numpy"),
-        )
-        for _ in range(STARTS)
-    ]
-    ratio = median(listing / numpy for listing, numpy in starts)
+    starts = time_in_turn(
+        {words: partial(start, *words) for words in (LIST, NUMPY)}, STARTS, clock=used_by_children
+    )
+    ratio = divide(starts, LIST, NUMPY)
     print(
         f"sst-ros scene list: {ratio:.1f} times import numpy (median of {STARTS} rounds, limit 3)"
     )

@@ -20,7 +20,7 @@ import numba
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import describe_machine, divide, join_line, judge, time_in_turn, write_json
+from benchmark.measure import Costs, describe_machine, join_line, time_in_turn, write_json
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -63,9 +63,22 @@ def main(arguments: list[str] | None = None) -> int:
     host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
-    rows = _rows(seconds)
-    _print(rows, host, options, sum(system.program.operations.values()))
-    write_json(options.json, {"machine": host, "scene": options.scene, "rows": rows})
+    counts = {
+        (work, who): STEPS // 10 if who == PLAIN and work != "evaluation" else STEPS
+        for work, who in seconds
+    }
+    costs = Costs(seconds, counts, "C -O3")
+    size = sum(system.program.operations.values())
+    print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
+    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
+    costs.print()
+    for work in dict.fromkeys(work for work, _ in seconds):
+        costs.judge(work, NUMBA, "C -O3", AT_MOST_C)
+    plain = median(seconds["rk4 step", PLAIN]) / counts["rk4 step", PLAIN]
+    met = "met" if plain <= AT_MOST_PLAIN else "MISSED"
+    print(f"plain rk4 step {1e6 * plain:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
+    print("\n" + join_line(host))
+    write_json(options.json, {"machine": host, "scene": options.scene, "rows": costs.rows()})
     return 0
 
 
@@ -127,37 +140,6 @@ def _chain(program: Program, compiled: Callable[[Any], Any]) -> Callable[..., fl
     exec(text, names)
     function: Callable[..., float] = compiled(names["slopes"])
     return function
-
-
-def _rows(seconds: dict[tuple[str, str], list[float]]) -> list[dict[str, Any]]:
-    rows = []
-    for work, who in seconds:
-        count = STEPS // 10 if who == PLAIN and work != "evaluation" else STEPS
-        row = {"work": work, "who": who, "ns": 1e9 * median(seconds[work, who]) / count}
-        floor = (work, "C -O3")
-        if floor in seconds and who != PLAIN:
-            row["over_c"] = divide(seconds, (work, who), floor)
-        rows.append(row)
-    order = list(dict.fromkeys(row["work"] for row in rows))
-    return sorted(rows, key=lambda row: (order.index(row["work"]), row["ns"]))
-
-
-def _print(rows: list[dict[str, Any]], host: dict[str, str], options: Any, size: int) -> None:
-    print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
-    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
-    print(f"{'work':16}{'who':24}{'time':>12}{'over C -O3':>12}")
-    for row in rows:
-        over = f"{row['over_c']:.2f}" if "over_c" in row else ""
-        took = f"{row['ns']:.0f} ns" if row["ns"] < 1e4 else f"{row['ns'] / 1e3:.1f} us"
-        print(f"{row['work']:16}{row['who']:24}{took:>12}{over:>12}")
-    print()
-    for row in rows:
-        if row["who"] == NUMBA and "over_c" in row:
-            print(judge(f"{row['work']}: numba over C", row["over_c"], AT_MOST_C))
-        if row["who"] == PLAIN and row["work"] == "rk4 step":
-            met = "met" if row["ns"] <= 1e9 * AT_MOST_PLAIN else "MISSED"
-            print(f"plain rk4 step {row['ns'] / 1e3:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
-    print("\n" + join_line(host))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of a long run: time and memory of `report run` for ten minutes at 500 Hz.
 
-python -m benchmark.long_bag [--seconds 600] [--bag FOLDER] [--sqlite] [--json FILE]
+python -m benchmark.long_bag [--seconds 600] [--bag FOLDER] [--json FILE]
 
 The bag is a true run: Example 2 with springs and friction in its actuators, so that it stays inside
 for ever, solved by single steps at 1 kHz. Every message is what the nodes would send, made by
@@ -14,11 +14,12 @@ import argparse
 import dataclasses
 import json
 import math
-import os
+import resource
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +60,11 @@ def endless() -> Scene:
     )
 
 
-def write(path: Path, seconds: float, *, sqlite: bool = False, shown: bool = False) -> Path:
+def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     """Write the bag of a run of the endless scene; its folder must not exist."""
     scene, samples = endless(), round(seconds * 1e9 / TICK_NS / TICKS_A_SAMPLE)
-    kinds = {
-        "/joint_states": _joint_state(),
-        "/sst_simulator/orientation": _of_stamped("Quaternion", "quaternion", "xyzw"),
-        "/sst_simulator/euler_zyz": _of_stamped("Vector3", "vector", "xyz"),
-        "/sst_simulator/applied_torques": _trajectory(),
-        "/sst_simulator/commands": _command(),
-    }
-    plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
+    kinds = _messages()
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {
             topic: writer.add_connection(topic, message.__msgtype__, typestore=STORE)
             for topic, message in kinds.items()
@@ -152,52 +146,39 @@ def _make(kind: str, **fields: Any) -> Any:
     return STORE.types[f"{package}/msg/{name}"](**fields)
 
 
-def _time(nanoseconds: int, kind: str = "Time") -> Any:
-    return _make(f"builtin_interfaces/{kind}", sec=0, nanosec=nanoseconds)
-
-
-def _header() -> Any:
-    return _make("std_msgs/Header", stamp=_time(0), frame_id="base")
-
-
-def _joint_state() -> Any:
+def _messages() -> dict[str, Any]:
+    """Give a message for each topic, with a mark in place of each number."""
+    stamp = _make("builtin_interfaces/Time", sec=0, nanosec=0)
+    header = _make("std_msgs/Header", stamp=stamp, frame_id="base")
     marks = {name: np.full(9, _MARK) for name in ("position", "velocity", "effort")}
-    return _make("sensor_msgs/JointState", header=_header(), name=list(JOINTS), **marks)
-
-
-def _of_stamped(kind: str, field: str, letters: Sequence[str]) -> Any:
-    inner = _make(f"geometry_msgs/{kind}", **dict.fromkeys(letters, _MARK))
-    return _make(f"geometry_msgs/{kind}Stamped", header=_header(), **{field: inner})
-
-
-def _trajectory() -> Any:
     none = {name: np.empty(0) for name in ("positions", "velocities", "accelerations")}
+    ends = [(k + 1) * TICK_NS for k in range(TICKS_A_SAMPLE)]
     points = [
         _make("trajectory_msgs/JointTrajectoryPoint", **none, effort=np.full(3, _MARK),
-              time_from_start=_time((k + 1) * TICK_NS, "Duration"))
-        for k in range(TICKS_A_SAMPLE)
+              time_from_start=_make("builtin_interfaces/Duration", sec=0, nanosec=end))
+        for end in ends
     ]  # fmt: skip
-    names = list(JOINTS[:3])
-    return _make(
-        "trajectory_msgs/JointTrajectory", header=_header(), joint_names=names, points=points
-    )
-
-
-def _command() -> Any:
+    turn = _make("geometry_msgs/Quaternion", **dict.fromkeys("xyzw", _MARK))
+    angles = _make("geometry_msgs/Vector3", **dict.fromkeys("xyz", _MARK))
     layout = _make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
-    return _make("std_msgs/Float64MultiArray", layout=layout, data=np.full(3, _MARK))
-
-
-def reported(bag: Path, out: Path) -> tuple[float, float, float]:
-    """Report a bag in a process of its own; wall time, processor time [s], peak memory [GB]."""
-    command = [sys.executable, "-m", "sst_ros", "report", "run", str(bag), "--out", str(out)]
-    began = time.perf_counter()
-    child = os.posix_spawn(command[0], command, dict(os.environ))
-    _, status, used = os.wait4(child, 0)
-    if status:
-        raise SystemExit(f"report run has failed: {os.waitstatus_to_exitcode(status)}")
-    wall = time.perf_counter() - began
-    return wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
+    return {
+        "/joint_states": _make(
+            "sensor_msgs/JointState", header=header, name=list(JOINTS), **marks
+        ),
+        "/sst_simulator/orientation": _make(
+            "geometry_msgs/QuaternionStamped", header=header, quaternion=turn
+        ),
+        "/sst_simulator/euler_zyz": _make(
+            "geometry_msgs/Vector3Stamped", header=header, vector=angles
+        ),
+        "/sst_simulator/applied_torques": _make(
+            "trajectory_msgs/JointTrajectory", header=header, joint_names=list(JOINTS[:3]),
+            points=points,
+        ),
+        "/sst_simulator/commands": _make(
+            "std_msgs/Float64MultiArray", layout=layout, data=np.full(3, _MARK)
+        ),
+    }  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -205,15 +186,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmark.long_bag", description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--bag", type=Path, help="write it there and keep it; used if it exists")
-    parser.add_argument("--sqlite", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         bag = options.bag or Path(folder) / "bag"
         if not bag.exists():
-            write(bag, options.seconds, sqlite=options.sqlite, shown=True)
+            write(bag, options.seconds, shown=True)
         size = sum(file.stat().st_size for file in bag.iterdir()) / 1e9
-        wall, busy, memory = reported(bag, Path(folder) / "report")
+        words = ["-m", "sst_ros", "report", "run", str(bag), "--out", str(Path(folder) / "report")]
+        began = time.perf_counter()
+        subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
+        wall, used = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+        busy, memory = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
         summary = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
     found = {
         "samples": summary["samples_recorded"],

@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TypeVar
 
-from sst_ros.report.results import processor
+from sst_ros.report.results import markdown, processor, table
 
 Key = TypeVar("Key", bound=Hashable)
 DOCS = Path(__file__).parents[1] / "docs"
@@ -92,23 +92,69 @@ def join_line(host: dict[str, str]) -> str:
     return ", ".join(f"{key} {value}" for key, value in host.items())
 
 
-def judge(what: str, value: float, target: float, *, least: bool = False) -> str:
-    """Return a line that says whether a target is met; of at most `target`, or `least` that."""
-    met = value >= target if least else value <= target
-    digits = ".0f" if least else ".2f"
-    return f"{what} {value:{digits}}, target {target}: {'met' if met else 'MISSED'}"
-
-
-def format_markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Return Markdown of rows, of which the first is the header."""
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def format_columns(columns: Sequence[dict[str, str]]) -> str:
     """Return Markdown with a row for each key and a column for each run."""
     keys = list(dict.fromkeys(key for column in columns for key in column))
-    return format_markdown([[key, *(column.get(key, "") for column in columns)] for key in keys])
+    name, *heads = (column[keys[0]] for column in [{keys[0]: keys[0]}, *columns])
+    rows = [
+        {name: key, **dict(zip(heads, (c.get(key, "") for c in columns), strict=True))}
+        for key in keys[1:]
+    ]
+    return markdown(table(rows))
+
+
+class Costs:
+    """What pieces of work cost by who does them, and their ratios to a floor.
+
+    Args:
+        seconds: of each (work, who), one number a round.
+        counts: how many units of work that was.
+        floor: who does the least.
+
+    """
+
+    def __init__(
+        self,
+        seconds: dict[tuple[str, str], list[float]],
+        counts: dict[tuple[str, str], int],
+        floor: str,
+    ) -> None:
+        self._ns = {
+            key: [1e9 * one / counts[key] for one in taken] for key, taken in seconds.items()
+        }
+        self.floor = floor
+
+    def ratio(self, work: str, who: str, other: str) -> float | None:
+        """Median over the rounds of a cost over another's; None where one is not known."""
+        if (work, who) not in self._ns or (work, other) not in self._ns:
+            return None
+        return divide(self._ns, (work, who), (work, other))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Work, who, the median cost [ns], and the ratio to the floor where that is known."""
+        found = []
+        for work, who in self._ns:
+            row = {"work": work, "who": who, "ns": median(self._ns[work, who])}
+            over = self.ratio(work, who, self.floor)
+            found.append(row if over is None else {**row, "over_c": over})
+        return found
+
+    def judge(self, work: str, who: str, other: str, target: float, *, least: bool = False) -> None:
+        """Print whether a ratio of at most `target` is met, or of `least` that."""
+        value = self.ratio(work, who, other)
+        if value is not None:
+            met = value >= target if least else value <= target
+            said = f"{value:.0f}" if least else f"{value:.2f}"
+            verdict = "met" if met else "MISSED"
+            print(f"{work}: {who} over {other} {said}, target {target}: {verdict}")
+
+    def print(self) -> None:
+        """Print all rows."""
+        print(f"{'work':18}{'who':38}{'ns':>10}{'over ' + self.floor:>16}")
+        for row in self.rows():
+            over = f"{row['over_c']:.2f}" if "over_c" in row else ""
+            print(f"{row['work']:18}{row['who']:38}{row['ns']:10.1f}{over:>16}")
+        print()
 
 
 def fill(text: str, parts: dict[str, str]) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured orders of convergence, energy over a long run with springs, and states between steps.
+"""Measured orders of convergence, and energy over a long run with springs.
 
 python -m benchmark.orders [--seconds 1000]
 """
@@ -9,11 +9,8 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
 from dataclasses import replace
-from statistics import median
 
-import numpy as np
 from scipy.integrate import solve_ivp
 
 from benchmark.measure import describe_machine, join_line
@@ -26,7 +23,6 @@ from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 
 SPAN = 0.4
-PUSH = (0.02, 0.03, -0.02)
 STEPS = {"rk4": 128, "dopri5": 128, "dop853": 16, "rodas4": 128}
 WITHIN, MOST_DRIFT = 0.1, 1e-12
 
@@ -38,7 +34,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     _orders()
     _energy(options.seconds)
-    _between()
     print("\n" + join_line(describe_machine("numpy", "scipy", "numba")))
     return 0
 
@@ -87,43 +82,6 @@ def _energy(seconds: int) -> None:
     met = "met" if worst / scale <= MOST_DRIFT else "MISSED"
     print(f"\nEnergy with springs, dop853, {seconds} s: off by {worst / scale:.1e}"
           f" of {scale:.2g} J, target {MOST_DRIFT:.0e}: {met}")  # fmt: skip
-
-
-def _between() -> None:
-    """What `within` costs and is worth, beside a polynomial through a step (SciPy's, order 7)."""
-    scene = scenes.load("example2_heavy")
-    assert scene.torque is not None
-    print("\nStates inside a step of 10 ms")
-    for compiled in (False, True):
-        simulation = Simulation(scene, "dop853", tolerance=1e-10, compiled=compiled)
-        simulation.step(PUSH, 10_000_000)
-        times: dict[str, list[float]] = {"step": [], "within": []}
-        for _ in range(200):
-            begin = time.process_time()
-            simulation.step(PUSH, 10_000_000)
-            between = time.process_time()
-            inside = simulation.within(simulation.state.time_ns - 4_000_000)
-            times["step"].append(between - begin)
-            times["within"].append(time.process_time() - between)
-        micro = {name: 1e6 * median(taken) for name, taken in times.items()}
-        print(f"{'numba' if compiled else 'plain':8}a step {micro['step']:.0f} us, a state inside "
-              f"it {micro['within']:.0f} us (medians of 200)")  # fmt: skip
-    model = kernel.model_of(scene)
-    start = [*Simulation(scene).state.quaternion, 1.0, -2.0, 1.5]
-
-    def slope(t: float, y: np.ndarray) -> tuple[float, ...]:
-        return kernel.derivative(model, tuple(y), PUSH)
-
-    whole = solve_ivp(slope, (0.0, 0.05), start, method="DOP853", rtol=1.0, atol=1.0,
-                      first_step=0.05, dense_output=True)  # fmt: skip
-    inside = solve_ivp(slope, (0.0, 0.02), start, method="DOP853", rtol=2.3e-14, atol=1e-15)
-    system = ODE(Dynamics.of(scene))
-    runner = CompiledMethod(system, DOP853, compiled=False)
-    again = runner.step_fixed(0.0, 0.02, 1, start, list(PUSH))
-    truth = inside.y[:, -1]
-    off = math.dist(whole.sol(0.02), truth), math.dist(again, truth)
-    print("In a step of 50 ms, 20 ms after its begin: "
-          f"polynomial {off[0]:.0e} off, a step to there {off[1]:.0e} off")  # fmt: skip
 
 
 if __name__ == "__main__":

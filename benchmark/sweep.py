@@ -10,12 +10,9 @@ a factor of its own, final states to Parquet.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
-import json
 import os
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,13 +20,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
 
-from benchmark.measure import describe_machine, join_line, write_json
-from sst_ros import load_scene, simulate, sweep
-from sst_ros.mechanism.frames import rotation_matrix
+from benchmark.measure import describe_machine, divide, join_line, time_in_turn, write_json
+from sst_ros import load_scene, sweep
 from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_chunk, run_local
 from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
@@ -160,31 +157,15 @@ def _mujoco(ours_us: float) -> dict[str, float]:
 
     The runs are alike: other inertias would not change its time.
     """
-    from mujoco import rollout
-
-    from benchmark.peers.mujoco_peer import Model
-    from benchmark.peers.task import Task
+    from benchmark.peers.mujoco_peer import Rollout
+    from benchmark.peers.study import solve_task
+    from benchmark.peers.task import Task, turn_between
 
     task, threads, copies = Task(), len(os.sched_getaffinity(0)), 8
-    model = Model(task, "RK4", 0.01, 0.003, True)
-    mujoco, kind = model.mujoco, model.mujoco.mjtState.mjSTATE_FULLPHYSICS
-    model.reset(MUJOCO_STEPS)
-    middles = (np.arange(MUJOCO_STEPS) + 0.5) / MUJOCO_STEPS
-    controls = np.array([task.torque_at(t) for t in middles])[None].repeat(copies, axis=0)
-    start = np.zeros(mujoco.mj_stateSize(model.model, kind))
-    mujoco.mj_getState(model.model, model.data, start, kind)
-    data = [mujoco.MjData(model.model) for _ in range(threads)]
-    best = np.inf
-    for _ in range(3):
-        began = time.perf_counter()
-        states, _ = rollout.rollout(
-            model.model, data, start[None].repeat(copies, axis=0), controls, nstep=MUJOCO_STEPS
-        )
-        best = min(best, (time.perf_counter() - began) / copies)
-    mujoco.mj_setState(model.model, model.data, states[0, -1], kind)
-    reference = simulate(task.scene, t_eval=[1.0], tolerance=1e-12).quaternion[0]
-    turn = rotation_matrix(reference).T @ model.pose().rotation
-    error = float(np.linalg.norm(turn - np.eye(3)) / np.sqrt(2.0))
+    engine = Rollout(task, "RK4", 0.01, 0.003, MUJOCO_STEPS, copies, threads)
+    seconds = time_in_turn({"": engine.run}, ROUNDS)[""]
+    best = min(seconds) / copies
+    error = turn_between(engine.pose(None).rotation, solve_task(task).pose.rotation)
     return {
         "us a run, MuJoCo rollout": 1e6 * best,
         "error of MuJoCo [rad]": error,
@@ -194,64 +175,63 @@ def _mujoco(ours_us: float) -> dict[str, float]:
 
 def _cluster(steps: int) -> dict[str, float]:
     """Two workers of one thread against one; cost of a chunk and of the scheduler."""
-    from sst_ros.sweeps.cluster_engine import connect, run_on_cluster, send_code
+    import distributed
 
-    found: dict[str, float] = {}
+    from sst_ros.sweeps.cluster_engine import run_on_cluster, send_code
+
+    dask: Any = distributed
     study = study_of(CHUNKS * CHUNK)
     ready = prepare(study, steps)
-    times: dict[str, list[float]] = {"1": [], "2": [], "C": []}
-    with tempfile.TemporaryDirectory() as folder:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        dask.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
+        dask.Client(cluster) as client,
+    ):
         task = ChunkTask(study, steps, folder, list_versions())
-        began = time.perf_counter()
-        run_chunk(task, 0)
-        found["seconds of a chunk"] = time.perf_counter() - began
-        with _workers(Path(folder), 2) as address, contextlib.closing(connect(address)) as client:
-            client.wait_for_workers(2, timeout=60)
-            send_code(client, ready.module)
-            both = list(client.scheduler_info(n_workers=-1)["workers"])
-            for index, worker in enumerate(both):  # each prepares the study once
-                client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
-            for _ in range(ROUNDS):
-                began = time.perf_counter()
-                futures = [
-                    client.submit(_on_worker, task, i, workers=[both[0]], pure=False)
-                    for i in range(CHUNKS)
-                ]
-                client.gather(futures)
-                times["1"].append(time.perf_counter() - began)
-                began = time.perf_counter()
-                run_on_cluster(client, task, range(CHUNKS), lambda _: None, print)
-                times["2"].append(time.perf_counter() - began)
-                times["C"].append(_bound())
-            began = time.perf_counter()
+        client.wait_for_workers(2, timeout=60)
+        send_code(client, ready.module)
+        both = list(client.scheduler_info(n_workers=-1)["workers"])
+
+        def run_on_one() -> None:
+            one = {"workers": both[:1], "pure": False}
+            client.gather([client.submit(_on_worker, task, i, **one) for i in range(CHUNKS)])
+
+        def run_on_both() -> None:
+            run_on_cluster(client, task, range(CHUNKS), lambda _: None, print)
+
+        def run_empty() -> None:
             client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
-            found["seconds of an empty task, scheduler and client"] = (
-                time.perf_counter() - began
-            ) / 1000
-    for workers in ("1", "2"):
-        found[f"seconds of {CHUNKS} chunks, {workers} workers"] = min(times[workers])
-    found["two workers against one"] = float(np.median(np.divide(times["1"], times["2"])))
-    found["two loops in C against one, in turn with them"] = float(np.median(times["C"]))
-    # The scheduler serves one task at a time: more threads than this wait for it.
-    useful = found["seconds of a chunk"] / found["seconds of an empty task, scheduler and client"]
-    found["largest useful number of threads"] = useful
-    found["hours of 1e9 runs on them"] = (
-        RUNS / CHUNK * found["seconds of an empty task, scheduler and client"] / 3600
-    )
-    return found
+
+        for index, worker in enumerate(both):  # each prepares the study once
+            client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
+        calls: dict[str, Callable[[], object]] = {
+            "1": run_on_one,
+            "2": run_on_both,
+            "a chunk": partial(run_chunk, task, 0),
+            "1 in C": partial(_hash, 1),
+            "2 in C": partial(_hash, 2),
+            "empty": run_empty,
+        }
+        times = time_in_turn(calls, ROUNDS)
+    chunk, empty = median(times["a chunk"]), median(times["empty"]) / 1000
+    return {
+        "seconds of a chunk": chunk,
+        "seconds of an empty task, scheduler and client": empty,
+        f"seconds of {CHUNKS} chunks, 1 workers": min(times["1"]),
+        f"seconds of {CHUNKS} chunks, 2 workers": min(times["2"]),
+        "two workers against one": divide(times, "1", "2"),
+        # What this machine gives to any program.
+        "two loops in C against one, in turn with them": 2.0 * divide(times, "1 in C", "2 in C"),
+        # The scheduler serves one task at a time: more threads than this wait for it.
+        "largest useful number of threads": chunk / empty,
+        "hours of 1e9 runs on them": RUNS / CHUNK * empty / 3600,
+    }
 
 
-def _bound() -> float:
-    """Throughput of two threads of bare C against one: what this machine gives to any program."""
-    times = []
-    for threads in (1, 2):
-        began = time.perf_counter()
-        with ThreadPoolExecutor(threads) as pool:
-            list(
-                pool.map(lambda _: hashlib.pbkdf2_hmac("sha256", b"", b"", HASHES), range(threads))
-            )
-        times.append(time.perf_counter() - began)
-    return 2.0 * times[0] / times[1]
+def _hash(threads: int) -> None:
+    """Occupy threads with bare C, each with the same work."""
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda _: hashlib.pbkdf2_hmac("sha256", b"", b"", HASHES), range(threads)))
 
 
 def _on_worker(task: ChunkTask, index: int) -> str:
@@ -260,33 +240,6 @@ def _on_worker(task: ChunkTask, index: int) -> str:
 
 def _nothing(index: int) -> int:
     return index
-
-
-@contextlib.contextmanager
-def _workers(folder: Path, count: int) -> Any:
-    """Start a scheduler and workers of one thread; end them."""
-    file = folder / "scheduler.json"
-    options = ["--no-dashboard", "--scheduler-file", str(file)]
-    words = [["dask_scheduler", "--port", "0", "--host", "127.0.0.1", *options]]
-    words += [["dask_worker", "--nthreads", "1", "--no-nanny", *options]] * count
-    processes = []
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    try:
-        for name, *more in words:
-            command = [sys.executable, "-m", f"distributed.cli.{name}", *more]
-            null, code = subprocess.DEVNULL, Path(__file__).parents[1]
-            process = subprocess.Popen(command, env=environment, stdout=null, stderr=null, cwd=code)
-            processes.append(process)
-            end = time.monotonic() + 60.0
-            while not (file.exists() and file.stat().st_size):
-                if time.monotonic() > end:
-                    raise TimeoutError("no scheduler")
-                time.sleep(0.05)
-        yield json.loads(file.read_text())["address"]
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait(60)
 
 
 if __name__ == "__main__":

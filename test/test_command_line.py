@@ -126,49 +126,44 @@ def test_a_port_that_is_none_is_refused(port, capsys):
     assert "must be a whole number from 1024 to 65535" in capsys.readouterr().err
 
 
-def broken(options):
-    raise ValueError("a bug\nwith two lines")
+BUG = "internal error, please report it with the output of --debug: "
 
 
-def test_a_bug_is_one_line_and_a_traceback_only_on_demand(monkeypatch, capsys):
-    monkeypatch.setattr("sst_ros.cli.scenes.list_all", broken)
-    assert main(["scene", "list"]) == 3
-    said = capsys.readouterr().err
-    assert said.startswith("sst-ros: internal error, please report it with the output of --debug: ")
-    assert said.endswith("ValueError: a bug with two lines\n")
-    assert main(["scene", "list", "--debug"]) == 3
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (ValueError("a bug\nwith two lines"), 3, f"{BUG}ValueError: a bug with two lines"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_what_goes_wrong_is_one_line_and_a_traceback_only_on_demand(
+    error, status, said, monkeypatch, capsys
+):
+    def fail(options):
+        raise error
+
+    monkeypatch.setattr("sst_ros.cli.scenes.list_all", fail)
+    assert main(["scene", "list"]) == status
+    assert capsys.readouterr().err == f"sst-ros: {said}\n"
+    assert main(["scene", "list", "--debug"]) == status
     assert "Traceback" in capsys.readouterr().err
 
 
-def interrupted(options):
-    raise KeyboardInterrupt
-
-
-def test_an_interrupt_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("sst_ros.cli.scenes.list_all", interrupted)
-    assert main(["scene", "list"]) == 130
-    assert capsys.readouterr().err == "sst-ros: interrupted\n"
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_is_one_line():
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "sst_ros", "scene", "list"],
-            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60,
-        )  # fmt: skip
-    assert (done.returncode, done.stderr) == (1, "sst-ros: No space left on device\n")
-
-
-def test_a_reader_that_leaves_is_no_error():
-    ours, theirs = os.pipe()
-    os.close(ours)
+@pytest.mark.parametrize(
+    ("reader", "said"), [("full", "sst-ros: No space left on device\n"), ("gone", "")]
+)
+def test_output_that_is_not_taken_is_no_traceback(reader, said):
+    """A full disk is one line; a reader that leaves is no error of ours."""
+    ours, theirs = os.pipe() if reader == "gone" else (None, os.open("/dev/full", os.O_WRONLY))
+    if ours is not None:
+        os.close(ours)
     done = subprocess.run(
         [sys.executable, "-m", "sst_ros", "scene", "schema"],
         stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60,
     )  # fmt: skip
     os.close(theirs)
-    assert (done.returncode, done.stderr) == (1, "")
+    assert (done.returncode, done.stderr) == (1, said)
 
 
 @pytest.mark.parametrize(
@@ -239,15 +234,6 @@ def test_scene_names_are_completed(tmp_path):
         "example2_heavy",
         "example2_stroke",
     ]
-
-
-def test_importing_the_package_imports_nothing_slow():
-    code = "import sys, sst_ros; print([m for m in {!r} if m in sys.modules])"
-    slow = ("numpy", "scipy", "matplotlib", "numba", "rclpy", "yaml")
-    done = subprocess.run(
-        [sys.executable, "-c", code.format(slow)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "[]\n"
 
 
 def test_every_command_names_itself_and_a_function_that_exists(capsys):

@@ -6,42 +6,34 @@ import sys
 
 import pytest
 
-HEAVY = {"scipy", "matplotlib", "numba", "rclpy", "pandas"}
-RUN = """
-import sst_ros
-simulation = sst_ros.Simulation("example2")
-simulation.step((1.0, 0.0, 0.0), 10_000_000)
-"""
-LIST = """
-from sst_ros.__main__ import main
-main(["scene", "list"])
-"""
-SCHEMA = """
-from sst_ros.__main__ import main
-main(["scene", "schema"])
-"""
-LOADED = """
-import sys
-print(*sys.modules)
-"""
+HEAVY = {"scipy", "matplotlib", "numba", "rclpy", "pandas", "rosbags", "dask"}
 DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "scene"}
 """Rooms that a command needs which prints documents; of `nodes` the handler of signals."""
+COMMAND = "from sst_ros.__main__ import main; main({!r})"
+RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_000_000)"
 
 
-@pytest.mark.parametrize("program", [RUN, LIST, SCHEMA])
-def test_numpy_and_yaml_are_all_that_is_loaded(program):
+@pytest.mark.parametrize(
+    ("program", "rooms", "excluded"),
+    [
+        pytest.param("import sst_ros", set(), HEAVY | {"numpy", "yaml"}, id="package"),
+        pytest.param(RUN, None, HEAVY, id="a run"),
+        pytest.param(COMMAND.format(["scene", "list"]), DOCUMENTS, HEAVY, id="scene list"),
+        pytest.param(COMMAND.format(["scene", "schema"]), DOCUMENTS, HEAVY, id="scene schema"),
+        pytest.param(COMMAND.format(["describe"]), DOCUMENTS, HEAVY, id="describe"),
+    ],
+)
+def test_what_is_loaded(program, rooms, excluded):
+    """A command takes little more time than the import of NumPy: it loads what it needs."""
     done = subprocess.run(
-        [sys.executable, "-c", program + LOADED],
+        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sys.modules)"],
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
-    loaded = done.stdout.splitlines()[-1].split()
-    libraries = {name.split(".")[0] for name in loaded}
-    assert "sst_ros" in libraries and not libraries & HEAVY
-    if program is not RUN:
-        rooms = {
-            name.split(".")[1] for name in loaded if name.count(".") == 2 and "sst_ros." in name
-        }
-        assert rooms <= DOCUMENTS and "sst_ros.dynamics.kernel" not in loaded
+    names = [name.split(".") for name in done.stdout.splitlines()[-1].split()]
+    assert ["sst_ros"] in names and not {first for first, *_ in names} & excluded
+    if rooms is not None:
+        assert {name[1] for name in names if name[0] == "sst_ros" and len(name) > 2} <= rooms
+        assert ["sst_ros", "dynamics", "kernel"] not in names
 
 
 STEPS = """

@@ -77,7 +77,7 @@ def series(task: Task, quick: bool) -> list[Series]:
 
     add("RK4, compiled torques", _Compiled, "RK4", 6400 if quick else 16000, grid)
     add("RK4, Python torques", _Steps, "RK4", 3200, few)
-    add("RK4, rollout", _Rollout, "RK4", 6400, few)
+    add("RK4, rollout", Rollout, "RK4", 6400, few)
     for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST"):
         name = f"{integrator.lower()}, compiled torques"
         add(name, _Compiled, integrator, 16000, grid[:: 1 if quick else 3])
@@ -245,25 +245,30 @@ def _compile(sines: tuple[tuple[int, tuple[float, float, float]], ...]) -> tuple
     return library, kind(("torques", library))
 
 
-class _Rollout(_Steps):
+class Rollout(_Steps):
     """MuJoCo's own loop over a table of torques."""
 
     PYTHON, MOTORS = "nowhere", True
 
-    def prepare(self) -> None:
+    def __init__(
+        self, task: Task, integrator: str, mobility: float, settle: float, steps: int,
+        copies: int = 1, threads: int = 1,
+    ) -> None:  # fmt: skip
         from mujoco import rollout
 
-        model, data, steps = self.model.model, self.model.data, self.steps
+        super().__init__(task, integrator, mobility, settle, steps)
+        model, data = self.model.model, self.model.data
         middles = (np.arange(steps) + 0.5) * (DURATION / steps)
-        controls = np.array([self.model.task.torque_at(t) for t in middles])[None]
+        controls = np.array([task.torque_at(t) for t in middles])[None].repeat(copies, axis=0)
         self.model.reset(steps)
         self.kind = self.mujoco.mjtState.mjSTATE_FULLPHYSICS
         start = np.zeros(self.mujoco.mj_stateSize(model, self.kind))
         self.mujoco.mj_getState(model, data, start, self.kind)
-        self.states = np.empty((1, steps, len(start)))
+        self.states = np.empty((copies, steps, len(start)))
+        own = data if threads == 1 else [self.mujoco.MjData(model) for _ in range(threads)]
         self.rollout = partial(
-            rollout.rollout, model, data, start[None], controls, nstep=steps, state=self.states,
-            sensordata=np.empty((1, steps, 0)),
+            rollout.rollout, model, own, start[None].repeat(copies, axis=0), controls, nstep=steps,
+            state=self.states, sensordata=np.empty((copies, steps, 0)),
         )  # fmt: skip
 
     def run(self) -> None:

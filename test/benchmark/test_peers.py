@@ -7,94 +7,80 @@ Engines that are not installed are skipped; nothing is timed here.
 import importlib
 import json
 import shutil
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from docs.blocks import ROOT
 
-ROOT = Path(__file__).parents[2]
+from benchmark.peers.task import Task, find_relative, turn_between
 
 
-@pytest.fixture(scope="module")
-def peers():
-    """Import from benchmark/peers, which is not part of the package."""
-    sys.path.insert(0, str(ROOT))
-    yield lambda name: importlib.import_module(f"benchmark.peers.{name}")
-    sys.path.remove(str(ROOT))
+def peer(name):
+    """Import a module that may need numba or Matplotlib."""
+    return importlib.import_module(f"benchmark.peers.{name}")
 
 
 @pytest.fixture(scope="module")
-def task(peers):
-    return peers("task").Task()
+def task():
+    return Task()
 
 
-def test_kernel_and_paper_agree_where_engines_are_gated(peers, task):
+def test_kernel_and_paper_agree_where_engines_are_gated(task):
     for at in task.moving:
         assert np.linalg.norm(list(at.velocity.values())) > 0.5
-        assert peers("task").find_relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
+        assert find_relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("module", "needs"),
-    [
-        ("mujoco_peer", ("mujoco", "numba")),
-        ("pinocchio_peer", ("pinocchio",)),
-        ("drake_peer", ("pydrake",)),
-        ("exudyn_peer", ("exudyn",)),
-        ("scipy_peer", ("scipy",)),
-    ],
-)
-def test_gate(peers, task, module, needs):
-    for name in needs:
-        pytest.importorskip(name)
-    for series in peers(module).series(task, quick=True):
+@pytest.mark.parametrize("module", ["mujoco", "pinocchio", "pydrake", "exudyn", "scipy"])
+def test_gate(task, module):
+    pytest.importorskip(module)
+    for series in peer(f"{module.removeprefix('py')}_peer").series(task, quick=True):
         assert series.gate(task) <= series.tolerance, series.name
 
 
-def test_gate_sees_a_wrong_inertia(peers, task):
+def test_gate_sees_a_wrong_inertia(task):
     """One inertia wrong by 1e-3 must not get through."""
     pytest.importorskip("pinocchio")
-    wrong = peers("task").Task()
+    wrong = Task()
     wrong.tensors["i2"] = 1.001 * wrong.tensors["i2"]
-    series = peers("pinocchio_peer").series(wrong, quick=True)[0]
+    series = peer("pinocchio_peer").series(wrong, quick=True)[0]
     assert series.gate(task) > series.tolerance
 
 
-def test_short_runs_converge_to_each_other(peers, task):
+def test_short_runs_converge_to_each_other(task):
     """The whole path of one engine and ours: same end to the order of their steps."""
     pytest.importorskip("numba")
     pytest.importorskip("pinocchio")
     ends = []
     for module in ("ours", "pinocchio_peer"):
-        series = [s for s in peers(module).series(task, quick=True) if s.name.startswith("DOP853")]
+        series = [s for s in peer(module).series(task, quick=True) if s.name.startswith("DOP853")]
         setting = next(s for s in series[0].settings if s.steps >= 20)
         engine = setting.make()
         ends.append(engine.pose(engine.run()))
-    assert peers("task").turn_between(ends[0].rotation, ends[1].rotation) < 1e-7
+    assert turn_between(ends[0].rotation, ends[1].rotation) < 1e-7
     assert np.abs(ends[0].gamma - ends[1].gamma).max() < 1e-7
 
 
 @pytest.mark.slow
-def test_our_headline_is_the_public_call(peers, task):
+def test_our_headline_is_the_public_call(task):
     """Every setting ends within its tolerance of the finest one, and no other series counts."""
     pytest.importorskip("numba")
-    ours = peers("ours")
+    ours = peer("ours")
     first, *others = ours.series(task, quick=True)
     assert first.name.startswith(ours.PUBLIC)
     assert not any(series.name.startswith(ours.PUBLIC) for series in others)
     ends = [(engine := setting.make()).pose(engine.run()).rotation for setting in first.settings]
     for setting, end in zip(first.settings, ends, strict=True):
         tolerance = float(setting.label.split()[1])
-        assert peers("task").turn_between(end, ends[-1]) <= tolerance + 1e-13
+        assert turn_between(end, ends[-1]) <= tolerance + 1e-13
 
 
-def test_the_table_has_times_and_their_ratio_to_ours(peers, task):
-    study, results = peers("study"), peers("results")
-    truth, floor = study.Reference(None, 0.0, ""), peers("floor").Floor({}, None)
+def test_the_table_has_times_and_their_ratio_to_ours(task):
+    study, results = peer("study"), peer("results")
+    truth, floor = study.Reference(None, 0.0, ""), peer("floor").Floor({}, None)
     rows = []
     for module, seconds in (("ours", 1e-5), ("scipy_peer", 1e-3)):
-        series = peers(module).series(task, quick=True)[0]
+        series = peer(module).series(task, quick=True)[0]
         point = study.Point(series.settings[0], 1e-12, 1e-12, seconds=[seconds] * 3)
         rows.append(study.Curve(series, 0.0, [point]))
     found = results.Results(rows, {}, truth, 3, True, 1.0, floor).tables()["series"]
@@ -102,10 +88,10 @@ def test_the_table_has_times_and_their_ratio_to_ours(peers, task):
     assert set(ours[4:]) == {"0.01 (1 x)"} and set(other[4:]) == {"1 (100 x)"}
 
 
-def test_the_readme_has_the_table_of_the_published_results(peers):
+def test_the_readme_has_the_table_of_the_published_results():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     results = json.loads((ROOT / "docs" / "peers.json").read_text(encoding="utf-8"))
-    filled = peers("results").fill_readme(text, results)
+    filled = peer("results").fill_readme(text, results)
     assert filled == text, "run python -m benchmark.peers.results"
     page = (ROOT / "docs" / "peers.md").read_text(encoding="utf-8")
     assert results["machine"]["date"] in page
@@ -114,10 +100,10 @@ def test_the_readme_has_the_table_of_the_published_results(peers):
             assert f"{row['ms']:.3g}" in page
 
 
-def test_the_picture_shows_the_best_settings(peers, tmp_path):
+def test_the_picture_shows_the_best_settings(tmp_path):
     pytest.importorskip("matplotlib")
     pandas = pytest.importorskip("pandas")
-    results = peers("results")
+    results = peer("results")
     rows = pandas.DataFrame({"median_ms": [2.0, 1.0, 3.0], "error_at_end_rad": [1.0, 3.0, 2.0]})
     assert results.find_front(rows) == ([1.0, 2.0], [3.0, 1.0])
     for name in ("peers.csv", "peers.json"):
