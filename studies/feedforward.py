@@ -252,9 +252,9 @@ def _unheld(plant: Scene) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _motion(scene: Scene) -> ReferenceMotion:
-    from sst_ros.recording.recorded_motion import samples
+    from sst_ros.recording.recording import read_motion
 
-    return reference_motion(scene, samples)
+    return reference_motion(scene, read_motion)
 
 
 INTRODUCTION = """\

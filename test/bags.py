@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of a run as the nodes would record it, without ROS: simulated, edited, written."""
 
+import copy
 import dataclasses
 import sys
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.recording.bag_writer import BagWriter
+from sst_ros.recording.recording import Recording
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.simulation.simulation import Simulation
@@ -237,6 +239,13 @@ def edited(entries: list[Entry], topic: str, sample: int, change) -> list[Entry]
         else entry
         for entry in entries
     ]
+
+
+def altered(run: Recording, **values: Any) -> Recording:
+    """Copy a recorded run with other attributes."""
+    again = copy.copy(run)
+    vars(again).update(values)
+    return again
 
 
 def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:

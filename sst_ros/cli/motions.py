@@ -11,8 +11,8 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.time_scaling import as_json, table, time_scaling, write_torques
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import require_free
-from sst_ros.recording.recorded_motion import samples
 from sst_ros.scene.scene import load
+from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.sweeps.chunk_task import read_sweep
 from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.sweep import run_study
@@ -31,12 +31,18 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     scene = load(options.scene)
-    plan = examine(reference_motion(scene, samples), scene)
+    plan = examine(reference_motion(scene, _read_motion), scene)
     write = as_json if options.json else table
     print(write(plan, time_scaling(plan)).rstrip())
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0
+
+
+def _read_motion(bag: str) -> Trajectory:
+    """Read a recorded motion, which needs rosbags; others do not."""
+    found: Trajectory = function("recording.recording:read_motion")(bag)
+    return found
 
 
 def run_sweep(options: argparse.Namespace) -> None:

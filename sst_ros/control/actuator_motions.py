@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,6 +36,9 @@ from sst_ros.mechanism.generic_math import axpy, multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.motions import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
+
+if TYPE_CHECKING:
+    from sst_ros.simulation.trajectory import Trajectory
 
 Path = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 """Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
@@ -186,23 +188,6 @@ def _fading(time: float, fade: float, duration: float) -> tuple[float, float, fl
     return e, (e1 if time < fade else -e1) / fade, e2 / (fade * fade)
 
 
-@dataclass(frozen=True)
-class MotionSamples:
-    """A recorded motion.
-
-    Attributes:
-        times: of the samples, rising [s], shape (n,); the motion begins with the first.
-        gamma, gamma_dot: of the actuators [rad], [rad/s], shape (n, 3).
-        quaternion: of {E} in {B} at the first sample, (x, y, z, w).
-
-    """
-
-    times: Array
-    gamma: Array
-    gamma_dot: Array
-    quaternion: Quaternion
-
-
 def through_points(
     geometry: Geometry,
     start: Quaternion,
@@ -269,21 +254,22 @@ def through_points(
     )
 
 
-def through_samples(geometry: Geometry, samples: MotionSamples) -> ReferenceMotion:
-    """Return the motion of a recording, quintic between samples; it may begin and end moving.
+def through_samples(geometry: Geometry, motion: Trajectory) -> ReferenceMotion:
+    """Return a motion from its first sample on, quintic between samples; its ends may move.
 
     Raises:
         AssemblyError: the recording is of another manipulator.
         SingularConfiguration: the motion meets a parallel singularity.
 
     """
-    times = samples.times - samples.times[0]
-    gamma = np.unwrap(samples.gamma, axis=0)
+    times = motion.t - motion.t[0]
+    gamma = np.unwrap(motion.gamma, axis=0)
     free = np.full_like(gamma, np.nan)
     # Samples lie much denser than the motion turns: several make one piece.
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    spline = Quintic(times, gamma, samples.gamma_dot, free)
-    return ActuatorMotion(geometry, cast("Path", spline.at), pieces, samples.quaternion)
+    spline = Quintic(times, gamma, motion.gamma_dot, free)
+    x, y, z, w = motion.quaternion[0].tolist()
+    return ActuatorMotion(geometry, cast("Path", spline.at), pieces, (x, y, z, w))
 
 
 def follow_assembly(

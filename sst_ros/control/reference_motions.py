@@ -6,12 +6,12 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from scipy.spatial.transform import Rotation
 
 from sst_ros.control.actuator_motions import (
     ActuatorMotion,
-    MotionSamples,
     follow_assembly,
     straight_path,
     sweep_path,
@@ -33,15 +33,18 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
 
+if TYPE_CHECKING:
+    from sst_ros.simulation.trajectory import Trajectory
+
 
 def reference_motion(
-    scene: Scene, samples: Callable[[str], MotionSamples] | None = None
+    scene: Scene, read_motion: Callable[[str], Trajectory] | None = None
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
     Args:
         scene: has a `motion`.
-        samples: reads a bag by its path, as `recording.recorded_motion.samples` does.
+        read_motion: reads a bag by its path, as `recording.recording.read_motion` does.
 
     Raises:
         InputError: the scene has no motion, or one that cannot be made; see `through_points`.
@@ -54,10 +57,10 @@ def reference_motion(
         raise InputError(scene.name, [Problem("motion", None, "the scene has no desired motion")])
     geometry = Geometry.of(scene)
     if motion.recorded:
-        if samples is None:
+        if read_motion is None:
             allowed = "a recorded motion cannot be read here"
             raise InputError(scene.name, [Problem("motion.recorded", motion.recorded.bag, allowed)])
-        return through_samples(geometry, samples(motion.recorded.bag))
+        return through_samples(geometry, read_motion(motion.recorded.bag))
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
     start = (x, y, z, w)

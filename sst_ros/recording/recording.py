@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sst_ros.errors import InputError
+from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import signals
@@ -27,7 +27,6 @@ from sst_ros.recording.topic_tables import (
     TICKS,
     TopicTable,
 )
-from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS
@@ -39,22 +38,6 @@ if TYPE_CHECKING:
 ESSENTIAL = (JOINT_STATES.topic.key, ORIENTATION.topic.key, TICKS.topic.key, SCENE.key)
 """Topics without which a recording is not that of a run."""
 OPTIONAL = (EULER.topic.key, DIAGNOSTICS.key, COMMANDS.topic.key)
-
-
-@dataclass(frozen=True)
-class Commands:
-    """Recorded commands in order of their reception.
-
-    Attributes:
-        received_ns: by the recorder's clock [ns], shape (c,).
-        stamp_ns: stamp of the sample that is answered [ns]; 0 where commands have none, shape (c,).
-        torque: commanded torques [N m], shape (c, 3).
-
-    """
-
-    received_ns: Integers
-    stamp_ns: Integers
-    torque: Array
 
 
 @dataclass(frozen=True)
@@ -85,7 +68,6 @@ class Ticks:
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
 
 
-@dataclass(frozen=True)
 class Recording:
     """A run from its bag. Samples are in order of time; rows belong to samples.
 
@@ -103,33 +85,54 @@ class Recording:
         euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were lost.
         ticks: applied torques.
         idle_states: number of joint states that are no samples, which are not in the arrays.
-        commands: recorded commands.
+        commands: recorded commands of both topics in order of their reception: `received_ns` and
+            `stamp_ns`, that of the sample which is answered, 0 where commands have none [ns],
+            shape (c,); `torque` [N m], shape (c, 3).
         reports: diagnostics of the simulator's run: when received [ns], text by key.
         missing: keys of the topics that are not in the recording.
         signals: all columns of the recording.
 
+    Raises:
+        InputError: the signals are not those of a whole run; the error names the fault.
+
     """
 
-    path: Path
-    scene: Scene
-    start_ns: int
-    time_ns: Integers
-    received_ns: Integers
-    gamma: Array
-    mu: Array
-    beta: Array
-    gamma_dot: Array
-    mu_dot: Array
-    beta_dot: Array
-    effort: Array
-    quaternion: Array
-    euler: Array
-    ticks: Ticks
-    idle_states: int
-    commands: Commands
-    reports: tuple[tuple[int, dict[str, str]], ...]
-    missing: tuple[str, ...]
-    signals: Signals
+    def __init__(self, found: Signals) -> None:
+        self.signals, self.path = found, found.path
+        if absent := [found.absent[key] for key in ESSENTIAL if key in found.absent]:
+            raise InputError(str(self.path), absent)
+        if found.scene is None:
+            raise refusal(self.path, SCENE.key, 0, "the recording must hold one scene")
+        self.scene, self.idle_states = found.scene, found.idle_states
+        self.missing = tuple(key for key in OPTIONAL if key in found.absent)
+        self.reports = tuple(
+            (one.received_ns, one.values)
+            for one in found.statuses
+            if one.name.endswith("run") and "phase" in one.values
+        )
+        joints, orientation, euler, ticks = (
+            _finite_rows(found, table) for table in (JOINT_STATES, ORIENTATION, EULER, TICKS)
+        )
+        if len(joints) < 2:
+            allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
+            if fault := self.diagnostics.get("fault"):
+                allowed += f"; the simulator reports: {fault}"
+            raise refusal(self.path, "joint_states", len(joints), allowed)
+        if not len(ticks):
+            raise refusal(self.path, "applied_torques", 0, "the run has no recorded torque")
+        self.start_ns = min(int(joints.stamp_ns[0]), int(ticks.stamp_ns[0]))
+        self.time_ns, self.received_ns = joints.stamp_ns - self.start_ns, joints.received_ns
+        self.gamma, self.mu, self.beta, *rates, self.effort = np.split(joints.values, 7, axis=1)
+        self.gamma_dot, self.mu_dot, self.beta_dot = rates
+        self.quaternion, self.euler = orientation.at(joints.stamp_ns), euler.at(joints.stamp_ns)
+        with np.errstate(over="ignore"):  # too long is refused just below
+            length = np.sqrt(np.einsum("ij,ij->i", self.quaternion, self.quaternion))
+        wrong = length[np.abs(length - 1.0) > 1e-6]  # nan compares False: lost is not wrong
+        if len(wrong):
+            allowed = "quaternions must have length 1"
+            raise refusal(self.path, "orientation", float(wrong[0]), allowed)
+        self.ticks = _ticks(self.path, ticks, self.start_ns)
+        self.commands = _commands(found)
 
     @property
     def period_ns(self) -> int:
@@ -213,83 +216,38 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
         InputError: it is no recording of a run, or a damaged one; the error names the fault.
 
     """
-    path = Path(path)
-    found = signals.read(path, damaged=damaged)
-    absent = [found.absent[key] for key in ESSENTIAL if key in found.absent]
-    if absent:
-        raise InputError(str(path), absent)
-    if found.scene is None:
-        raise refusal(path, SCENE.key, 0, "the recording must hold one scene")
-    reports = tuple(
-        (one.received_ns, one.values)
-        for one in found.statuses
-        if one.name.endswith("run") and "phase" in one.values
-    )
-    joints, orientation, euler, ticks = (
-        _finite_rows(found, table) for table in (JOINT_STATES, ORIENTATION, EULER, TICKS)
-    )
-    stamps = joints.stamp_ns
-    if len(stamps) < 2:
-        allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
-        if reports and (fault := reports[-1][1].get("fault")):
-            allowed += f"; the simulator reports: {fault}"
-        raise refusal(path, "joint_states", len(stamps), allowed)
-    if not len(ticks.stamp_ns):
-        raise refusal(path, "applied_torques", 0, "the run has no recorded torque")
-    start_ns = min(int(stamps[0]), int(ticks.stamp_ns[0]))
-    quaternion = _rows_at(stamps, orientation)
-    with np.errstate(over="ignore"):  # too long is refused just below
-        length = np.sqrt(np.einsum("ij,ij->i", quaternion, quaternion))
-    if np.any(np.abs(length - 1.0) > 1e-6):  # nan compares False: lost is not wrong
-        wrong = float(length[np.abs(length - 1.0) > 1e-6][0])
-        raise refusal(path, "orientation", wrong, "quaternions must have length 1")
-    gamma, mu, beta, gamma_dot, mu_dot, beta_dot, effort = np.split(joints.values, 7, axis=1)
-    return Recording(
-        path=path,
-        scene=found.scene,
-        start_ns=start_ns,
-        time_ns=stamps - start_ns,
-        received_ns=joints.received_ns,
-        gamma=gamma,
-        mu=mu,
-        beta=beta,
-        gamma_dot=gamma_dot,
-        mu_dot=mu_dot,
-        beta_dot=beta_dot,
-        effort=effort,
-        quaternion=quaternion,
-        euler=_rows_at(stamps, euler),
-        ticks=_ticks(path, ticks, start_ns),
-        idle_states=found.idle_states,
-        commands=_commands(found),
-        reports=reports,
-        missing=tuple(key for key in OPTIONAL if key in found.absent),
-        signals=found,
-    )
+    return Recording(signals.read(Path(path), damaged=damaged))
+
+
+def read_motion(bag: str | Path) -> Trajectory:
+    """Read the motion of a run, to be done again: the samples that have an orientation.
+
+    Raises:
+        InputError: it is no recording of a run, or it has fewer than two such samples.
+
+    """
+    motion = read(bag).trajectory
+    if len(motion) < 2:
+        problem = Problem("orientation", len(motion), "two samples or more must have one")
+        raise InputError(str(bag), [problem])
+    return motion
+
+
+def _rows(found: Signals, table: TopicTable) -> Series:
+    """Return the rows of a topic; none where it was not recorded."""
+    none = np.empty(0, dtype=np.int64)
+    empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
+    return found.topic_series.get(table.topic.key, empty)
 
 
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
-    """Return the rows of a topic, none where it was not recorded; moments of ticks may be nan."""
-    key = table.topic.key
-    if key not in found.topic_series:
-        none = np.empty(0, dtype=np.int64)
-        return Series((), none, none, np.empty((0, len(table.columns))))
-    series = found.topic_series[key]
+    """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
+    series = _rows(found, table)
     bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refusal(found.path, key, row, f"is not finite at stamp {stamp} ns")
+        raise refusal(found.path, table.topic.key, row, f"is not finite at stamp {stamp} ns")
     return series
-
-
-def _rows_at(stamps_ns: Integers, series: Series) -> Array:
-    """Pick the rows at the stamps; nan where there is none."""
-    if np.array_equal(stamps_ns, series.stamp_ns):
-        return series.values
-    result = np.full((len(stamps_ns), series.values.shape[1]), np.nan)
-    there = places(series.stamp_ns, stamps_ns)
-    result[there >= 0] = series.values[there[there >= 0]]
-    return result
 
 
 def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
@@ -301,23 +259,20 @@ def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
         at = int(starts[1:][overlap][0])
         allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
         raise refusal(path, "applied_torques", at, allowed)
-    torque, moment = series.values[:, 1:4], series.values[:, 4:]
+    moment = series.values[:, 4:]
     known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-    return Ticks(starts - start_ns, ends - start_ns, torque, moment if known else None)
+    return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
 
 
-def _commands(found: Signals) -> Commands:
+def _commands(found: Signals) -> Series:
     """Put the commands of both topics in order of their reception."""
-    keys = (COMMANDS.topic.key, STAMPED_COMMANDS.topic.key)
-    parts = [found.topic_series[key] for key in keys if key in found.topic_series]
-    if not parts:
-        none = np.empty(0, dtype=np.int64)
-        return Commands(none, none, np.empty((0, 3)))
-    received = np.concatenate([part.received_ns for part in parts])
-    stamps = np.concatenate([part.stamp_ns for part in parts])
-    torque = np.concatenate([part.values for part in parts])
+    parts = [_rows(found, table) for table in (COMMANDS, STAMPED_COMMANDS)]
+    stamps, received, torque = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("stamp_ns", "received_ns", "values")
+    )
     order = np.argsort(received, kind="stable")
-    return Commands(received[order], stamps[order], torque[order])
+    return Series(COMMANDS.columns, stamps[order], received[order], torque[order])
 
 
 def _usual(lengths_ns: Integers) -> int:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that a recording holds of a run, as columns; what it lacks is left out and named.
+"""All that a recording holds of a run, as tables: in memory, as pandas, CSV or Parquet.
 
-Any recording in which some topic of a run is found is read; `recording.read` makes a `Recording`
-of it, which refuses what is not a whole run.
+Numbers have the bits of the recording. Any recording in which some topic of a run is found is read;
+what it lacks is left out and named. `recording.read` makes a `Recording` of it, which refuses what
+is not a whole run.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import Problem
 from sst_ros.extras import require
+from sst_ros.host.output import require_free, write_into
+from sst_ros.host.table_file import write_table
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.bag_reader import Bag, refusal
 from sst_ros.recording.topic_tables import (
@@ -44,6 +47,8 @@ if TYPE_CHECKING:
 
 Integers: TypeAlias = NDArray[np.int64]
 
+FORMATS = ("csv", "parquet")
+
 
 @dataclass(frozen=True)
 class Series:
@@ -61,6 +66,28 @@ class Series:
     stamp_ns: Integers
     received_ns: Integers
     values: Array
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, *names: str) -> Array:
+        """Columns of quantities, as in "gamma_1", shape (n, number of names)."""
+        names_of = [column.quantity for column in self.columns]
+        return np.asarray(self.values[:, [names_of.index(name) for name in names]])
+
+    @property
+    def torque(self) -> Array:
+        """Torques [N m] of a table that has some, shape (n, 3)."""
+        return self.take("tau_1", "tau_2", "tau_3")
+
+    def at(self, stamps_ns: Integers) -> Array:
+        """Rows at these stamps, shape (m, columns); nan where there is none."""
+        if np.array_equal(stamps_ns, self.stamp_ns):
+            return self.values
+        there = places(self.stamp_ns, stamps_ns)
+        found = np.full((len(stamps_ns), self.values.shape[1]), np.nan)
+        found[there >= 0] = self.values[there[there >= 0]]
+        return found
 
 
 def places(among_ns: Integers, times_ns: Integers) -> Integers:
@@ -140,48 +167,45 @@ class Signals:
         """Time of each row since the start of the run [s]."""
         return np.asarray(self.time_ns(table) / NANOSECONDS)
 
-    def has(self, *names: str, table: str = "samples") -> bool:
-        """Return whether there are columns of these quantities, as in "gamma_1"."""
-        return all(self._places(name, table) for name in names)
-
     def legs(self, name: str, table: str = "samples") -> Array:
         """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
         return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
     def take(self, *names: str, table: str = "samples") -> Array:
         """Columns of quantities, shape (n, number of names)."""
-        at = [place for name in names for place in self._places(name, table)]
-        return np.asarray(self.tables[table].values[:, at])
+        return self.tables[table].take(*names)
 
-    def columns(self, table: str) -> tuple[Column, ...]:
-        """Columns of a table as pandas has it: times first."""
-        return (*TIMES, *self.tables[table].columns)
+    def columns(self, table: str) -> dict[Column, NDArray[Any]]:
+        """Columns of a table, times first, whole numbers where they are in ns.
+
+        Raises:
+            InputError: the recording has no such table.
+
+        """
+        if table not in self.tables:
+            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
+            raise refusal(self.path, "table", table, allowed)
+        series = self.tables[table]
+        times = (self.time_ns(table), series.stamp_ns, series.received_ns)
+        numbers = zip(series.columns, series.values.T, strict=True)
+        return dict(zip(TIMES, times, strict=True)) | {
+            column: values.astype(np.int64) if column.unit == "ns" else values
+            for column, values in numbers
+        }
 
     def table(self, name: str = "samples") -> pd.DataFrame:
-        """Return a table as pandas, indexed by time; `attrs` describes each column.
+        """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
 
         Raises:
             InputError: the recording has no such table.
             MissingDependency: pandas is not installed.
 
         """
-        pandas = require("pandas")
-        if name not in self.tables:
-            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
-            raise refusal(self.path, "table", name, allowed)
-        series = self.tables[name]
-        times = (self.time_ns(name), series.stamp_ns, series.received_ns)
-        data = {column.name: values for column, values in zip(TIMES, times, strict=True)}
-        for column, values in zip(series.columns, series.values.T, strict=True):
-            data[column.name] = values.astype(np.int64) if column.unit == "ns" else values
-        result: pd.DataFrame = pandas.DataFrame(data).set_index(TIMES[0].name)
-        result.attrs = {column.name: column.text for column in self.columns(name)}
+        columns = self.columns(name)
+        numbers = {column.name: values for column, values in columns.items()}
+        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index(TIMES[0].name)
+        result.attrs = {column.name: column.text for column in columns}
         return result
-
-    def _places(self, name: str, table: str) -> list[int]:
-        series = self.tables.get(table)
-        found = enumerate(series.columns if series else ())
-        return [place for place, column in found if column.quantity == name]
 
 
 def read(path: Path, *, damaged: bool = False) -> Signals:
@@ -214,7 +238,7 @@ def read(path: Path, *, damaged: bool = False) -> Signals:
                 raise refusal(path, key, error.value, str(error)) from None
     idle = collected[JOINT_STATES.topic.key].skipped
     series = {key: collected.pop(key).series(path) for key in list(collected)}
-    found = {key: one for key, one in series.items() if len(one.stamp_ns)}
+    found = {key: one for key, one in series.items() if len(one)}
     if not found:
         allowed = "must have at least one of " + ", ".join(t.topic.ending for t in TOPIC_TABLES)
         raise refusal(path, "topics", None, allowed)
@@ -282,12 +306,52 @@ def _join(parts: Sequence[Series]) -> Series:
     """Put topics side by side at all stamps that any of them has."""
     stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
     received = np.zeros(len(stamps), dtype=np.int64)
-    values = []
     for part in parts:
         at = np.searchsorted(stamps, part.stamp_ns)
-        whole = np.full((len(stamps), len(part.columns)), np.nan)
-        whole[at] = part.values
-        values.append(whole)
         received[at] = np.where(received[at] > 0, received[at], part.received_ns)
     columns = tuple(column for part in parts for column in part.columns)
-    return Series(columns, stamps, received, np.concatenate(values, axis=1))
+    return Series(columns, stamps, received, np.hstack([part.at(stamps) for part in parts]))
+
+
+def frame(bag: str | Path, table: str = "samples") -> pd.DataFrame:
+    """Read a table of a recording.
+
+    Args:
+        bag: a rosbag2 recording, MCAP or sqlite3.
+        table: samples, ticks, commands, commands_stamped or external_moment.
+
+    Returns:
+        A row for each stamp, indexed by `time_ns` [ns] since the start of the run; columns bear
+        their units, and `attrs` describes each.
+
+    Raises:
+        InputError: the recording cannot be read, or it has no such table.
+        MissingDependency: pandas is not installed.
+
+    """
+    return read(Path(bag)).table(table)
+
+
+def export(bag: Path, out: Path, form: str = FORMATS[0], *, force: bool = False) -> list[Path]:
+    """Write a file for each table of a recording into the folder `out`; return their paths.
+
+    Args:
+        bag: a rosbag2 recording, MCAP or sqlite3.
+        out: folder, made if it is not there.
+        form: csv or parquet.
+        force: replace earlier files.
+
+    Raises:
+        InputError: the recording cannot be read, `out` cannot be written or is not empty.
+        MissingDependency: pandas or pyarrow is not installed.
+
+    """
+    require_free(out, "export", force=force)
+    run = read(bag)
+    paths = {name: out / f"{name}.{form}" for name in run.tables}
+    with write_into(out, "export"):
+        for name, path in paths.items():
+            columns = run.columns(name)
+            about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
+            write_table({one.name: values for one, values in columns.items()}, path, about)
+    return list(paths.values())

@@ -7,6 +7,7 @@ Columns bear their units. A recording that lacks a topic lacks its columns, and 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,19 +89,15 @@ class _JointRows:
         return [(stamp, position + velocity + effort[: len(ACTUATED)])]
 
 
-def _read_quaternion(message: Any) -> Rows:
-    stamp, q = nanoseconds(message.header.stamp), message.quaternion
-    return [(stamp, (q.x, q.y, q.z, q.w))] if stamp else []
+def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
+    """Read the parts of a vector or quaternion; where `stamped`, of messages with a stamp only."""
+    parts = attrgetter(*(f"{vector}.{name}" for name in names))
 
+    def rows(message: Any) -> Rows:
+        stamp = nanoseconds(message.header.stamp)
+        return [(stamp, parts(message))] if stamp or not stamped else []
 
-def _read_vector(message: Any) -> Rows:
-    stamp, v = nanoseconds(message.header.stamp), message.vector
-    return [(stamp, (v.x, v.y, v.z))] if stamp else []
-
-
-def _read_moment(message: Any) -> Rows:
-    m = message.wrench.torque
-    return [(nanoseconds(message.header.stamp), (m.x, m.y, m.z))]
+    return rows
 
 
 def _read_ticks(message: Any) -> Rows:
@@ -179,13 +176,13 @@ JOINT_STATES = _table(
 ORIENTATION = _table(
     "orientation",
     "geometry_msgs/msg/QuaternionStamped",
-    _read_quaternion,
+    _parts("quaternion", "xyzw"),
     (("q_x", "q_y", "q_z", "q_w"), "1", "quaternion of {E} in {B}"),
 )
 EULER = _table(
     "euler_zyz",
     "geometry_msgs/msg/Vector3Stamped",
-    _read_vector,
+    _parts("vector", "xyz"),
     (("theta", "phi", "psi"), "rad", "ZYZ angle of {E} in {B}"),
 )
 REFERENCE = _table(
@@ -221,7 +218,7 @@ STAMPED_COMMANDS = _table(
 MOMENT = _table(
     "external_moment",
     "geometry_msgs/msg/WrenchStamped",
-    _read_moment,
+    _parts("wrench.torque", "xyz", stamped=False),
     (MOMENTS, "N m", _MOMENT),
     stamped=False,
 )

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.actuator_motions import MotionSamples
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Command, Controller, Measurement
 from sst_ros.control.plan import check
@@ -26,6 +25,7 @@ from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_goal import motion_of
 from sst_ros.scene.scene import Actuators, Scene
 from sst_ros.simulation.simulation import NANOSECONDS
+from sst_ros.simulation.trajectory import Trajectory
 
 _COLUMNS = 22
 """Numbers of a sample of a `TrackingRecord`."""
@@ -63,7 +63,7 @@ class TrajectoryFollower:
         self._period_ns = NANOSECONDS // settings.rate
         self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
-            self._planned = reference_motion(model, _samples)
+            self._planned = reference_motion(model, _read_motion)
             check(self._planned, self._model)
         self.samples = self.irregular = self.limited = self.refused = 0
         self.last_refusal = ""
@@ -235,11 +235,10 @@ class TrajectoryFollower:
             raise InputError("joint_states", [Problem("position", measured.gamma, allowed)])
 
 
-def _samples(bag: str) -> MotionSamples:
-    """Read a recorded motion; the import is needed for these only."""
-    from sst_ros.recording.recorded_motion import samples
+def _read_motion(bag: str) -> Trajectory:
+    from sst_ros.recording.recording import read_motion  # needs rosbags, which others do not
 
-    return samples(bag)
+    return read_motion(bag)
 
 
 def _limit(model: Scene, limit: float) -> Scene:

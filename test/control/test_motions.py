@@ -11,7 +11,7 @@ import pytest
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_motions import MotionSamples, through_points, through_samples
+from sst_ros.control.actuator_motions import through_points, through_samples
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
@@ -30,6 +30,7 @@ from sst_ros.scene.motions import (
 )
 from sst_ros.scene.scene import Initial, Scene, load
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.simulation.trajectory import Trajectory
 
 START = (0.75, 0.7, 0.75)
 POINTS = ((0.4, (0.8, 0.75, 0.8)), (0.9, (0.9, 0.55, 0.7)), (1.6, (0.6, 0.8, 0.65)))
@@ -239,11 +240,13 @@ def test_a_recorded_motion_is_what_was_recorded():
     simulation, period = Simulation(scene, tolerance=1e-13), 2_000_000
     torque = (0.5, -0.4, 0.3)
     states = [simulation.state, *(simulation.step(torque, period) for _ in range(100))]
-    samples = MotionSamples(
-        np.array([state.time_ns * 1e-9 for state in states]),
-        np.array([state.joints.gamma for state in states]),
-        np.array([state.joints.gamma_dot for state in states]),
-        states[0].quaternion,
+    samples = Trajectory(
+        scene,
+        [state.time_ns * 1e-9 for state in states],
+        [state.quaternion for state in states],
+        [state.body_rate for state in states],
+        [state.torque for state in states],
+        joints=[np.ravel(state.joints) for state in states],
     )
     motion = through_samples(Geometry.of(scene), samples)
     again, worst = Simulation(scene, tolerance=1e-13), []

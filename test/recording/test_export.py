@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Reader
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.extras import MissingDependency
-from sst_ros.recording.export import export, frame
+from sst_ros.recording.signals import export, frame
 from sst_ros.recording.topic_tables import TABLES, TIMES
 
 ROOT = Path(__file__).parents[2]

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from bags import altered
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
@@ -51,9 +52,9 @@ def test_the_reference_agrees_with_scipy(run):
 def test_the_error_of_a_bad_integrator_is_told_as_it_is(run):
     """A run whose samples are off by a known motion shows exactly that."""
     off = 1e-6 * np.sin(10.0 * run.seconds)[:, None] * [1.0, 0.5, -0.2]
-    found = reference.integration(dataclasses.replace(run, gamma=run.gamma + off))
+    found = reference.integration(altered(run, gamma=run.gamma + off))
     assert np.allclose(found.error.gamma, np.abs(off[:, 0]), atol=1e-12)
-    turned = dataclasses.replace(run, gamma=run.gamma + 2.0 * np.pi)
+    turned = altered(run, gamma=run.gamma + 2.0 * np.pi)
     assert reference.integration(turned).error.gamma.max() < 1e-11
 
 
@@ -116,7 +117,7 @@ def test_a_lost_start_is_not_taken_for_an_error(tmp_path, bags, example2):
 
 def test_a_wrong_start_is_an_error(run):
     """All samples are there, and they begin 1e-6 rad off: that is the simulator's doing."""
-    found = reference.integration(dataclasses.replace(run, gamma=run.gamma + 1e-6))
+    found = reference.integration(altered(run, gamma=run.gamma + 1e-6))
     assert abs(found.error.gamma[0] - 1e-6) < 1e-12
 
 
@@ -143,7 +144,7 @@ def test_the_ideal_is_the_motion_under_continuous_torques(run):
 
 
 def test_a_scene_without_torques_has_no_ideal(run):
-    bare = dataclasses.replace(run, scene=dataclasses.replace(run.scene, torque=None))
+    bare = altered(run, scene=dataclasses.replace(run.scene, torque=None))
     assert reference.ideal(bare) is None
 
 
@@ -152,7 +153,7 @@ def test_long_ticks_are_cut_into_short_steps(run):
     ticks = recording.Ticks(
         run.ticks.start_ns[::10], run.ticks.end_ns[9::10], run.ticks.torque[::10]
     )
-    found = reference.integration(dataclasses.replace(run, ticks=ticks))
+    found = reference.integration(altered(run, ticks=ticks))
     assert found.steps >= 20 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
 
 
