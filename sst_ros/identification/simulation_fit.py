@@ -178,17 +178,6 @@ def _is_positive(name: str) -> bool:
     return last in ("mass", "xx", "yy", "zz")
 
 
-TOLERANCE = 1e-12
-"""Relative and absolute, of a step; the latter over the size of a parameter for its column."""
-
-AT_STOPS = 0.1
-"""Of the tolerance where stops are elastic: derivatives jump there, and a step across loses its
-order."""
-
-GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
-RESTITUTION = "stroke.restitution"
-
-
 class Sensitivities:
     """Motions of a scene and their derivatives by parameters.
 
