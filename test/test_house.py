@@ -102,3 +102,15 @@ def test_every_test_file_has_a_name_of_its_own():
     # launch_testing's collector, which every ROS installation loads, refuses equal names.
     names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
     assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_constant_of_a_file_is_written_once(name):
+    body = ast.parse(FILES[name].read_text(encoding="utf-8")).body
+    targets = [
+        target.id
+        for node in body
+        for target in (node.targets if isinstance(node, ast.Assign) else ())
+        if isinstance(target, ast.Name)
+    ]
+    assert sorted(targets) == sorted(set(targets))
