@@ -135,7 +135,7 @@ class ActuatorSpaceMap:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         legs = [(leg, kernel.leg_motion(leg, rows, rate)) for leg in self._legs]
         return (
-            *(joint_angle(at, 0, leg.across, leg.v) for leg, at in legs),
+            *(joint_angle(at, 0) for _, at in legs),
             *(at.gamma_dot for _, at in legs),
             *(dot(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
         )
@@ -149,7 +149,7 @@ class ActuatorSpaceMap:
             multiply(1.0 / sine, cross(at.along, at.p))
             for sine, (_, at) in zip(sines, legs, strict=True)
         ]
-        beta = (joint_angle(at, 2, leg.across, leg.v) for leg, at in legs)
+        beta = (joint_angle(at, 2) for _, at in legs)
         return (*sines, *beta, dot(j2[0], cross(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:

@@ -130,6 +130,18 @@ class Expression:
         return self.graph.node(op, *(args or (self,)))
 
 
+def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
+    """Return an operator of numbers and its reflected form."""
+
+    def forward(self: Number, other: Value) -> Value:
+        return self._fold(op, self, other)
+
+    def reflected(self: Number, other: Value) -> Value:
+        return self._fold(op, other, self)
+
+    return forward, reflected
+
+
 class Number(float):
     """A constant that another scene of the same structure may have another value of.
 
@@ -159,29 +171,10 @@ class Number(float):
             value = max(*values, 0.0) if op == "positive" else getattr(math, op)(*values)
         return Number(value, (op, *map(_origin, args)))
 
-    def __add__(self, other: Value) -> Value:
-        return self._fold("add", self, other)
-
-    def __radd__(self, other: Value) -> Value:
-        return self._fold("add", other, self)
-
-    def __sub__(self, other: Value) -> Value:
-        return self._fold("sub", self, other)
-
-    def __rsub__(self, other: Value) -> Value:
-        return self._fold("sub", other, self)
-
-    def __mul__(self, other: Value) -> Value:
-        return self._fold("mul", self, other)
-
-    def __rmul__(self, other: Value) -> Value:
-        return self._fold("mul", other, self)
-
-    def __truediv__(self, other: Value) -> Value:
-        return self._fold("div", self, other)
-
-    def __rtruediv__(self, other: Value) -> Value:
-        return self._fold("div", other, self)
+    __add__, __radd__ = _folds("add")
+    __sub__, __rsub__ = _folds("sub")
+    __mul__, __rmul__ = _folds("mul")
+    __truediv__, __rtruediv__ = _folds("div")
 
     def __neg__(self) -> Value:
         op, *args = self.origin if isinstance(self.origin, tuple) else ("",)

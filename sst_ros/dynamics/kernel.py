@@ -22,6 +22,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from sst_ros.dynamics.model import (
+    PLACES,
     Leg,
     LegMotion,
     Model,
@@ -37,6 +38,7 @@ from sst_ros.mechanism.generic_math import (
     Quadruple,
     Rows,
     Scalar,
+    Symmetric,
     Triple,
     add,
     axpy,
@@ -48,6 +50,8 @@ from sst_ros.mechanism.generic_math import (
     rotation_rows,
     solve_symmetric,
     sqrt,
+    symmetric_rows,
+    triple,
 )
 from sst_ros.state import Joints
 
@@ -75,7 +79,7 @@ class Balance(NamedTuple):
 
     """
 
-    inertia: tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+    inertia: Symmetric
     force: Triple
     jacobian: Rows
 
@@ -109,7 +113,7 @@ def body_acceleration(
 ) -> Triple:
     """W_dot [rad/s^2] in {E} of the direct dynamics; arguments as for `derivative`."""
     at = balance(model, q, rate, torque, moment)
-    return solve_symmetric(*at.inertia, *at.force)
+    return solve_symmetric(at.inertia, at.force)
 
 
 def actuator_torque(
@@ -121,18 +125,12 @@ def actuator_torque(
     g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel singularity.
     """
     at = balance(model, q, rate, ZERO, moment)
-    xx, yy, zz, xy, xz, yz = at.inertia
-    x, y, z = acceleration
-    missing = (
-        xx * x + xy * y + xz * z - at.force[0],
-        xy * x + yy * y + yz * z - at.force[1],
-        xz * x + yz * y + zz * z - at.force[2],
-    )
+    rows = zip(symmetric_rows(at.inertia), at.force, strict=True)
+    missing = triple(dot(row, acceleration) - force for row, force in rows)
     first, second, third = at.jacobian
     others = (cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, others[0])
-    tau = tuple(dot(missing, other) / determinant for other in others)
-    return (tau[0], tau[1], tau[2]), determinant
+    return triple(dot(missing, other) / determinant for other in others), determinant
 
 
 def balance(
@@ -140,8 +138,8 @@ def balance(
 ) -> Balance:
     """Collect all that acts on the star; arguments as for `derivative`."""
     rows = rotation_rows(q)
-    mxx, myy, mzz, mxy, mxz, myz = model.star
-    fx, fy, fz = _on_star(model, rows, rate, moment)
+    inertia: tuple[Scalar, ...] = model.star
+    force = _on_star(model, rows, rate, moment)
     field = field_of(model, rows)
     jacobian = []
     for leg, drive in zip(model.legs, torque, strict=True):
@@ -164,23 +162,21 @@ def balance(
         toward_a = multiply(c_inertia, g)
         toward_gamma = axpy(a_inertia, g, c_inertia, p)
         if leg.loads is not None:
-            at_gamma, at_mu, at_beta = joint_torques(leg.loads, at, leg.across, leg.v, field)
+            at_gamma, at_mu, at_beta = joint_torques(at, field)
             force_gamma = force_gamma - at_gamma
             # mu_dot = -a_dot / sqrt(u)
             force_a = force_a + _quotient(at_mu, u)
-            fx, fy, fz = fx + at_beta * at.b[0], fy + at_beta * at.b[1], fz + at_beta * at.b[2]
-        fx = fx - force_a * p[0] - force_gamma * g[0]
-        fy = fy - force_a * p[1] - force_gamma * g[1]
-        fz = fz - force_a * p[2] - force_gamma * g[2]
-        mxx = mxx + toward_a[0] * p[0] + toward_gamma[0] * g[0]
-        myy = myy + toward_a[1] * p[1] + toward_gamma[1] * g[1]
-        mzz = mzz + toward_a[2] * p[2] + toward_gamma[2] * g[2]
-        mxy = mxy + toward_a[0] * p[1] + toward_gamma[0] * g[1]
-        mxz = mxz + toward_a[0] * p[2] + toward_gamma[0] * g[2]
-        myz = myz + toward_a[1] * p[2] + toward_gamma[1] * g[2]
-    return Balance(
-        (mxx, myy, mzz, mxy, mxz, myz), (fx, fy, fz), (jacobian[0], jacobian[1], jacobian[2])
-    )
+            force = triple(f + at_beta * b for f, b in zip(force, at.b, strict=True))
+        force = triple(
+            f - force_a * along - force_gamma * across
+            for f, along, across in zip(force, p, g, strict=True)
+        )
+        inertia = tuple(
+            m + toward_a[i] * p[j] + toward_gamma[i] * g[j]
+            for m, (i, j) in zip(inertia, PLACES, strict=True)
+        )
+    xx, yy, zz, xy, xz, yz = inertia
+    return Balance((xx, yy, zz, xy, xz, yz), force, (jacobian[0], jacobian[1], jacobian[2]))
 
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
@@ -190,7 +186,7 @@ def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     angles, rates = [], []
     for leg in model.legs:
         at = leg_motion(leg, rows, (wx, wy, wz))
-        angles.append([joint_angle(at, kind, leg.across, leg.v) for kind in range(3)])
+        angles.append([joint_angle(at, kind) for kind in range(3)])
         rates.append([joint_rate(at, kind) for kind in range(3)])
     gamma, mu, beta = zip(*angles, strict=True)
     gamma_dot, mu_dot, beta_dot = zip(*rates, strict=True)
@@ -210,8 +206,9 @@ def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     u = across * across + z * z
     g = ((x - a * e0) / u, (y - a * e1) / u, z / u)
     b = ((a * x - e0) / u, (a * y - e1) / u, a * z / u)
-    outward = (dot(rows[0], p), dot(rows[1], p), dot(rows[2], p))
+    outward = triple(dot(row, p) for row in rows)
     return LegMotion(
+        leg=leg,
         axis=(x, y, z),
         along=(e0, e1, 0.0),
         a=a,
@@ -235,14 +232,7 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
 
 def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> Triple:
     """Moments on the star in {E}: gyroscopic, weight, external."""
-    wx, wy, wz = rate
-    xx, yy, zz, xy, xz, yz = model.star
-    spin = (
-        xx * wx + xy * wy + xz * wz,
-        xy * wx + yy * wy + yz * wz,
-        xz * wx + yz * wy + zz * wz,
-    )
-    total = cross(spin, rate)
+    total = cross(triple(dot(row, rate) for row in symmetric_rows(model.star)), rate)
     if model.gravity is not None:
         total = add(total, cross(model.weight, field_of(model, rows)))
     for external in (model.moment, moment):
@@ -287,7 +277,7 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     for leg in model.legs:
         if leg.loads is not None:
             at = leg_motion(leg, rows, (wx, wy, wz))
-            total = total + spring_and_weight_energy(leg.loads, at, leg.across, leg.v, field)
+            total = total + spring_and_weight_energy(at, field)
     return total
 
 
@@ -306,9 +296,8 @@ def power(
         at = leg_motion(leg, rows, (wx, wy, wz))
         total = total + drive * at.gamma_dot
         if leg.loads is not None:
-            total = total - dissipation(leg.loads, at, leg.across, leg.v)
+            total = total - dissipation(at)
     for external in (model.moment, moment):
         if external is not None:
-            omega = tuple(dot(row, (wx, wy, wz)) for row in rows)
-            total = total + dot(external, (omega[0], omega[1], omega[2]))
+            total = total + dot(external, triple(dot(row, (wx, wy, wz)) for row in rows))
     return total

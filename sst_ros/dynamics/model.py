@@ -15,7 +15,9 @@ import numpy as np
 
 from sst_ros.mechanism.generic_math import (
     ZERO,
+    Rows,
     Scalar,
+    Symmetric,
     Triple,
     atan2,
     cross,
@@ -24,6 +26,7 @@ from sst_ros.mechanism.generic_math import (
     positive,
     sqrt,
     tanh,
+    triple,
 )
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Friction, Inertia, Link, Payload, Scene, Star, Stroke
@@ -63,7 +66,7 @@ class Model(NamedTuple):
 
     """
 
-    star: tuple[float, float, float, float, float, float]
+    star: Symmetric
     legs: tuple[Leg, Leg, Leg]
     gravity: Triple | None = None
     weight: Triple = ZERO
@@ -122,7 +125,7 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
         constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
         star = [
             part + xx * (float(i == j) - e[i] * e[j])
-            for part, (i, j) in zip(star, _PLACES, strict=True)
+            for part, (i, j) in zip(star, PLACES, strict=True)
         ]
         legs.append(
             Leg(w, v, cross(w, v), e[0], e[1], *constants, loads_of_leg(scene, geometry, k))
@@ -141,11 +144,12 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     )
 
 
-_PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Rows and columns of the six numbers of an inertia (xx, yy, zz, xy, xz, yz)."""
 
 
 def _star(scene: Scene) -> list[Scalar]:
-    """Inertia of star and payload about O in {E}, in the order of `_PLACES`."""
+    """Inertia of star and payload about O in {E}, in the order of `PLACES`."""
     star, payload = _tensor(scene.star.inertia), scene.payload
     if payload is None:
         return star
@@ -153,7 +157,7 @@ def _star(scene: Scene) -> list[Scalar]:
     square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
     return [
         part + (own + mass * (square * float(i == j) - c[i] * c[j]))
-        for part, own, (i, j) in zip(star, _tensor(payload.inertia), _PLACES, strict=True)
+        for part, own, (i, j) in zip(star, _tensor(payload.inertia), PLACES, strict=True)
     ]
 
 
@@ -234,6 +238,7 @@ class LegMotion(NamedTuple):
     """One leg at one instant, vectors in {E}: see `kernel` for the letters.
 
     Attributes:
+        leg: its constants.
         axis: w_k.
         along: t_k = (e0, e1, 0).
         outward: p in {B}, which points along r_k.
@@ -241,6 +246,7 @@ class LegMotion(NamedTuple):
 
     """
 
+    leg: Leg
     axis: Triple
     along: Triple
     a: Scalar
@@ -254,25 +260,22 @@ class LegMotion(NamedTuple):
     beta_dot: Scalar
 
 
-def joint_torques(
-    loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
-) -> Triple:
-    """Torques [N m] at gamma, mu and beta; `field` is gravity in {E}."""
-    friction = tuple(
-        0.0 if one is None else -friction_torque(one, joint_rate(leg, kind))
+def joint_torques(at: LegMotion, field: Triple) -> Triple:
+    """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
+    loads = at.leg.loads
+    if loads is None:
+        return ZERO
+    friction = triple(
+        0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
         for kind, one in enumerate(loads.friction)
     )
-    springs = tuple(
-        0.0
-        if spring is None
-        else -spring.stiffness * (joint_angle(leg, kind, across, v) - spring.rest)
+    springs = triple(
+        0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
         for kind, spring in enumerate(loads.springs)
     )
-    at_gamma, at_mu = _weight(loads, leg, field)
+    at_gamma, at_mu = _weight(loads, at, field)
     if loads.stops is not None:
-        at_gamma = at_gamma + stop_torque(
-            loads.stops, joint_angle(leg, 0, across, v), leg.gamma_dot
-        )
+        at_gamma = at_gamma + stop_torque(loads.stops, joint_angle(at, 0), at.gamma_dot)
     return (
         friction[0] + springs[0] + at_gamma,
         friction[1] + springs[1] + at_mu,
@@ -280,34 +283,36 @@ def joint_torques(
     )
 
 
-def spring_and_weight_energy(
-    loads: LegLoads, leg: LegMotion, across: Triple, v: Triple, field: Triple
-) -> Scalar:
+def spring_and_weight_energy(at: LegMotion, field: Triple) -> Scalar:
     """Energy [J] in springs, elastic stops and the weight of the links."""
-    total: Scalar = 0.0
+    loads, total = at.leg.loads, 0.0
+    if loads is None:
+        return total
     for kind, spring in enumerate(loads.springs):
         if spring is not None:
-            stretch = joint_angle(leg, kind, across, v) - spring.rest
+            stretch = joint_angle(at, kind) - spring.rest
             total = total + 0.5 * spring.stiffness * stretch * stretch
     if loads.stops is not None:
-        gamma = joint_angle(leg, 0, across, v)
+        gamma = joint_angle(at, 0)
         for depth in (positive(-gamma), positive(gamma - loads.stops.arc)):
             total = total + 0.5 * loads.stops.stiffness * depth * depth
     if any(loads.drive) or any(loads.link):
-        first, second = _directions(leg)
+        first, second = _directions(at)
         total = total - dot(_combine(loads.drive, *first), field)
         total = total - dot(_combine(loads.link, *second), field)
     return total
 
 
-def dissipation(loads: LegLoads, leg: LegMotion, across: Triple, v: Triple) -> Scalar:
+def dissipation(at: LegMotion) -> Scalar:
     """Power [W] that friction and the damping of elastic stops take out."""
-    total: Scalar = 0.0
+    loads, total = at.leg.loads, 0.0
+    if loads is None:
+        return total
     for kind, friction in enumerate(loads.friction):
         if friction is not None:
-            total = total + friction_torque(friction, joint_rate(leg, kind)) * joint_rate(leg, kind)
+            total = total + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
     if loads.stops is not None and loads.stops.damping:
-        gamma, speed = joint_angle(leg, 0, across, v), leg.gamma_dot
+        gamma, speed = joint_angle(at, 0), at.gamma_dot
         elastic = loads.stops._replace(damping=0.0)
         excess = stop_torque(elastic, gamma, speed) - stop_torque(loads.stops, gamma, speed)
         total = total + excess * speed
@@ -335,21 +340,21 @@ def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar
     return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
 
 
-def joint_rate(leg: LegMotion, kind: int) -> Scalar:
+def joint_rate(at: LegMotion, kind: int) -> Scalar:
     """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
     if kind == 0:
-        return leg.gamma_dot
-    return -leg.a_dot / sqrt(leg.u) if kind == 1 else leg.beta_dot
+        return at.gamma_dot
+    return -at.a_dot / sqrt(at.u) if kind == 1 else at.beta_dot
 
 
-def joint_angle(leg: LegMotion, kind: int, across: Triple, v: Triple) -> Scalar:
-    """Angle of gamma (0), mu (1) or beta (2) [rad]; v and across = w x v are the arc's in {B}."""
+def joint_angle(at: LegMotion, kind: int) -> Scalar:
+    """Angle of gamma (0), mu (1) or beta (2) [rad]."""
     if kind == 0:
-        return atan2(dot(leg.outward, across), dot(leg.outward, v))
+        return atan2(dot(at.outward, at.leg.across), dot(at.outward, at.leg.v))
     if kind == 1:
-        return atan2(sqrt(leg.u), leg.a)
+        return atan2(sqrt(at.u), at.a)
     # r.(t x s) and r.s with s = (0, 0, 1), both times sqrt(u).
-    return atan2(leg.p[0] * leg.along[1] - leg.p[1] * leg.along[0], leg.p[2])
+    return atan2(at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2])
 
 
 def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
@@ -363,9 +368,7 @@ def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Sca
     return dot(total, leg.axis), -dot(on_link, first[0])
 
 
-def _directions(
-    leg: LegMotion,
-) -> tuple[tuple[Triple, Triple, Triple], tuple[Triple, Triple, Triple]]:
+def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
     """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
     root = sqrt(leg.u)
     r = (leg.p[0] / root, leg.p[1] / root, leg.p[2] / root)
@@ -373,5 +376,4 @@ def _directions(
 
 
 def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
-    first, second, third = (c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))
-    return (first, second, third)
+    return triple(c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))

@@ -343,7 +343,7 @@ def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
         legs = [(kernel.leg_motion(leg, rows, ZERO), leg) for leg in model.legs]
         first, second, third = rows
         return (
-            *(joint_angle(at, 0, leg.across, leg.v) for at, leg in legs),
+            *(joint_angle(at, 0) for at, leg in legs),
             atan2(second[2], first[2]),
             atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
             atan2(third[1], -third[0]),

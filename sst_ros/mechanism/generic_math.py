@@ -8,6 +8,7 @@ expressions) or through NumPy (columns, complex numbers) or mpmath.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,29 +17,18 @@ Scalar = Any
 Triple = tuple[Scalar, Scalar, Scalar]
 Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 Rows = tuple[Triple, Triple, Triple]
+Symmetric = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
 ZERO: Triple = (0.0, 0.0, 0.0)
 _ARRAYS = (np.ndarray, np.generic, complex)
 
 
-def sqrt(x: Any) -> Any:
-    """Square root."""
-    return math.sqrt(x) if type(x) is float else _other("sqrt", x)
+def _function(name: str) -> Callable[[Any], Any]:
+    of_float: Callable[[float], float] = getattr(math, name)
+    return lambda x: of_float(x) if type(x) is float else _other(name, x)
 
 
-def tanh(x: Any) -> Any:
-    """Hyperbolic tangent."""
-    return math.tanh(x) if type(x) is float else _other("tanh", x)
-
-
-def exp(x: Any) -> Any:
-    """Exponential."""
-    return math.exp(x) if type(x) is float else _other("exp", x)
-
-
-def sin(x: Any) -> Any:
-    """Sine."""
-    return math.sin(x) if type(x) is float else _other("sin", x)
+sqrt, tanh, exp, sin = map(_function, ("sqrt", "tanh", "exp", "sin"))
 
 
 def positive(x: Any) -> Any:
@@ -137,18 +127,21 @@ def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
     return (alpha * a[0] + beta * b[0], alpha * a[1] + beta * b[1], alpha * a[2] + beta * b[2])
 
 
-def solve_symmetric(
-    xx: Scalar,
-    yy: Scalar,
-    zz: Scalar,
-    xy: Scalar,
-    xz: Scalar,
-    yz: Scalar,
-    fx: Scalar,
-    fy: Scalar,
-    fz: Scalar,
-) -> Triple:
-    """Solve a symmetric positive definite 3 x 3 system by L D L^T."""
+def triple(numbers: Iterable[Scalar]) -> Triple:
+    """Return three numbers as a triple."""
+    first, second, third = numbers
+    return (first, second, third)
+
+
+def symmetric_rows(matrix: Symmetric) -> Rows:
+    """Rows of a symmetric matrix (xx, yy, zz, xy, xz, yz)."""
+    xx, yy, zz, xy, xz, yz = matrix
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+
+
+def solve_symmetric(matrix: Symmetric, right: Triple) -> Triple:
+    """Solve a positive definite system (xx, yy, zz, xy, xz, yz) by L D L^T."""
+    (xx, yy, zz, xy, xz, yz), (fx, fy, fz) = matrix, right
     l21, l31 = xy / xx, xz / xx
     d2 = yy - l21 * xy
     e32 = yz - l31 * xy

@@ -14,6 +14,7 @@ for all alpha_k < 180 deg and beta_k < 90 deg.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,19 +140,9 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
     singular = np.linalg.svd(np.nan_to_num(np.stack(rows, axis=-2)), compute_uv=False)
     with np.errstate(divide="ignore", invalid="ignore"):
         cond_j = np.where(singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf)
-    found = (
-        angles,
-        mu,
-        beta,
-        admissible & (stroke >= 0.0),
-        stroke,
-        beta.min(axis=-1),
-        geometry.beta_max - beta.max(axis=-1),
-        np.prod(c, axis=-1),
-        det_j2,
-        cond_j,
-    )
-    return Measures(*frozen(*found))
+    edge, reach = beta.min(axis=-1), geometry.beta_max - beta.max(axis=-1)
+    limits = (admissible & (stroke >= 0.0), stroke, edge, reach)
+    return Measures(*frozen(angles, mu, beta, *limits, np.prod(c, axis=-1), det_j2, cond_j))
 
 
 def workspace(
@@ -315,31 +306,25 @@ def parallel_singularities(chart: OrientationMap) -> SingularPoses:
 
 def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
     """Poses with c_k = 0 at the edge of what is admissible: all other conditions hold there."""
-    found: list[tuple[Array, Array, Array, int, float]] = []
-    for k in range(3):
+    found = []
+    for k, sign in product(range(3), (1.0, -1.0)):
         angles = np.linspace(0.0, geometry.arc[k], points)
         s = np.cos(angles)[:, None] * geometry.v[k]
         s = s + np.sin(angles)[:, None] * cross(geometry.w[k], geometry.v[k])
-        for sign in (1.0, -1.0):
-            t = np.broadcast_to(sign * geometry.w[k], s.shape)
-            # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
-            e, z = geometry.e[k], np.array([0.0, 0.0, 1.0])
-            rotation = columns(cross(t, s), t, s) @ np.stack([np.cross(e, z), e, z])
-            gamma, _, beta = kinematics.inverse(geometry, rotation)
-            others = [i for i in range(3) if i != k]
-            inside = np.all((s @ geometry.w.T)[:, others] > 0.0, axis=1)
-            inside &= np.all((beta > 0.0)[:, others], axis=1)
-            inside &= np.all((beta <= geometry.beta_max)[:, others], axis=1)
-            inside &= np.all(((gamma >= 0.0) & (gamma <= geometry.arc))[:, others], axis=1)
-            gamma[:, k] = beta[:, k] = np.nan
-            c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
-            for i in np.flatnonzero(inside):
-                found.append((rotation[i], gamma[i], beta[i], k, float(c[i])))
-    rotations = np.array([row[0] for row in found]).reshape(-1, 3, 3)
-    gammas, betas = (np.array([row[i] for row in found]).reshape(-1, 3) for i in (1, 2))
-    legs = np.array([row[3] for row in found], dtype=int)
-    c_k = np.array([row[4] for row in found])
-    return SingularPoses("serial", *frozen(rotations, gammas, betas, legs, c_k))
+        t = np.broadcast_to(sign * geometry.w[k], s.shape)
+        # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
+        e, z = geometry.e[k], np.array([0.0, 0.0, 1.0])
+        rotation = columns(cross(t, s), t, s) @ np.stack([np.cross(e, z), e, z])
+        gamma, _, beta = kinematics.inverse(geometry, rotation)
+        valid = (s @ geometry.w.T > 0.0) & (beta > 0.0) & (beta <= geometry.beta_max)
+        valid &= (gamma >= 0.0) & (gamma <= geometry.arc)
+        valid[:, k] = True
+        gamma[:, k] = beta[:, k] = np.nan
+        c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
+        inside = valid.all(axis=1)
+        found.append([part[inside] for part in (rotation, gamma, beta, np.full(points, k), c)])
+    arrays = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return SingularPoses("serial", *frozen(*arrays))
 
 
 def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:

@@ -39,7 +39,7 @@ def derivative(star, legs, q, rate, torque):
     for leg, drive in zip(legs, torque, strict=True):
         add_leg(mass, force, leg, drive, rotation, rate)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = mass
-    return *quaternion_rate(q, rate), *solve_symmetric(xx, yy, zz, xy, xz, yz, *force)
+    return *quaternion_rate(q, rate), *solve_symmetric((xx, yy, zz, xy, xz, yz), force)
 
 
 def add_leg(mass, force, leg, drive, rotation, rate):

@@ -127,7 +127,7 @@ def state_after_the_bounce(scene, name, value, monkeypatch):
     def gamma(state):
         leg = model.legs[0]
         at = kernel.leg_motion(leg, rotation_rows(tuple(state[:4])), ZERO)
-        return joint_angle(at, 0, leg.across, leg.v)
+        return joint_angle(at, 0)
 
     for contact, guess, steps in PHASES:
         # The branch of the phase, also where a stage of the method lies beyond its end.
