@@ -9,23 +9,26 @@ beside the theory of `sampled_data`.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller import Controller, ControllerSettings, ControlStopped, Measurement
+from sst_ros.control.controller import ControlChannel, Controller, ControlStopped, Measurement
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
+from sst_ros.mechanism.generic_math import axpy
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.scene.yaml_document import build, values_of
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from sst_ros.state import Vector3
+from sst_ros.sweeps.sweep_study import ControlledRun
+from studies.loop_runs import run_in_loop
 from studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
@@ -37,63 +40,32 @@ SHARE = 0.2
 _GONE, _LOST = 1e-3, 1e2 * OFFSET
 
 
-@dataclass(frozen=True)
-class Channel:
-    """What a channel changes; all zeros change nothing.
-
-    Attributes:
-        delay: of commands in samples. Until the first one arrives, it acts already.
-        counts: steps of the encoders per turn; 0 for exact angles. An encoder measures no rate:
-            that is the difference of the last two angles over the period.
-        noise: standard deviations on gamma [rad] and gamma_dot [rad/s], new at every sample.
-
-    """
-
-    delay: int = 0
-    counts: int = 0
-    noise: tuple[float, float] = (0.0, 0.0)
-
-
 class ChannelState:
-    """The memory of a channel during a run with `period_s` between samples [s]."""
+    """The memory of a channel during a run."""
 
-    def __init__(self, channel: Channel, period_s: float, seed: int) -> None:
-        self._channel, self._period = channel, period_s
-        self._random = np.random.default_rng(seed)
-        self._before: Vector3 | None = None
-        self._queue: deque[Vector3] = deque()
+    def __init__(self, channel: ControlChannel, seed: int) -> None:
+        self._channel, self._random = channel, np.random.default_rng(seed)
+        self._deviations = np.repeat((channel.angle_noise, channel.rate_noise), 3)
+        self._before: Any = None
+        self._queue: Any = (0.0,) * (3 * channel.delay)
+        self._first = 1.0
 
-    def measure(self, gamma: Vector3, gamma_dot: Vector3) -> tuple[Vector3, Vector3]:
+    def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
         """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
-        if self._channel.counts:
-            step = 2.0 * math.pi / self._channel.counts
-            if self._before is None:
-                earlier = np.subtract(gamma, np.multiply(self._period, gamma_dot)).tolist()
-                self._before = _count(earlier, step)
-            before, gamma = self._before, _count(gamma, step)
-            self._before = gamma
-            a, b, c = ((x - y) / self._period for x, y in zip(gamma, before, strict=True))
-            gamma_dot = (a, b, c)
-        if any(self._channel.noise):
-            gamma = self._noisy(gamma, self._channel.noise[0])
-            gamma_dot = self._noisy(gamma_dot, self._channel.noise[1])
-        return gamma, gamma_dot
+        channel, noise = self._channel, []
+        if channel.counts and self._before is None:
+            earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
+            self._before = tuple(map(channel.count, earlier))
+        if self._deviations.any():
+            noise = (self._random.standard_normal(6) * self._deviations).tolist()
+        *measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
+        return Measurement(*measured)
 
     def delayed(self, command: Vector3) -> Vector3:
         """Return the torques [N m] that act when this command has been sent."""
-        if not self._queue:
-            self._queue.extend([command] * self._channel.delay)
-        self._queue.append(command)
-        return self._queue.popleft()
-
-    def _noisy(self, values: Vector3, deviation: float) -> Vector3:
-        a, b, c = (self._random.standard_normal(3) * deviation).tolist()
-        return (values[0] + a, values[1] + b, values[2] + c)
-
-
-def _count(angles: Sequence[float], step: float) -> Vector3:
-    a, b, c = (step * round(angle / step) for angle in angles)
-    return (a, b, c)
+        torque, self._queue = self._channel.transmit(command, self._queue, self._first)
+        self._first = 0.0
+        return torque
 
 
 @dataclass(frozen=True)
@@ -102,11 +74,11 @@ class ModelError:
 
     name: str
     model: Callable[[Scene], Scene] = lambda scene: scene
-    channel: Channel = field(default_factory=Channel)
+    channel: ControlChannel = field(default_factory=ControlChannel)
 
     def changes(self, plant: Scene) -> bool:
         """Whether this plant can have it: friction that is not there cannot be unknown."""
-        return self.channel != Channel() or self.model(plant) != plant
+        return self.channel != ControlChannel() or self.model(plant) != plant
 
 
 def make_heavier(scene: Scene, factor: float) -> Scene:
@@ -133,26 +105,26 @@ def model_errors() -> Iterator[ModelError]:
     yield ModelError("friction unknown", partial(replace, friction=None))
     yield ModelError("gravity missing", partial(replace, gravity=None))
     for delay in range(1, 6):
-        yield ModelError(f"delay {delay}", channel=Channel(delay=delay))
+        yield ModelError(f"delay {delay}", channel=ControlChannel(delay=delay))
     for counts in (65536, 16384):
-        yield ModelError(f"encoder {counts}", channel=Channel(counts=counts))
-    yield ModelError("noise", channel=Channel(noise=(1e-4, 1e-2)))
+        yield ModelError(f"encoder {counts}", channel=ControlChannel(counts=counts))
+    yield ModelError("noise", channel=ControlChannel(angle_noise=1e-4, rate_noise=1e-2))
 
 
 @dataclass(frozen=True)
-class ControlLoop:
+class ControlLoop(ControlledRun):
     """A controller and a plant."""
 
     plant: Scene  # what moves
-    model: Scene  # the controller's model of it
-    motion: ReferenceMotion
-    settings: ControllerSettings
-    period_ns: int  # between samples, over which a torque is held
-    channel: Channel = field(default_factory=Channel)  # between plant and controller
     seed: int = 0  # of the noise
     rest_s: float = 0.0  # time for which the loop goes on after the motion
     offset: float = 0.0  # of the plant's gamma at the start [rad]
     lost: float = math.inf  # error of gamma beyond which the run is aborted [rad]
+
+    @property
+    def period_ns(self) -> int:
+        """Time between samples, over which a torque is held [ns]."""
+        return round(self.channel.period * NANOSECONDS)
 
 
 def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
@@ -167,29 +139,28 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
     plant = at_start(loop.plant, loop.motion, loop.offset)
     simulation = Simulation(plant, compiled=numba_version() is not None)
     controller = Controller(loop.model, loop.motion, loop.settings, period)
-    channel = ChannelState(loop.channel, period, loop.seed)
+    channel = ChannelState(loop.channel, loop.seed)
     rows, limited, failure = [], [], ""
-    torque = (0.0, 0.0, 0.0)
-    for k in range(round((loop.motion.duration + loop.rest_s) / period) + 1):
-        time = k * loop.period_ns / NANOSECONDS
-        try:
-            if k > 0:
-                simulation.step(torque, loop.period_ns)
-            joints = simulation.state.joints
-            measured = Measurement(*channel.measure(joints.gamma, joints.gamma_dot))
-            command = controller.command(time, measured)
-            torque = channel.delayed(command.torque)
-            desired = command.desired
-            rows.append(
-                ((time,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
-                 command.feedforward, command.feedback, torque)
-            )  # fmt: skip
-            limited.append(command.saturated)
-            if math.dist(desired.gamma, joints.gamma) > loop.lost:
-                raise ControlStopped(f"off by more than {loop.lost:g} rad", time)
-        except (RunStopped, ControlStopped) as error:
-            failure = str(error)
-            break
+
+    def torque(simulation: Simulation) -> Vector3:
+        joints, time = simulation.state.joints, simulation.time_ns / NANOSECONDS
+        command = controller.command(time, channel.measure(joints.gamma, joints.gamma_dot))
+        acting, desired = channel.delayed(command.torque), command.desired
+        rows.append(
+            ((time,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
+             command.feedforward, command.feedback, acting)
+        )  # fmt: skip
+        limited.append(command.saturated)
+        if math.dist(desired.gamma, joints.gamma) > loop.lost:
+            raise ControlStopped(f"off by more than {loop.lost:g} rad", time)
+        return acting
+
+    try:
+        ticks = round((loop.motion.duration + loop.rest_s) / period)
+        run_in_loop(simulation, torque, loop.period_ns, ticks)
+        torque(simulation)  # of the end, which is a sample, too
+    except (RunStopped, ControlStopped) as error:
+        failure = str(error)
     table = np.array(rows).reshape(len(rows), 8, 3)
     time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = table.swapaxes(0, 1)
     track = TrackingRecord(

@@ -104,7 +104,7 @@ def run_controlled(
     ticks = math.ceil(seconds * rate - 1e-6)
     fast = compiled and numba_version() is not None
     simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
-    samples = run_in_loop(simulation, torque, period_ns, ticks)
+    samples = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
     rows = [(*state.quaternion, *state.body_rate) for state in samples.states]
     return ControlRun(
         rate, method, hold, np.array([state.time_ns for state in samples.states]), np.array(rows),

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.control.controller import INSTANTS, MODES, ControllerSettings
+from sst_ros.control.controller import INSTANTS, MODES, ControlChannel, ControllerSettings
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
@@ -44,7 +44,7 @@ from sst_ros.state import Vector3
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies import control_loop as loops
-from studies.control_loop import SHARE, Channel, ControlLoop, ModelError, model_errors, run_loop
+from studies.control_loop import SHARE, ControlLoop, ModelError, model_errors, run_loop
 from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, slope
 
@@ -188,12 +188,12 @@ def _tracked(
         "damping_ratio": plan.damping_ratio, "period_s": plan.period_ns / NANOSECONDS,
         "seed": plan.seed,
     }  # fmt: skip
+    channel = replace(error.channel, period=plan.period_ns / NANOSECONDS)
     track, limited, failure = run_loop(
         ControlLoop(
-            plan.scene, error.model(plan.scene), motion, settings, plan.period_ns, error.channel,
-            plan.seed, rest_s=REST_S,
+            error.model(plan.scene), motion, settings, channel, plan.scene, plan.seed, REST_S
         )
-    )  # fmt: skip
+    )
     if failure:
         return named | {"failure": failure}
     found = evaluate(track, int(limited.sum()))
@@ -215,8 +215,9 @@ def _tracked(
 
 
 def _limit(plant: Scene, settings: ControllerSettings, period: int, delay: int) -> dict[str, Any]:
+    channel = ControlChannel(period=period / NANOSECONDS, delay=delay)
     ideal, real = (
-        ControlLoop(each, each, _motion(each), settings, period, Channel(delay=delay))
+        ControlLoop(each, _motion(each), settings, channel, each)
         for each in (loops.ideal_plant(plant), plant)
     )
     found = loops.bandwidth_in_theory(real), *map(loops.bandwidth_limit, (ideal, real))
@@ -225,7 +226,8 @@ def _limit(plant: Scene, settings: ControllerSettings, period: int, delay: int) 
 
 def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[str, Any]:
     """Find the largest error of gamma under feedforward alone; nan where the loop fails."""
-    track, _, failure = run_loop(ControlLoop(plant, plant, _motion(plant), settings, period_ns))
+    channel = ControlChannel(period=period_ns / NANOSECONDS)
+    track, _, failure = run_loop(ControlLoop(plant, _motion(plant), settings, channel, plant))
     error = math.nan if failure else float(np.abs(track.error).max())
     return {"at": settings.feedforward_at, "period_s": period_ns / NANOSECONDS, "error": error}
 

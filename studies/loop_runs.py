@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from sst_ros.runtime.pacing import Pacer, SteadyTime
-from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.runtime.torque_input import ZERO, HasState
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
@@ -57,9 +56,11 @@ class FunctionRun:
 
 
 def run_in_loop(
-    simulation: Simulation, torque: TorqueOf, period_ns: int, ticks: int
+    simulation: Simulation, torque: TorqueOf, period_ns: int, ticks: int, *, warm: bool = False
 ) -> FunctionRun:
     """Run a simulation from its start for some ticks, with a sample at each.
+
+    With `warm` the code of all methods is loaded before, so that all ticks take equally long.
 
     Raises:
         RunStopped: it ended before.
@@ -68,7 +69,8 @@ def run_in_loop(
     run: Any = FunctionRun(torque)
     settings, pacer = RunSettings(period_ns, last_tick=ticks), Pacer(period_ns, 0.0, SteadyTime())
     loop = TickLoop(simulation, settings, run, pacer, run)
-    loop.warm_up()
+    if warm:
+        loop.warm_up()
     loop.begin()
     loop.resume()
     while not loop.complete:

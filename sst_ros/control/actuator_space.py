@@ -32,11 +32,13 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
     axpy,
+    cos,
     cross,
     dot,
     multiply,
     rotate_back,
     rotation_rows,
+    sin,
     sqrt,
 )
 from sst_ros.mechanism.geometry import Geometry
@@ -101,8 +103,21 @@ class ActuatorSpaceMap:
 
         """
         q = self.orientation(near, gamma)
+        return Reference(
+            q, *self.star_motion(q, gamma_dot, gamma_ddot), gamma, gamma_dot, gamma_ddot
+        )
+
+    def star_motion(
+        self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
+    ) -> tuple[Vector3, Vector3]:
+        """W [rad/s] and W_dot [rad/s^2] in {E} of rates and accelerations of the actuators.
+
+        Raises:
+            ArithmeticError: singularity.
+
+        """
         x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
-        return Reference(q, (x, y, z), (ax, ay, az), gamma, gamma_dot, gamma_ddot)
+        return (x, y, z), (ax, ay, az)
 
     def orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
         """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
@@ -111,10 +126,7 @@ class ActuatorSpaceMap:
             ArithmeticError: parallel singularity.
 
         """
-        carriages: list[float] = []
-        for angle, leg in zip(gamma, self._legs, strict=True):
-            c, s = math.cos(angle), math.sin(angle)
-            carriages += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
+        carriages = self.carriages(gamma)
         best, least, q = near, math.inf, near
         for _ in range(_STEPS):
             *moved, first, second, third = self._newton(*q, *carriages)
@@ -125,6 +137,14 @@ class ActuatorSpaceMap:
                 break
             q = (moved[0], moved[1], moved[2], moved[3])
         return best
+
+    def carriages(self, gamma: Any) -> list[Any]:
+        """Return the unit vectors r_k of the carriages at angles of any kind, nine numbers."""
+        found: list[Any] = []
+        for angle, leg in zip(gamma, self._legs, strict=True):
+            c, s = cos(angle), sin(angle)
+            found += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
+        return found
 
     @cached_property
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:

@@ -18,13 +18,18 @@ differential, kp phi^2 + e_W^2 falls at the rate 2 kd e_W^2 from every error bel
 
 Integral action adds K r times the integral of e. It is frozen while a torque is at its limit and
 the error would drive it further (conditional integration, Astrom and Hagglund 2006, section 3.5).
+
+The law and the channel between plant and controller take numbers of any kind: floats in a
+`Controller`, traced ones in the compiled loop of a batch. So they branch on settings, never on
+numbers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,26 +41,32 @@ from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
+    Quadruple,
+    Scalar,
+    Triple,
     add,
+    atan2,
     axpy,
     cross,
     dot,
-    multiply,
+    positive,
     relative_quaternion,
     rotation_rows,
+    sqrt,
 )
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section, choice, number
-from sst_ros.state import Quaternion, State, Vector3, clamp
-
-__all__ = ["MODES", "Command", "ControlStopped", "Controller", "Measurement"]
+from sst_ros.scene.schema import Section, choice, integer, number
+from sst_ros.state import State, Vector3
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 
 SPACES = ("gamma", "so3")
 
 INSTANTS = ("start", "middle")
+
+_ROUND = 1.5 * 2.0**52
+"""Added and subtracted, it rounds to whole numbers, halves to even."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +146,262 @@ class ControllerSettings(Section):
         """Whether the gains are given as such, and not by bandwidth."""
         return any(self.stiffness) or any(self.damping)
 
+    @property
+    def feeds(self) -> bool:
+        """Whether the torque of the desired motion is part of the command."""
+        return self.mode not in ("pd", "gravity_pd")
+
+    @property
+    def observes(self) -> bool:
+        """Whether the law needs the orientation at the measured angles."""
+        return self.mode in ("gravity_pd", "computed_torque")
+
+
+@dataclass(frozen=True)
+class ControlChannel(Section):
+    """What lies between plant and controller; zeros change nothing.
+
+    Until the first of delayed commands arrives it acts already. An encoder measures no rate: that
+    is the difference of its last two angles over the period. Noise is new at every sample.
+    """
+
+    period: float = number("control period", "s", default=1e-3, least=1e-6, most=1.0)
+    delay: int = integer("delay of commands", "periods", default=0, least=0, most=100)
+    counts: int = integer(
+        "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
+    )
+    angle_noise: float = number(
+        "standard deviation of noise on gamma", "rad", default=0.0, least=0.0, most=1.0
+    )
+    rate_noise: float = number(
+        "standard deviation of noise on gamma_dot", "rad/s", default=0.0, least=0.0, most=1e3
+    )
+
+    def count(self, angle: Scalar) -> Scalar:
+        """Round an angle [rad] to the steps of the encoders."""
+        step = 2.0 * math.pi / self.counts
+        return step * ((angle / step + _ROUND) - _ROUND)
+
+    def measure(
+        self, gamma: Triple, gamma_dot: Triple, before: Any, noise: Any
+    ) -> tuple[Triple, Triple, Any]:
+        """Return the angles and rates that the controller receives, and angles to remember.
+
+        Args:
+            gamma: angles [rad].
+            gamma_dot: rates [rad/s].
+            before: angles to remember of the last sample; none without encoders.
+            noise: six numbers that are added to gamma and gamma_dot; or none.
+
+        """
+        if self.counts:
+            gamma = (self.count(gamma[0]), self.count(gamma[1]), self.count(gamma[2]))
+            moved = axpy(1.0, gamma, -1.0, before)
+            gamma_dot = (moved[0] / self.period, moved[1] / self.period, moved[2] / self.period)
+            before = gamma
+        if noise:
+            gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
+        return gamma, gamma_dot, before
+
+    def transmit(self, command: Triple, queue: Any, first: Scalar) -> tuple[Triple, Any]:
+        """Return the command that acts, and the queue behind it: 3 `delay` numbers.
+
+        `first` is 1 at the first sample, else 0.
+        """
+        pairs = zip(command * self.delay, queue, strict=True)
+        line = (*(first * c + (1.0 - first) * q for c, q in pairs), *command)
+        return (line[0], line[1], line[2]), line[3:]
+
+
+class Sample(NamedTuple):
+    """What the law has at a sample.
+
+    Attributes:
+        desired: the reference.
+        feedforward: torque of the desired motion [N m].
+        held: the same at the instant whose torque is held.
+        gamma, gamma_dot: as measured [rad], [rad/s].
+        observed: orientation at the measured angles, where the law needs it.
+        integral: sum of errors [rad s]; none without integral action.
+
+    """
+
+    desired: Reference
+    feedforward: Triple
+    held: Triple
+    gamma: Triple
+    gamma_dot: Triple
+    observed: Any
+    integral: Any
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the law answers at a sample.
+
+    Attributes:
+        torque: the command [N m]: feedforward + feedback, limited.
+        feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
+        feedback: torque due to the error [N m].
+        desired: the reference at this instant.
+        integral: the new sum of errors [rad s].
+
+    """
+
+    torque: Vector3
+    feedforward: Vector3
+    feedback: Vector3
+    desired: Reference
+    integral: Any
+
+    @property
+    def total(self) -> Vector3:
+        """The command before it is limited [N m]."""
+        return add(self.feedforward, self.feedback)
+
+    @property
+    def saturated(self) -> bool:
+        """Whether a torque was limited."""
+        return self.torque != self.total
+
+
+class ControlLaw(NamedTuple):
+    """The law of some settings, and its numbers; by joint where there are three.
+
+    Attributes:
+        settings: what it is.
+        torque: inverse dynamics of the model [N m], of quaternion, W and W_dot.
+        accelerate: W and W_dot of the model, of quaternion, gamma_dot and gamma_ddot.
+        kp, kd: gains of accelerations [1/s^2], [1/s].
+        inertia: M_kk at the start of the motion [kg m^2].
+        integral_rate: of the integral action [1/s].
+        limit: of commands [N m]; None for none.
+        period: time from one sample to the next [s].
+
+    """
+
+    settings: ControllerSettings
+    torque: Callable[[Any, Any, Any], Triple]
+    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]
+    kp: Triple
+    kd: Triple
+    inertia: Triple
+    integral_rate: Scalar
+    limit: Scalar | None
+    period: float
+
+    def answer(self, at: Sample) -> Command:
+        """Return the torques at a sample."""
+        mode, feedback, summed = self.settings.mode, ZERO, ZERO
+        feedforward = at.held if self.settings.feeds else ZERO
+        error = axpy(1.0, at.desired.gamma, -1.0, at.gamma)
+        rates = axpy(1.0, at.desired.gamma_dot, -1.0, at.gamma_dot)
+        if mode == "gravity_pd":
+            feedforward = self.torque(at.observed, ZERO, ZERO)
+        if mode == "computed_torque":
+            needed, summed = self._compute_torque(at, error, rates)
+            feedback = axpy(1.0, needed, -1.0, at.feedforward)
+        elif mode != "feedforward":
+            summed = error
+            feedback = _by_joint(self.inertia, self._feed_back(at.integral, error, rates))
+        torque = total = add(feedforward, feedback)
+        weight: Scalar = 1.0
+        if self.limit is not None:
+            torque = bound(total, self.limit)
+            weight = 1.0 - is_above(dot(axpy(1.0, total, -1.0, torque), error))
+        integral = at.integral and axpy(1.0, at.integral, weight * self.period, summed)
+        return Command(torque, feedforward, feedback, at.desired, integral)
+
+    def _compute_torque(self, at: Sample, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
+        """Torque of computed_torque, and the error to integrate."""
+        asked = add(at.desired.gamma_ddot, self._feed_back(at.integral, error, rates))
+        body_rate, body_acceleration = self.accelerate(at.observed, at.gamma_dot, asked)
+        if self.settings.space == "so3":
+            between = relative_quaternion(at.observed, at.desired.quaternion)
+            turn = rotation_rows(between)
+            rate, forward = (
+                (dot(turn[0], vector), dot(turn[1], vector), dot(turn[2], vector))
+                for vector in (at.desired.body_rate, at.desired.body_acceleration)
+            )
+            moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
+            error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
+            body_acceleration = add(moving, self._feed_back(at.integral, error, rates))
+        return self.torque(at.observed, body_rate, body_acceleration), error
+
+    def _feed_back(self, integral: Any, error: Triple, rates: Triple) -> Triple:
+        """Acceleration kp e + kd e_dot, with integral action."""
+        leaning = axpy(1.0, error, self.integral_rate, integral) if integral else error
+        return add(_by_joint(self.kp, leaning), _by_joint(self.kd, rates))
+
+
+def _by_joint(factors: Triple, values: Triple) -> Triple:
+    return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
+
+
+def feedback_gains(
+    inertia: Array, value: Callable[[str], Any], direct: bool
+) -> tuple[Array, Array]:
+    """Return gains kp [1/s^2] and kd [1/s] of accelerations, shape (3, n).
+
+    Args:
+        inertia: M_kk, shape (3, 1).
+        value: of a field of `ControllerSettings`, for n loops or for all of them.
+        direct: whether stiffness and damping are given.
+
+    """
+    if direct:
+        kp, kd = (np.reshape(value(name), (3, -1)) / inertia for name in ("stiffness", "damping"))
+        return kp, kd
+    ones, bandwidth = np.ones_like(inertia), value("bandwidth")
+    return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)
+
+
+def command_limit(limit: Any, model: Scene) -> Array:
+    """Return the limit of commands [N m]: the settings', 0 for none, or less by the actuators."""
+    own = model.actuators.torque_limit if model.actuators is not None else None
+    return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own or np.inf)
+
+
+def feed_forward(
+    settings: ControllerSettings,
+    inverse: InverseDynamics,
+    motion: ReferenceMotion,
+    desired: Reference,
+    instant: float,
+) -> tuple[Vector3, Vector3]:
+    """Return the torques of a desired motion [N m]: now, and at the instant [s] that is held."""
+    if not settings.feeds:
+        return ZERO, ZERO
+    now = inverse.reference_torque(desired)
+    if settings.feedforward_at == "start":
+        return now, now
+    return now, inverse.reference_torque(motion.at(instant))
+
+
+def rotation_vector(quaternion: Quadruple) -> Triple:
+    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
+    sign = 2.0 * is_above(quaternion[3]) - 1.0
+    x, y, z, w = (sign * part for part in quaternion)
+    sine = sqrt(x * x + y * y + z * z + 1e-300)
+    factor = 2.0 * atan2(sine, w) / sine
+    return factor * x, factor * y, factor * z
+
+
+def bound(values: Triple, limit: Scalar) -> Triple:
+    """Clamp three numbers to the interval from -limit to limit."""
+    first, second, third = (
+        min(max(value, -limit), limit)
+        if isinstance(value, float)
+        else value - positive(value - limit) + positive(-limit - value)
+        for value in values
+    )
+    return first, second, third
+
+
+def is_above(value: Scalar) -> Scalar:
+    """Return 1 where a number is positive, else 0."""
+    return value.apply("step") if hasattr(value, "apply") else float(value > 0.0)
+
 
 class ControlStopped(SstError):
     """No torque can be computed; every later call raises the same until a reset.
@@ -157,28 +424,8 @@ class Measurement:
     gamma_dot: Vector3
 
 
-@dataclass(frozen=True)
-class Command:
-    """Output of a controller at one instant.
-
-    Attributes:
-        torque: command [N m]: feedforward + feedback, limited.
-        feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
-        feedback: torque due to the error [N m].
-        desired: the reference at this instant.
-        saturated: a torque was limited.
-
-    """
-
-    torque: Vector3
-    feedforward: Vector3
-    feedback: Vector3
-    desired: Reference
-    saturated: bool
-
-
 class Controller:
-    """A controller that tracks one reference motion by one of the five schemes above.
+    """A controller that tracks one reference motion by one of the five schemes of the law.
 
     Args:
         model: the manipulator as the controller models it; the plant may differ.
@@ -209,17 +456,31 @@ class Controller:
             virtual_work.Mechanism.of(model), posture, (0.0, 0.0, 0.0)
         )
         self.inertia = _three(-np.diag(t1))
-        self._kp, self._kd = self._gains()
-        limits = [settings.torque_limit or math.inf]
-        if model.actuators is not None:
-            limits.append(model.actuators.torque_limit or math.inf)
-        self._limit = min(limits)
+        column, rate = np.array(self.inertia)[:, None], settings.integral_rate
+        gains = feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
+        kp, kd = (_three(gain[:, 0]) for gain in gains)
+        # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
+        if rate >= min(kd) and rate > 0.0:
+            allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
+            raise InputError("control", [Problem("integral_rate", rate, allowed)])
+        limit = float(command_limit(settings.torque_limit, model))
+        self._law = ControlLaw(
+            settings,
+            self._inverse.torque,
+            self._observer.coordinates.star_motion,
+            kp,
+            kd,
+            self.inertia,
+            rate,
+            limit if math.isfinite(limit) else None,
+            period_s,
+        )
         self.reset()
 
     def reset(self) -> None:
         """Clear the integral, the observer and a failure."""
         self._observer.reset()
-        self._sum: Vector3 = ZERO
+        self._integral: Vector3 = ZERO
         self._failure: ControlStopped | None = None
 
     def follow(self, motion: ReferenceMotion) -> None:
@@ -248,108 +509,22 @@ class Controller:
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
 
     def _command(self, time: float, measured: Measurement) -> Command:
-        _require_finite((*measured.gamma, *measured.gamma_dot), "measured")
-        mode, desired = self._settings.mode, self._motion.at(time)
-        error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
-        feedforward, feedback = ZERO, ZERO
-        if mode == "gravity_pd":
-            feedforward = self._inverse.gravity_torque(self._observer.update(measured.gamma))
-        elif mode != "pd":
-            feedforward = self._inverse.reference_torque(desired)
-        summed: Vector3 = ZERO
-        if mode == "computed_torque":
-            total, summed = self._compute_torque(desired, measured, error)
-            feedback = axpy(1.0, total, -1.0, feedforward)
-        elif mode != "feedforward":
-            rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
-            acceleration, summed = self._feedback(error, rates)
-            feedback = _by_joint(self.inertia, acceleration)
-        if self._settings.feedforward_at == "middle" and mode not in ("pd", "gravity_pd"):
-            feedforward = self._inverse.reference_torque(
-                self._motion.at(time + 0.5 * self._period_s)
-            )
-        return self._finish(feedforward, feedback, desired, error, summed)
-
-    def _finish(
-        self,
-        feedforward: Vector3,
-        feedback: Vector3,
-        desired: Reference,
-        error: Vector3,
-        summed: Vector3,
-    ) -> Command:
-        total = add(feedforward, feedback)
-        _require_finite(total, "torque")
-        torque = clamp(total, self._limit)
-        if dot(axpy(1.0, total, -1.0, torque), error) <= 0.0:
-            self._sum = axpy(1.0, self._sum, self._period_s, summed)
-        return Command(torque, feedforward, feedback, desired, torque != total)
-
-    def _compute_torque(
-        self, desired: Reference, measured: Measurement, error: Vector3
-    ) -> tuple[Vector3, Vector3]:
-        """Torque of computed_torque, and the error to integrate."""
-        quaternion = self._observer.update(measured.gamma)
-        rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
-        acceleration, summed = self._feedback(error, rates)
-        now = self._observer.coordinates.of_actuators(
-            quaternion, measured.gamma, measured.gamma_dot, add(desired.gamma_ddot, acceleration)
-        )
-        body_acceleration = now.body_acceleration
-        if self._settings.space == "so3":
-            body_acceleration, summed = self._on_so3(desired, now)
-        return self._inverse.torque(now.quaternion, now.body_rate, body_acceleration), summed
-
-    def _on_so3(self, desired: Reference, now: Reference) -> tuple[Vector3, Vector3]:
-        """W_dot in {E}, and the rotation vector of the error, which is integrated."""
-        between = relative_quaternion(now.quaternion, desired.quaternion)
-        turn = rotation_rows(between)
-        rate, forward = (
-            _three(dot(row, vector) for row in turn)
-            for vector in (desired.body_rate, desired.body_acceleration)
-        )
-        moving = axpy(1.0, forward, -1.0, cross(now.body_rate, rate))
-        phi = rotation_vector(between)
-        acceleration, summed = self._feedback(phi, axpy(1.0, rate, -1.0, now.body_rate))
-        return add(moving, acceleration), summed
-
-    def _feedback(self, error: Vector3, rates: Vector3) -> tuple[Vector3, Vector3]:
-        """Acceleration kp e + kd e_dot with integral action, and the error to integrate."""
-        leaning = axpy(1.0, error, self._settings.integral_rate, self._sum)
-        return add(_by_joint(self._kp, leaning), _by_joint(self._kd, rates)), error
-
-    def _gains(self) -> tuple[Vector3, Vector3]:
-        """Gains kp [1/s^2] and kd [1/s] of accelerations."""
-        given, of = self._settings, self.inertia
-        if given.direct:
-            kp = _three(np.divide(given.stiffness, of))
-            kd = _three(np.divide(given.damping, of))
-        else:
-            kp = multiply(given.bandwidth**2, (1.0, 1.0, 1.0))
-            kd = multiply(2.0 * given.damping_ratio * given.bandwidth, (1.0, 1.0, 1.0))
-        # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
-        if given.integral_rate >= min(kd) and given.integral_rate > 0.0:
-            allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
-            raise InputError("control", [Problem("integral_rate", given.integral_rate, allowed)])
-        return kp, kd
-
-
-def rotation_vector(quaternion: Quaternion) -> Vector3:
-    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
-    sign = math.copysign(1.0, quaternion[3])
-    x, y, z, w = (sign * part for part in quaternion)
-    sine = math.hypot(x, y, z)
-    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
-    return factor * x, factor * y, factor * z
+        gamma, gamma_dot = measured.gamma, measured.gamma_dot
+        _require_finite((*gamma, *gamma_dot), "measured")
+        settings, desired = self._settings, self._motion.at(time)
+        instant = time + 0.5 * self._period_s
+        torques = feed_forward(settings, self._inverse, self._motion, desired, instant)
+        observed = self._observer.update(gamma) if settings.observes else ()
+        at = Sample(desired, *torques, gamma, gamma_dot, observed, self._integral)
+        command = self._law.answer(at)
+        _require_finite(command.total, "torque")
+        self._integral = command.integral
+        return command
 
 
 def _three(values: Iterable[float]) -> Vector3:
     first, second, third = map(float, values)
     return first, second, third
-
-
-def _by_joint(factors: Vector3, values: Vector3) -> Vector3:
-    return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
 
 
 def _require_finite(numbers: Sequence[float], what: str) -> None:

@@ -31,6 +31,11 @@ def _function(name: str) -> Callable[[Any], Any]:
 sqrt, tanh, exp, sin = map(_function, ("sqrt", "tanh", "exp", "sin"))
 
 
+def cos(x: Any) -> Any:
+    """Cosine."""
+    return math.cos(x) if type(x) is float else _other("cos", x)
+
+
 def positive(x: Any) -> Any:
     """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
     if type(x) is float:

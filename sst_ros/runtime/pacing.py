@@ -1,15 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks at absolute deadlines; late ones are counted, never made up for."""
+"""Ticks of a run at absolute deadlines; late ones are counted, never made up for."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 _LONGEST_SLEEP_S = 0.05
 _TOGETHER_NS = 2_000_000
 """Bounds the ticks that one sleep ends in, so that few commands wait."""
+
+
+@dataclass
+class RunSettings:
+    """Numbers of a run, whoever runs it; the times may change between two ticks.
+
+    Attributes:
+        period_ns: length of a tick [ns].
+        ticks_per_sample: ticks between two published samples; this is the control period.
+        last_tick: tick after which the run ends; sys.maxsize for no end.
+        lockstep: each sample is answered before the next tick.
+        waits: a command starts the run.
+        partial_commands: an effort that is nan means zero torque.
+        command_timeout_ns: age at which a command is no longer held [ns]; 0 for never.
+        lockstep_timeout: longest wait for the answer to a sample [s]; 0 for no end.
+        subscriber_timeout: longest wait for subscribers [s].
+
+    """
+
+    period_ns: int
+    ticks_per_sample: int = 1
+    last_tick: int = sys.maxsize
+    lockstep: bool = False
+    waits: bool = False
+    partial_commands: bool = False
+    command_timeout_ns: float = 0.0
+    lockstep_timeout: float = 0.0
+    subscriber_timeout: float = 0.0
+
+    @property
+    def ends(self) -> bool:
+        """Whether the run has a last tick."""
+        return self.last_tick < sys.maxsize
 
 
 class TimeSource(Protocol):

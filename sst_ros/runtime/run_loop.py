@@ -18,8 +18,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.tick_loop import Counters, HeldTorques, NoAnswer, RunOutput, TickLoop
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Initial, Scene

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 from sst_ros.control.controller import ControllerSettings
 from sst_ros.errors import Problem
+from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS, NANOSECONDS
@@ -27,39 +28,6 @@ def _rate(doc: str, default: int) -> Any:
 def _tolerance(doc: str, unit: str, default: float) -> Any:
     text = f"{doc}, where the goal does not give it; 0 for none"
     return number(text, unit, default=default, least=0.0, most=1e6)
-
-
-@dataclass
-class RunSettings:
-    """What a run takes from the parameters of its node; the times may change between two ticks.
-
-    Attributes:
-        period_ns: length of a tick [ns].
-        ticks_per_sample: ticks between two published samples; this is the control period.
-        last_tick: tick after which the run ends; sys.maxsize for no end.
-        lockstep: each sample is answered before the next tick.
-        waits: a command starts the run.
-        partial_commands: an effort that is nan means zero torque.
-        command_timeout_ns: age at which a command is no longer held [ns]; 0 for never.
-        lockstep_timeout: longest wait for the answer to a sample [s]; 0 for no end.
-        subscriber_timeout: longest wait for subscribers [s].
-
-    """
-
-    period_ns: int
-    ticks_per_sample: int = 1
-    last_tick: int = sys.maxsize
-    lockstep: bool = False
-    waits: bool = False
-    partial_commands: bool = False
-    command_timeout_ns: float = 0.0
-    lockstep_timeout: float = 0.0
-    subscriber_timeout: float = 0.0
-
-    @property
-    def ends(self) -> bool:
-        """Whether the run has a last tick."""
-        return self.last_tick < sys.maxsize
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import time
 from typing import Protocol
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.pacing import Pacer
-from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import ZERO, HasState, TorqueInput
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulation import Simulation, State

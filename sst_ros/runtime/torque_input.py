@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from sst_ros.runtime.settings import RunSettings
+from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp, finite_vector, nanoseconds

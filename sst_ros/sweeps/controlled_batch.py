@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A batch under feedback: the controller is compiled into the loop, and acts once a period."""
+"""A batch under feedback: the control law, compiled into the loop, acts once a period.
+
+At a sample the law and its channel are a function of the state of the plant and of a memory: the
+integral, the queue of delayed commands, the last encoder angles, the observed orientation, and sums
+of tracking errors. It is traced, without branches: what the settings do not use has no operation.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -12,8 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller import Controller
-from sst_ros.dynamics.expression import Expression, Program, trace
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.controller import (
+    ControlLaw,
+    Controller,
+    Sample,
+    bound,
+    command_limit,
+    feed_forward,
+    feedback_gains,
+    is_above,
+)
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.reference import Reference
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import Expression, trace
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
 from sst_ros.integration.batch import Batch
@@ -21,15 +39,9 @@ from sst_ros.integration.batch_result import BatchResult
 from sst_ros.integration.batch_run import integrated
 from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
 from sst_ros.integration.methods import DOP853
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.generic_math import axpy, dot, positive
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.sweeps.sweep_study import ControlledRun
-from sst_ros.sweeps.traced_controller import (
-    GAINS,
-    REFERENCES,
-    TracedController,
-    divide,
-    tabulate_references,
-)
 
 NOISE = (
     """\
@@ -54,10 +66,35 @@ def gaussian(seed, row, counter):
 The bits are those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for each number;
 a pair of them becomes a normal number by the method of Box and Muller (1958)."""
 
+NEWTON_STEPS = 5
+"""Of the observer at a sample. They square the error; from one sample to the next it is small."""
+
+_DESIRED = [(field.name, 4 if field.name == "quaternion" else 3)
+            for field in dataclasses.fields(Reference)]  # fmt: skip
+
+REFERENCES = (("first", 1), *_DESIRED, ("feedforward", 3), ("held", 3))
+"""Names and sizes of what a sample is given: whether it is the first, reference, torques."""
+
+GAINS = (
+    ("kp", 3), ("kd", 3), ("inertia", 3), ("integral_rate", 1), ("limit", 1), ("plant_limit", 1),
+    ("noise", 2),
+)  # fmt: skip
 
 _NOISE = 6
 _NEVER = 2**62
 """Steps from one sample to the next while torques are held."""
+
+Group = dict[str, Any]
+"""Tuples of numbers by name."""
+
+
+def divide(names: Iterable[tuple[str, int]], numbers: Sequence[Any]) -> Group:
+    """Divide numbers into groups of the sizes given."""
+    found, at = {}, 0
+    for name, size in names:
+        found[name] = tuple(numbers[at : at + size])
+        at += size
+    return found
 
 
 class ControlledBatch:
@@ -82,36 +119,33 @@ class ControlledBatch:
         self, batch: Batch, loop: ControlledRun, length: float, seed: int, varied: set[str]
     ) -> None:
         self._batch, self._loop, self._seed = batch, loop, seed
-        period = loop.channel.period
-        self.samples = round(length / period)
-        if not self.samples or abs(self.samples * period - length) > 1e-9 * length:
-            allowed = f"must be a whole number of control periods of {period:g} s"
+        settings, channel = loop.settings, loop.channel
+        self.samples = round(length / channel.period)
+        if not self.samples or abs(self.samples * channel.period - length) > 1e-9 * length:
+            allowed = f"must be a whole number of control periods of {channel.period:g} s"
             raise InputError("sweep", [Problem("duration", length, allowed)])
-        controller = Controller(loop.model, loop.motion, loop.settings, period)
-        self._inertia = np.array(controller.inertia)
-        own = bool(loop.settings.torque_limit) or "control.torque_limit" in varied
-        limited = own or any(
-            plant.actuators is not None and plant.actuators.torque_limit
-            for plant in (loop.model, batch.scene)
+        self._inertia = np.array(
+            Controller(loop.model, loop.motion, settings, channel.period).inertia
+        )[:, None]
+
+        def has(*names: str) -> bool:
+            own = (getattr(settings if hasattr(settings, n) else channel, n) for n in names)
+            return any(own) or bool(varied & {f"control.{name}" for name in names})
+
+        plants = loop.model, batch.scene
+        self._limited = has("torque_limit") or any(
+            plant.actuators is not None and plant.actuators.torque_limit for plant in plants
         )
-        self._noisy = bool(
-            loop.channel.angle_noise
-            or loop.channel.rate_noise
-            or varied & {"control.angle_noise", "control.rate_noise"}
-        )
-        integral = loop.settings.integral_rate > 0.0 or "control.integral_rate" in varied
-        observes = loop.settings.mode in ("gravity_pd", "computed_torque")
-        sizes = {
-            "integral": 3 * integral,
-            "queue": 3 * loop.channel.delay,
-            "before": 3 * (loop.channel.counts > 0),
-            "observed": 4 * observes,
+        self._noise = _NOISE if has("angle_noise", "rate_noise") else 0
+        self._memory_sizes = {
+            "integral": 3 if has("integral_rate") else 0,
+            "queue": 3 * channel.delay,
+            "before": 3 if channel.counts else 0,
+            "observed": 4 if settings.observes else 0,
             "squares": 3,
             "largest": 3,
             "limited": 1,
         }
-        memory = tuple((name, int(size)) for name, size in sizes.items())
-        self._controller = TracedController(loop, limited, memory)
 
     @cached_property
     def module(self) -> ModuleType:
@@ -149,7 +183,8 @@ class ControlledBatch:
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
         step = self.samples * self._loop.channel.period / steps
-        memory, gains = self._memory(gamma, rate, count), self._gains(batch, given, count)
+        memory = self._start_memory(gamma, rate, count)
+        gains = self._make_gains(batch, given, count)
 
         def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
             own: list[Any] = [memory, gains, numbers]
@@ -178,8 +213,9 @@ class ControlledBatch:
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
-        found = divide(self._controller.memory, list(memory))
-        final = self._references[-1, 1:4] - result.gamma
+        found = divide(self._memory_sizes.items(), list(memory))
+        desired = divide(REFERENCES, self._references[-1])
+        final = np.array(desired["gamma"]) - result.gamma
         complete = (result.code == 0)[:, None]
         squares = np.stack(found["squares"], axis=1) + np.where(complete, final**2, 0.0)
         largest = np.stack(found["largest"], axis=1)
@@ -192,59 +228,137 @@ class ControlledBatch:
 
     @cached_property
     def _references(self) -> Array:
-        return tabulate_references(self._loop, self.samples)
+        """References of all samples of a run, shape (samples + 1, n)."""
+        loop, period = self._loop, self._loop.channel.period
+        inverse, rows = InverseDynamics(loop.model), []
+        for k in range(self.samples + 1):
+            time = k * round(period * 1e9) / 1e9
+            at = loop.motion.at(time)
+            torques = feed_forward(loop.settings, inverse, loop.motion, at, time + 0.5 * period)
+            desired = (number for name, _ in _DESIRED for number in getattr(at, name))
+            rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
+        return np.array(rows)
 
     @cached_property
     def _feedback(self) -> SampledFeedback:
-        model, controller = self._batch.model, self._controller
+        model = self._batch.model
         drive, state = model.ode.drive[3:], model.ode.state
-        noise = _NOISE if self._noisy else 0
-        groups: dict[str, Sequence[tuple[str, int]]] = {
-            "references": REFERENCES,
-            "state": [(name, 1) for name in state],
-            "memory": controller.memory,
-            "noise": [("noise", noise)],
-            "parameters": [(name, 1) for name in (*drive, *model.names)],
-            "gains": GAINS,
+        sizes = {
+            "references": sum(size for _, size in REFERENCES),
+            "state": len(state),
+            "memory": sum(self._memory_sizes.values()),
+            "noise": self._noise,
+            "parameters": len(drive) + len(model.names),
+            "gains": sum(size for _, size in GAINS),
         }
-        sizes = {name: sum(n for _, n in parts) for name, parts in groups.items()}
-        names = [
-            f"{i}_{name}_{k}"
-            for i, parts in enumerate(groups.values())
-            for name, n in parts
-            for k in range(n)
-        ]
 
         def command(*inputs: Expression) -> tuple[Any, ...]:
-            given = divide(list(sizes.items()), inputs)
-            return controller(
-                model.constants(given["parameters"][len(drive) :]).model,
-                given["state"],
+            given = divide(sizes.items(), inputs)
+            constants = model.constants(given["parameters"][len(drive) :])
+            return self._command(
+                kernel.joints(constants.model, given["state"]),
                 divide(REFERENCES, given["references"]),
-                divide(controller.memory, given["memory"]),
+                divide(self._memory_sizes.items(), given["memory"]),
                 divide(GAINS, given["gains"]),
                 given["noise"],
             )
 
-        program: Program = trace(command, names)
-        return SampledFeedback(program, sizes["references"], sizes["memory"], noise, sizes["gains"])
+        names = [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
+        kept = (sizes[name] for name in ("references", "memory", "noise", "gains"))
+        return SampledFeedback(trace(command, names), *kept)
 
-    def _memory(self, gamma: Array, rate: Array, count: int) -> Array:
+    def _command(
+        self, joints: Any, given: Group, memory: Group, gains: Group, noise: Sequence[Any]
+    ) -> tuple[Any, ...]:
+        """Return three torques and the new memory.
+
+        Args:
+            joints: angles and rates of the plant.
+            given: references of the sample, by the names in REFERENCES.
+            memory: by name.
+            gains: by the names in GAINS.
+            noise: six standard normal numbers, or none.
+
+        """
+        loop, new = self._loop, dict(memory)
+        angle, rate = gains["noise"]
+        scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
+        gamma, gamma_dot, new["before"] = loop.channel.measure(
+            joints.gamma, joints.gamma_dot, memory["before"], scaled
+        )
+        new["observed"] = self._observe(gamma, memory["observed"])
+        desired = Reference(**{name: given[name] for name, _ in _DESIRED})
+        limit = gains["limit"][0] if self._limited else None
+        law = ControlLaw(
+            loop.settings,
+            self._torque,
+            self._accelerate,
+            gains["kp"],
+            gains["kd"],
+            gains["inertia"],
+            gains["integral_rate"][0],
+            limit,
+            loop.channel.period,
+        )
+        told = law.answer(
+            Sample(
+                desired,
+                given["feedforward"],
+                given["held"],
+                gamma,
+                gamma_dot,
+                new["observed"],
+                memory["integral"],
+            )
+        )
+        new["integral"] = told.integral
+        torque, new["queue"] = loop.channel.transmit(
+            told.torque, memory["queue"], given["first"][0]
+        )
+        if self._limited:
+            cut = axpy(1.0, told.total, -1.0, told.torque)
+            new["limited"] = (memory["limited"][0] + is_above(dot(cut, cut)),)
+            torque = bound(torque, gains["plant_limit"][0])
+        off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
+        new["squares"] = tuple(s + e * e for s, e in zip(memory["squares"], off, strict=True))
+        new["largest"] = tuple(
+            s + positive(positive(e) + positive(-e) - s)
+            for s, e in zip(memory["largest"], off, strict=True)
+        )
+        return (*torque, *(number for name in self._memory_sizes for number in new[name]))
+
+    def _observe(self, gamma: Any, last: Any) -> Any:
+        """Quaternion at the measured angles in the last assembly mode; none if not needed."""
+        carriages = self._space.carriages(gamma) if last else ()
+        for _ in range(NEWTON_STEPS if last else 0):
+            last = self._space.newton_step(*last, *carriages)[:4]
+        return last
+
+    def _torque(self, *at: Any) -> Any:
+        """Inverse dynamics of the controller's model."""
+        return kernel.actuator_torque(kernel.model_of(self._loop.model), *at)[0]
+
+    def _accelerate(self, q: Any, gamma_dot: Any, gamma_ddot: Any) -> tuple[Any, Any]:
+        """W and W_dot of the controller's model."""
+        found = self._space.star_accelerations(*q, *gamma_dot, *gamma_ddot)
+        return found[:3], found[3:]
+
+    @cached_property
+    def _space(self) -> ActuatorSpaceMap:
+        return ActuatorSpaceMap(Geometry.of(self._loop.model))
+
+    def _start_memory(self, gamma: Array, rate: Array, count: int) -> Array:
         """Return the memory before the first sample, a column a scenario."""
         start, channel = self._loop.motion.at(0.0), self._loop.channel
-        columns = []
-        for name, size in self._controller.memory:
-            block = np.zeros((size, count))
-            if name == "observed" and size:
-                block[:] = np.array(start.quaternion)[:, None]
-            if name == "before" and size:
-                step = 2.0 * math.pi / channel.counts
-                block[:] = step * np.rint((gamma - channel.period * rate) / step).T
-            columns.append(block)
-        return np.concatenate(columns)
+        blocks = {name: np.zeros((size, count)) for name, size in self._memory_sizes.items()}
+        if self._loop.settings.observes:
+            blocks["observed"][:] = np.array(start.quaternion)[:, None]
+        if channel.counts:
+            blocks["before"][:] = channel.count(gamma - channel.period * rate).T
+        return np.concatenate(list(blocks.values()))
 
-    def _gains(self, batch: Batch, given: dict[str, Array], count: int) -> Array:
-        """Return the gains, a column a scenario; see `Controller`."""
+    def _make_gains(self, batch: Batch, given: dict[str, Array], count: int) -> Array:
+        """Return the gains, a column a scenario; see GAINS."""
         settings, channel = self._loop.settings, self._loop.channel
 
         def value(name: str) -> Any:
@@ -252,31 +366,15 @@ class ControlledBatch:
             found = given.get(f"control.{name}", np.array(nominal))
             return found.T if np.ndim(nominal) == 1 and found.ndim == 2 else found
 
-        inertia = self._inertia[:, None]
-        if settings.direct or {"control.stiffness", "control.damping"} & given.keys():
-            stiffness, damping = value("stiffness"), value("damping")
-            kp = stiffness.reshape(3, -1) / inertia
-            kd = damping.reshape(3, -1) / inertia
-        else:
-            bandwidth = value("bandwidth")
-            kp = np.broadcast_to(bandwidth**2, (3, count))
-            kd = np.broadcast_to(2.0 * value("damping_ratio") * bandwidth, (3, count))
-        limit = value("torque_limit")
-        limit = np.where(limit > 0.0, limit, np.inf)
-        actuators = self._loop.model.actuators
-        if actuators is not None and actuators.torque_limit:
-            limit = np.minimum(limit, actuators.torque_limit)
-        rows = [
-            np.atleast_2d(row)
-            for row in (
-                kp,
-                kd,
-                inertia,
-                value("integral_rate"),
-                limit,
-                batch.columns.torque_limit,
-                value("angle_noise"),
-                value("rate_noise"),
-            )
-        ]
-        return np.concatenate([np.broadcast_to(row, (len(row), count)) for row in rows])
+        varies = {"control.stiffness", "control.damping"} & given.keys()
+        rows = (
+            *feedback_gains(self._inertia, value, settings.direct or bool(varies)),
+            self._inertia,
+            value("integral_rate"),
+            command_limit(value("torque_limit"), self._loop.model),
+            batch.columns.torque_limit,
+            value("angle_noise"),
+            value("rate_noise"),
+        )
+        shaped = (np.atleast_2d(row) for row in rows)
+        return np.concatenate([np.broadcast_to(row, (len(row), count)) for row in shaped])

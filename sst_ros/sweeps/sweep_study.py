@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sst_ros.control.controller import ControllerSettings
+from sst_ros.control.controller import ControlChannel, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.scene import Scene, SineTorque, scene_of
-from sst_ros.scene.schema import Section, integer, number, specs
+from sst_ros.scene.schema import Section, specs
 from sst_ros.scene.yaml_document import plain, values_of
 from sst_ros.state import QUANTITIES
 from sst_ros.sweeps.variations import (
@@ -287,23 +287,6 @@ def find_problems(given: Mapping[str, Any]) -> Iterator[Problem]:
     ):
         allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
         yield Problem("trajectory", kept, allowed)
-
-
-@dataclass(frozen=True)
-class ControlChannel(Section):
-    """What lies between plant and controller; zeros change nothing."""
-
-    period: float = number("control period", "s", default=1e-3, least=1e-6, most=1.0)
-    delay: int = integer("delay of commands", "periods", default=0, least=0, most=100)
-    counts: int = integer(
-        "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
-    )
-    angle_noise: float = number(
-        "standard deviation of noise on gamma", "rad", default=0.0, least=0.0, most=1.0
-    )
-    rate_noise: float = number(
-        "standard deviation of noise on gamma_dot", "rad/s", default=0.0, least=0.0, most=1e3
-    )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.control.controller import MODES, ControllerSettings
+from sst_ros.control.controller import MODES, ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.report.results import write
@@ -18,7 +18,6 @@ from sst_ros.scene.scene import load
 from studies import feedforward
 from studies.control_loop import (
     SHARE,
-    Channel,
     ControlLoop,
     RestMotion,
     bandwidth_in_theory,
@@ -52,9 +51,8 @@ def errors(*names):
 
 def held(scene, delay, damping=1.0):
     settings = ControllerSettings(mode="computed_torque", damping_ratio=damping)
-    return ControlLoop(
-        scene, scene, reference_motion(scene), settings, PERIOD_NS, Channel(delay=delay)
-    )
+    channel = ControlChannel(period=1e-9 * PERIOD_NS, delay=delay)
+    return ControlLoop(scene, reference_motion(scene), settings, channel, scene)
 
 
 @pytest.fixture(scope="module")

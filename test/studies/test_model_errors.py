@@ -6,11 +6,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sst_ros.control.controller import ControlChannel, Measurement
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load
-from studies.control_loop import Channel, ChannelState, make_heavier, model_errors
+from studies.control_loop import ChannelState, make_heavier, model_errors
 
 REACH, EXAMPLE2 = load("reach"), load("example2_heavy")
 BODY_RATE, ACCELERATION = (0.4, -0.7, 0.9), (3.0, 2.0, -5.0)
@@ -54,14 +55,14 @@ GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 
 
 def test_a_channel_that_loses_nothing_changes_nothing():
-    wire = ChannelState(Channel(), 1e-3, 0)
-    assert wire.measure(GAMMA, RATE) == (GAMMA, RATE)
+    wire = ChannelState(ControlChannel(), 0)
+    assert wire.measure(GAMMA, RATE) == Measurement(GAMMA, RATE)
     assert wire.delayed((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 5])
 def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
-    wire = ChannelState(Channel(delay=delay), 1e-3, 0)
+    wire = ChannelState(ControlChannel(delay=delay), 0)
     came = [wire.delayed((float(k), 0.0, 0.0))[0] for k in range(10)]
     assert came == [max(k - delay, 0) for k in range(10)]
 
@@ -69,11 +70,12 @@ def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
 def test_an_encoder_counts_and_knows_rates_from_counts_alone():
     period, counts = 1e-3, 1000
     step = 2.0 * np.pi / counts
-    wire = ChannelState(Channel(counts=counts), period, 0)
+    wire = ChannelState(ControlChannel(period=period, counts=counts), 0)
     seen, rates = [], []
     for k in range(200):
         angle = 0.5 + 3.0 * k * period
-        gamma, rate = wire.measure((angle,) * 3, (3.0,) * 3)
+        measured = wire.measure((angle,) * 3, (3.0,) * 3)
+        gamma, rate = measured.gamma, measured.gamma_dot
         assert abs(gamma[0] - angle) <= 0.5 * step * (1.0 + 1e-9)
         assert gamma[0] / step == pytest.approx(round(gamma[0] / step), abs=1e-9)
         seen.append(gamma[0])
@@ -84,8 +86,9 @@ def test_an_encoder_counts_and_knows_rates_from_counts_alone():
 
 def test_noise_has_its_deviation_and_repeats_by_seed():
     def drawn(seed):
-        wire = ChannelState(Channel(noise=(1e-3, 0.1)), 1e-3, seed)
-        return np.array([wire.measure(GAMMA, RATE) for _ in range(4000)])
+        wire = ChannelState(ControlChannel(angle_noise=1e-3, rate_noise=0.1), seed)
+        seen = (wire.measure(GAMMA, RATE) for _ in range(4000))
+        return np.array([(one.gamma, one.gamma_dot) for one in seen])
 
     first = drawn(3)
     # The deviation of 12 000 numbers is known to 1 / sqrt(2 n) = 0.65 %.

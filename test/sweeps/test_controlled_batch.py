@@ -8,14 +8,20 @@ import pytest
 from scipy import stats
 
 from sst_ros import load_scene, sweep
-from sst_ros.control.controller import MODES, Controller, ControllerSettings, Measurement
+from sst_ros.control.controller import (
+    MODES,
+    ControlChannel,
+    Controller,
+    ControllerSettings,
+    Measurement,
+)
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.sweeps.controlled_batch import NOISE
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
-from studies.control_loop import Channel, ChannelState, ControlLoop, run_loop
+from studies.control_loop import ChannelState, ControlLoop, run_loop
 
 for module in ("numba", "dask", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
@@ -88,14 +94,14 @@ def check_torques(case):
     joints = Dynamics.of(SCENE).joints
     for lane in range(3):
         controller = Controller(SCENE, study.controlled.motion, settings, PERIOD)
-        encoders = ChannelState(
-            Channel(delay=channel.get("delay", 0), counts=channel.get("counts", 0)), PERIOD, 0
-        )
+        quiet = {key: channel.get(key, 0) for key in ("delay", "counts")}
+        encoders = ChannelState(ControlChannel(period=PERIOD, **quiet), 0)
         noise = channel.get("angle_noise", 0.0), channel.get("rate_noise", 0.0)
         for k in range(SAMPLES):
             q, rate = result.kept.quaternion[k, lane], result.kept.body_rate[k, lane]
             at = joints(*q.tolist(), *rate.tolist())
-            gamma, gamma_dot = encoders.measure(at[0:3], at[9:12])
+            measured = encoders.measure(at[0:3], at[9:12])
+            gamma, gamma_dot = measured.gamma, measured.gamma_dot
             if any(noise):
                 drawn = [gaussian(11, rows[lane : lane + 1], 6 * k + j)[0] for j in range(6)]
                 gamma = tuple(np.add(gamma, noise[0] * np.array(drawn[:3])).tolist())
@@ -114,10 +120,12 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
     found = run_study(study, None)
     for row, mass in enumerate((2.6, 2.0)):
         loop = ControlLoop(
-            SCENE.with_values({"star.mass": mass}), SCENE, study.controlled.motion,
-            ControllerSettings(mode="feedforward_pd", bandwidth=40.0), 10_000_000,
-            Channel(delay=1),
-        )  # fmt: skip
+            SCENE,
+            study.controlled.motion,
+            ControllerSettings(mode="feedforward_pd", bandwidth=40.0),
+            ControlChannel(period=0.01, delay=1),
+            SCENE.with_values({"star.mass": mass}),
+        )
         track, limited, failure = run_loop(loop)
         assert failure == ""
         rms = np.sqrt(np.mean(track.error**2, axis=0))
