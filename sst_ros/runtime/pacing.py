@@ -16,7 +16,7 @@ _TOGETHER_NS = 2_000_000
 
 @dataclass
 class RunSettings:
-    """Numbers of a run, whoever runs it; the times may change between two ticks.
+    """Numbers of a run, of a node or not; the times may change between two ticks.
 
     Attributes:
         period_ns: length of a tick [ns].
