@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control loop in lockstep, what may be wrong with it, and how fast it may be.
+"""The tick loop of the node without ROS; a control loop in it, its errors, and how fast it may be.
 
 A controller has a model of the plant, which may be wrong, and a channel to it, with encoders, noise
 and a delay of commands. The largest stable bandwidth of computed torque is found by bisection,
@@ -9,6 +9,7 @@ beside the theory of `sampled_data`.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,13 +23,14 @@ from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
 from sst_ros.integration.codegen import numba_version
-from sst_ros.mechanism.generic_math import axpy
+from sst_ros.mechanism.generic_math import ZERO, axpy
+from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
+from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.scene.yaml_document import build, values_of
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
 from sst_ros.state import Vector3
 from sst_ros.sweeps.sweep_study import ControlledRun
-from studies.loop_runs import run_in_loop
 from studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
@@ -111,6 +113,73 @@ def model_errors() -> Iterator[ModelError]:
     yield ModelError("noise", channel=ControlChannel(angle_noise=1e-4, rate_noise=1e-2))
 
 
+TorqueOf = Callable[[Simulation], Any]
+"""Torques of the tick that begins now [N m], constant or a `SineTorque`."""
+
+
+class FunctionRun:
+    """Input and output of a run whose torques come from a function instead of messages.
+
+    Attributes:
+        states: those of all samples.
+        times: processor time of the thread at each [s].
+
+    """
+
+    moment, unread = ZERO, False
+
+    def __init__(self, torque: TorqueOf) -> None:
+        self._torque = torque
+        self.states: list[State] = []
+        self.times: list[float] = []
+
+    def torque(self, simulation: Simulation, _: int) -> Any:
+        """Return the torques of the tick that begins now."""
+        return simulation.acting(self._torque(simulation))
+
+    def constant(self, _: int) -> bool:
+        """Return that the torques of the last tick do not act any longer."""
+        return False
+
+    def now_ns(self) -> int:
+        """Return any time but zero, which means that there is none."""
+        return NANOSECONDS
+
+    def sample(self, simulation: Simulation, _: int) -> None:
+        """Keep the state."""
+        self.states.append(simulation.state)
+        self.times.append(time.thread_time())
+
+    def _nothing(self, *_: Any) -> None:
+        """Do nothing: no command gets old, and there is nothing to publish to."""
+
+    refresh = start = ticks = _nothing
+
+
+def run_in_loop(
+    simulation: Simulation, torque: TorqueOf, period_ns: int, ticks: int, *, warm: bool = False
+) -> FunctionRun:
+    """Run a simulation from its start for some ticks, with a sample at each.
+
+    With `warm` the code of all methods is loaded before, so that all ticks take equally long.
+
+    Raises:
+        RunStopped: it ended before.
+
+    """
+    run: Any = FunctionRun(torque)
+    settings, pacer = RunSettings(period_ns, last_tick=ticks), Pacer(period_ns, 0.0, SteadyTime())
+    loop = TickLoop(simulation, settings, run, pacer, run)
+    if warm:
+        loop.warm_up()
+    loop.begin()
+    loop.resume()
+    while not loop.complete:
+        loop.to_next_sample(paced=True)
+    done: FunctionRun = run
+    return done
+
+
 @dataclass(frozen=True)
 class ControlLoop(ControlledRun):
     """A controller and a plant."""
@@ -143,16 +212,16 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
     rows, limited, failure = [], [], ""
 
     def torque(simulation: Simulation) -> Vector3:
-        joints, time = simulation.state.joints, simulation.time_ns / NANOSECONDS
-        command = controller.command(time, channel.measure(joints.gamma, joints.gamma_dot))
+        joints, now = simulation.state.joints, simulation.time_ns / NANOSECONDS
+        command = controller.command(now, channel.measure(joints.gamma, joints.gamma_dot))
         acting, desired = channel.delayed(command.torque), command.desired
         rows.append(
-            ((time,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
+            ((now,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
              command.feedforward, command.feedback, acting)
         )  # fmt: skip
         limited.append(command.saturated)
         if math.dist(desired.gamma, joints.gamma) > loop.lost:
-            raise ControlStopped(f"off by more than {loop.lost:g} rad", time)
+            raise ControlStopped(f"off by more than {loop.lost:g} rad", now)
         return acting
 
     try:
@@ -182,8 +251,8 @@ class RestMotion(ReferenceMotion):
 
     def __init__(self, motion: ReferenceMotion, duration: float) -> None:
         super().__init__(duration, (0.0, duration))
-        start, zero = motion.at(0.0), (0.0, 0.0, 0.0)
-        self._pose = Reference(start.quaternion, zero, zero, start.gamma, zero, zero)
+        start = motion.at(0.0)
+        self._pose = Reference(start.quaternion, ZERO, ZERO, start.gamma, ZERO, ZERO)
 
     def _inside(self, time: float) -> Reference:
         return self._pose

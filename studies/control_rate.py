@@ -40,7 +40,7 @@ from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation
 from studies import DOCS, parser, run
-from studies.loop_runs import run_in_loop
+from studies.control_loop import run_in_loop
 from studies.sampled_data import ORDERS, slope
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,11 +19,11 @@ import numpy as np
 
 from sst_ros import SineTorque, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
-from sst_ros.host.output import Bar
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot.style import free_figure
 from sst_ros.report.results import markdown, provenance, table, write
 from sst_ros.scene.scene import Scene
+from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 
 METHODS = ("dopri5", "dop853", "rk4", "rodas4", "auto")
@@ -235,12 +234,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
     def study(options: argparse.Namespace) -> bool:
         jobs = [(name, options.seed, k) for k in range(options.count) for name in CLASSES]
-        bar, rows = Bar("estimate", True), []
-        with ProcessPoolExecutor() as pool:
-            for row in pool.map(measure, jobs):
-                rows.append(row)
-                bar.draw(len(rows) / len(jobs))
-        report(rows, options)
+        report(run_jobs(measure, jobs, "estimate        "), options)
         return True
 
     return run(study, arguments, words)

@@ -31,8 +31,8 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.yaml_document import values_of
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
+from studies.control_loop import run_in_loop
 from studies.extreme_cases import Case, apart
-from studies.loop_runs import run_in_loop
 
 LOOSER = 1e-4
 """Tolerance at which the error estimate is checked where LOOSE resolves no error."""

@@ -14,8 +14,6 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import trace
@@ -31,7 +29,6 @@ from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
-    axpy,
     cos,
     cross,
     dot,
@@ -231,10 +228,7 @@ class OrientationObserver:
 
     def __init__(self, geometry: Geometry, quaternion: Quaternion, gamma: Vector3) -> None:
         self.coordinates = ActuatorSpaceMap(geometry)
-        self._begin = quaternion, gamma
-        across = np.cross(geometry.w, geometry.v)
-        legs = (geometry.v.tolist(), across.tolist(), geometry.e.tolist())
-        self._legs = list(zip(*legs, strict=True))
+        self._begin, self._arcs = (quaternion, gamma), geometry.e.tolist()
         self.reset()
 
     def reset(self) -> None:
@@ -282,11 +276,11 @@ class OrientationObserver:
 
     def _measures(self, quaternion: Quaternion, gamma: Vector3) -> tuple[float, float]:
         """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
-        rows = rotation_rows(quaternion)
+        rows, carriages = rotation_rows(quaternion), self.coordinates.carriages(gamma)
         normals, largest = [], 0.0
-        for angle, (v, across, e) in zip(gamma, self._legs, strict=True):
-            r = axpy(math.cos(angle), v, math.sin(angle), across)
-            t = dot(rows[0], e), dot(rows[1], e), dot(rows[2], e)
+        for k, (x, y, z) in enumerate(self._arcs):
+            r = (carriages[3 * k], carriages[3 * k + 1], carriages[3 * k + 2])
+            t = dot(rows[0], (x, y, z)), dot(rows[1], (x, y, z)), dot(rows[2], (x, y, z))
             normals.append(cross(t, r))
             largest = max(largest, abs(dot(r, t)))
         determinant = dot(normals[0], cross(normals[1], normals[2]))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -20,7 +20,6 @@ from sst_ros.dynamics.limits import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Actuators, Scene
-from sst_ros.state import Vector3
 
 SAMPLES = 16
 """Parts of a piece of the motion; even, for Simpson's rule."""
@@ -135,26 +134,35 @@ def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 
     """
     times = sample_times(motion)
-    desired = tuple(motion.at(time) for time in times.tolist())
-    geometry = Geometry.of(scene)
-    distances = tuple(_distances(motion, scene, geometry, times, desired))
+    desired = tuple(map(motion.at, times.tolist()))
+    distances = tuple(_distances(motion, scene, times, desired))
     inverse = InverseDynamics(scene)
-
-    def torque(time: float) -> Vector3:
-        return inverse.reference_torque(motion.at(time))
-
-    torques = np.array([inverse.reference_torque(at) for at in desired])
-    demands = [_demand(motion, torque, leg, times, desired, torques) for leg in range(3)]
-    problems = [*_beyond(distances), *_too_much(demands, scene.actuators)]
+    asked: dict[str, Callable[[Reference], Sequence[float]]] = {
+        "torque": inverse.reference_torque,
+        "power": lambda at: np.multiply(inverse.reference_torque(at), at.gamma_dot).tolist(),
+        "velocity": lambda at: at.gamma_dot,
+        "acceleration": lambda at: at.gamma_ddot,
+    }
+    samples = {name: np.array(list(map(of, desired))) for name, of in asked.items()}
+    demands = []
+    for leg in range(3):
+        peaks = {
+            name: peak_magnitude(_component(motion, of, leg), times, samples[name][:, leg])
+            for name, of in asked.items()
+        }
+        rms = _root_mean_square(samples["torque"][:, leg], times)
+        demands.append(ActuatorDemand(torque_rms=rms, **peaks))
+    first, second, third = demands
+    problems = (*_beyond(distances), *_too_much(demands, scene.actuators))
     return MotionPlan(
         motion,
         scene,
         times,
         desired,
-        torques,
-        (demands[0], demands[1], demands[2]),
+        samples["torque"],
+        (first, second, third),
         distances,
-        tuple(problems),
+        problems,
     )
 
 
@@ -166,77 +174,56 @@ def sample_times(motion: ReferenceMotion) -> Array:
     return np.concatenate([*inner, [motion.pieces[-1]]])
 
 
-def _demand(
-    motion: ReferenceMotion,
-    torque: Callable[[float], Vector3],
-    leg: int,
-    times: Array,
-    desired: tuple[Reference, ...],
-    torques: Array,
-) -> ActuatorDemand:
-    rates = np.array([at.gamma_dot[leg] for at in desired])
-    accelerations = np.array([at.gamma_ddot[leg] for at in desired])
-    mine = torques[:, leg]
+def _component(
+    motion: ReferenceMotion, of: Callable[[Reference], Sequence[float]], index: int
+) -> Callable[[float], float]:
+    """Return one of the numbers of a reference as a function of time."""
+    return lambda time: of(motion.at(time))[index]
+
+
+def _root_mean_square(values: Array, times: Array) -> float:
     square = sum(
-        float(simpson(mine[start : start + SAMPLES + 1] ** 2, x=times[start : start + SAMPLES + 1]))
-        for start in range(0, len(times) - 1, SAMPLES)
+        float(
+            simpson(values[first : first + SAMPLES + 1] ** 2, x=times[first : first + SAMPLES + 1])
+        )
+        for first in range(0, len(times) - 1, SAMPLES)
     )
-    return ActuatorDemand(
-        torque=peak_magnitude(lambda time: torque(time)[leg], times, mine),
-        torque_rms=float(np.sqrt(square / motion.duration)),
-        power=peak_magnitude(
-            lambda time: torque(time)[leg] * motion.at(time).gamma_dot[leg], times, mine * rates
-        ),
-        velocity=peak_magnitude(lambda time: motion.at(time).gamma_dot[leg], times, rates),
-        acceleration=peak_magnitude(
-            lambda time: motion.at(time).gamma_ddot[leg], times, accelerations
-        ),
-    )
+    return float(np.sqrt(square / times[-1]))
 
 
 def _distances(
-    motion: ReferenceMotion,
-    scene: Scene,
-    geometry: Geometry,
-    times: Array,
-    desired: tuple[Reference, ...],
+    motion: ReferenceMotion, scene: Scene, times: Array, desired: tuple[Reference, ...]
 ) -> Iterator[LimitDistance]:
+    geometry = Geometry.of(scene)
     coordinates = ActuatorSpaceMap(geometry)
-    gammas = np.array([at.gamma for at in desired])
-    postures = np.array([_posture(coordinates, at) for at in desired])
 
-    def gamma(leg: int) -> Callable[[float], float]:
-        return lambda time: motion.at(time).gamma[leg]
+    def measure(at: Reference) -> tuple[float, ...]:
+        """Gamma, sin(mu), beta and det J2, ten numbers."""
+        return (*at.gamma, *_posture(coordinates, at))
 
-    def posture(index: int) -> Callable[[float], float]:
-        return lambda time: _posture(coordinates, motion.at(time))[index]
-
-    def both(
-        key: str, end: float, function: Callable[[float], float], values: Array, refused: bool
-    ) -> Iterator[LimitDistance]:
-        yield LimitDistance(key, 0.0, 1.0, "rad", minimum(function, times, values), refused)
-        yield LimitDistance(key, end, -1.0, "rad", maximum(function, times, values), refused)
-
-    held = scene.stroke.at_end != "ignore"
+    values = np.array([measure(at) for at in desired]).T
+    ranges = (
+        ("gamma", 0, geometry.arc.tolist(), scene.stroke.at_end != "ignore"),
+        ("beta", 6, [geometry.beta_max] * 3, scene.workspace.at_edge != "ignore"),
+    )
+    for name, column, ends, held in ranges:
+        for leg, end in enumerate(ends):
+            given = _component(motion, measure, column + leg), times, values[column + leg]
+            key = f"{name}_{leg + 1}"
+            yield LimitDistance(key, 0.0, 1.0, "rad", minimum(*given), held)
+            yield LimitDistance(key, end, -1.0, "rad", maximum(*given), held)
     for leg in range(3):
-        arc = float(geometry.arc[leg])
-        yield from both(f"gamma_{leg + 1}", arc, gamma(leg), gammas[:, leg], held)
-    held = scene.workspace.at_edge != "ignore"
-    for leg in range(3):
-        most, index = geometry.beta_max, 3 + leg
-        yield from both(f"beta_{leg + 1}", most, posture(index), postures[:, index], held)
-    for leg in range(3):
-        low = minimum(posture(leg), times, postures[:, leg])
+        low = minimum(_component(motion, measure, 3 + leg), times, values[3 + leg])
         if low.value < SINGULAR_MU:
             said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
         yield LimitDistance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
-    sign = 1.0 if postures[0, 6] > 0.0 else -1.0
-    low = minimum(lambda time: sign * posture(6)(time), times, sign * postures[:, 6])
+    determinant, sign = _component(motion, measure, 9), 1.0 if values[9, 0] > 0.0 else -1.0
+    low = minimum(lambda time: sign * determinant(time), times, sign * values[9])
     if low.value < SINGULAR_J2:
-        end = low.time if low.value > 0.0 else brentq(posture(6), 0.0, low.time)
+        end = low.time if low.value > 0.0 else brentq(determinant, 0.0, low.time)
         said = f"parallel singularity at t = {end:.9g} s, det J2"
-        raise SingularConfiguration(said, posture(6)(end))
+        raise SingularConfiguration(said, determinant(end))
     yield LimitDistance("det J2", 0.0, sign, "1", Peak(sign * low.value, low.time), True)
 
 

@@ -62,14 +62,11 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     """
     actuators = plan.scene.actuators
     caps = {"torque": math.inf}
-    if actuators and actuators.velocity_limit is not None:
-        fastest = max(abs(demand.velocity.value) for demand in plan.demands)
-        caps["velocity"] = actuators.velocity_limit / fastest if fastest else math.inf
-    if actuators and actuators.acceleration_limit is not None:
-        hardest = max(abs(demand.acceleration.value) for demand in plan.demands)
-        caps["acceleration"] = (
-            math.sqrt(actuators.acceleration_limit / hardest) if hardest else math.inf
-        )
+    for name, limit, _ in limits(actuators):
+        largest = max(abs(getattr(demand, name).value) for demand in plan.demands)
+        if name != "torque":
+            ratio = limit / largest if largest else math.inf
+            caps[name] = ratio if name == "velocity" else math.sqrt(ratio)
     binding = min(caps, key=lambda name: caps[name])
     cap = caps[binding]
     if actuators is None or actuators.torque_limit is None:

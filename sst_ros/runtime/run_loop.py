@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.pacing import Pacer, RunSettings
-from sst_ros.runtime.tick_loop import Counters, HeldTorques, NoAnswer, RunOutput, TickLoop
+from sst_ros.runtime.tick_loop import NoAnswer, RunOutput, TickLoop
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.simulation.simulation import Simulation
@@ -61,8 +61,8 @@ class NoSubscribers(SstError):
     """A topic of wait_for_subscribers has no subscriber."""
 
 
-class RunLoop:
-    """State machine of one node's run.
+class RunLoop(TickLoop):
+    """State machine of one node's run, whose ticks are those of a `TickLoop`.
 
     Attributes:
         phase: present phase.
@@ -81,35 +81,13 @@ class RunLoop:
         output: RunOutput,
     ) -> None:
         self.phase, self.fault, self.failed = Phase.WAITING, "", False
-        self._build, self._run = build, run
-        self._input, self._output = torque_input, output
-        self._original = build(scene)
-        self._ticks = TickLoop(self._original, run, torque_input, pacer, output)
+        self._build, self._original = build, build(scene)
+        super().__init__(self._original, run, torque_input, pacer, output)
         self._requests: deque[tuple[Callable[[], Reply], PendingReply]] = deque()
         self._changing = threading.RLock()
         self._thread: threading.Thread | None = None
         self._watched = (0.0, 0.0)
-        self._awaited_since: float | None = time.monotonic()
-
-    @property
-    def simulation(self) -> Simulation:
-        """Present simulation; its `state` may be read by any thread."""
-        return self._ticks.simulation
-
-    @property
-    def counters(self) -> Counters:
-        """Counters of the run."""
-        return self._ticks.counters
-
-    @property
-    def held(self) -> HeldTorques:
-        """Torques since the start of the run."""
-        return self._ticks.held
-
-    @property
-    def begun(self) -> bool:
-        """Whether the first sample has been published since the start or the last reset."""
-        return self._ticks.begun
+        self._missing_since: float | None = time.monotonic()
 
     def ask(self, request: Callable[[], Reply], timeout: float = _REPLY_S) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the thread of the run; wait for it.
@@ -119,9 +97,9 @@ class RunLoop:
         pending = self.post(request)
         deadline = time.monotonic() + timeout
         while not pending.done.wait(_POLL_S):
-            since = self._ticks.step_since
+            since = self.step_since
             stuck = since and time.perf_counter() - since > _STUCK_S
-            ends = stuck or self._ticks.stopped.is_set() or time.monotonic() > deadline
+            ends = stuck or self.stopped.is_set() or time.monotonic() > deadline
             if ends and not pending.done.is_set():  # it may have been served just before
                 with self._changing, contextlib.suppress(ValueError):  # it is being served
                     self._requests.remove((request, pending))
@@ -133,17 +111,17 @@ class RunLoop:
         """Have a request served; do not wait."""
         pending = PendingReply()
         self._requests.append((request, pending))
-        self._ticks.requested.set()
+        self.requested.set()
         return pending
 
     def stop(self) -> None:
         """Make `run` return soon."""
-        self._ticks.stopped.set()
-        self._ticks.requested.set()
+        self.stopped.set()
+        self.requested.set()
 
     def watch(self) -> None:
         """Latch a fault, from another thread, where the step in progress does not end."""
-        since, used = self._ticks.step_since, self._processor_s()
+        since, used = self.step_since, self._processor_s()
         if since == 0.0 or since != self._watched[0]:
             self._watched = since, used
         elif used - self._watched[1] > _STUCK_S and self.phase is not Phase.FAULT:
@@ -154,7 +132,7 @@ class RunLoop:
 
     def run(self) -> None:
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
-        self._thread, self._awaited_since = threading.current_thread(), time.monotonic()
+        self._thread, self._missing_since = threading.current_thread(), time.monotonic()
         self._publish_phase()
         act: dict[Phase, Callable[[], None]] = {
             Phase.WAITING: self._wait_for_start,
@@ -164,12 +142,12 @@ class RunLoop:
             Phase.FINISHED: lambda: None,  # a step led to the end
         }
         warm = False
-        while not (self._ticks.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
+        while not (self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
             try:
                 if not warm:
                     warm = True
-                    self._ticks.warm_up()
-                if self._ticks.requested.is_set():
+                    self.warm_up()
+                if self.requested.is_set():
                     self._serve()
                 act[self.phase]()
             except NoSubscribers as missing:
@@ -181,7 +159,7 @@ class RunLoop:
                 at = traceback.extract_tb(error.__traceback__)[-1]
                 where = f"{at.filename.rpartition('/')[2]}:{at.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
-                self._ticks.stopped.wait(IDLE_PERIOD_S)
+                self.stopped.wait(IDLE_PERIOD_S)
         self._end_of_run()
 
     def pause(self, paused: bool) -> Reply:
@@ -190,7 +168,7 @@ class RunLoop:
             return Reply(False, f"fault, reset first: {self.fault}")
         if paused:
             reply = "already paused" if self.phase is Phase.PAUSED else "paused"
-            self._ticks.publish_rest()
+            self.publish_rest()
             self._to(Phase.PAUSED)
             return Reply(True, reply)
         if self.phase is not Phase.PAUSED:
@@ -206,12 +184,12 @@ class RunLoop:
         """Advance a paused run by some samples, with the torques of the last command."""
         if self.phase is not Phase.PAUSED:
             return Reply(False, f"refused: only a paused run can be stepped, it is {self._status}")
-        if not self.begun and not self._ticks.begin():
+        if not self.begun and not self.begin():
             return Reply(False, "refused: there is no time yet on /clock")
         for _ in range(samples):
-            self._ticks.refresh()
+            self.refresh()
             try:
-                if not self._ticks.to_next_sample(paced=False):
+                if not self.to_next_sample(paced=False):
                     return Reply(False, "not done: the node is shutting down")
             except NoAnswer as none:
                 return Reply(False, f"not done, no controller answers: {none}")
@@ -219,7 +197,7 @@ class RunLoop:
                 self._fail(str(stopped))
             if self.fault:
                 return Reply(False, self._status)
-            if self._ticks.complete:
+            if self.complete:
                 self._finish()
                 break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
@@ -244,16 +222,16 @@ class RunLoop:
             self._restart(self._build(scene))
         except SstError as error:
             return Reply(False, f"refused: {error}")
-        self._ticks.warm_up()
+        self.warm_up()
         self.counters.states_set += 1
         return Reply(True, f"the state is set, {self.phase.value}")
 
     def _restart(self, simulation: Simulation) -> None:
-        self._ticks.restart(simulation)
+        self.restart(simulation)
         self._show()
 
     def _serve(self) -> None:
-        self._ticks.requested.clear()
+        self.requested.clear()
         while self._requests:
             with self._changing:
                 if not self._requests:
@@ -267,7 +245,7 @@ class RunLoop:
     def _wait_for_start(self) -> None:
         """Show the state until the run starts: by itself, or by a command."""
         shown = -math.inf
-        while not self._ticks.requested.is_set():
+        while not self.requested.is_set():
             if self._start():
                 return
             if time.monotonic() - shown > IDLE_PERIOD_S:
@@ -279,57 +257,57 @@ class RunLoop:
         """Start the run, unless it has to wait; return whether it runs."""
         if not (self._has_subscribers() and (not self._run.waits or self._input.starts_run())):
             return False
-        if not self._ticks.begin():
+        if not self.begin():
             return False
         self._resume()
         return True
 
     def _has_subscribers(self) -> bool:
         """Whether the topics of wait_for_subscribers have had subscribers."""
-        if self._awaited_since is None:
+        if self._missing_since is None:
             return True
         missing = self._output.missing_subscribers()
         timeout = self._run.subscriber_timeout
         if not missing:
-            self._awaited_since = None
-        elif time.monotonic() - self._awaited_since > timeout:
+            self._missing_since = None
+        elif time.monotonic() - self._missing_since > timeout:
             reason = f"no subscriber of {', '.join(missing)} within {timeout:g} s"
             raise NoSubscribers(f"{reason} (wait_for_subscribers)")
         return not missing
 
     def _resume(self) -> None:
         self._to(Phase.RUNNING)
-        self._ticks.resume()
+        self.resume()
 
     def _to_next_sample(self) -> None:
-        done = self._ticks.to_next_sample(paced=True)
+        done = self.to_next_sample(paced=True)
         if self.fault:  # latched by `watch`: the step has ended after all
-            self._ticks.publish_rest()
-        elif done and self._ticks.complete:
+            self.publish_rest()
+        elif done and self.complete:
             self._finish()
 
     def _finish(self) -> None:
-        self._ticks.publish_rest()
+        self.publish_rest()
         self._to(Phase.FINISHED)
 
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
         self.fault = self.fault or reason
         if self.phase is not Phase.FAULT:
-            self._ticks.publish_rest()
+            self.publish_rest()
         self._to(Phase.FAULT)
 
     def _idle(self) -> None:
         self._show()
-        self._ticks.requested.wait(IDLE_PERIOD_S)
+        self.requested.wait(IDLE_PERIOD_S)
 
     def _show(self) -> None:
-        self._ticks.show(fault=bool(self.fault))
+        self.show(fault=bool(self.fault))
 
     def _end_of_run(self) -> None:
-        self._ticks.publish_rest()
+        self.publish_rest()
         self.counters.hold()
-        self._ticks.stopped.set()
+        self.stopped.set()
         while self._requests:
             self._requests.popleft()[1].done.set()
 
