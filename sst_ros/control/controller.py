@@ -244,6 +244,7 @@ class Command:
         feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
         feedback: torque due to the error [N m].
         desired: the reference at this instant.
+        error, error_rate: desired - measured, of gamma [rad] and gamma_dot [rad/s].
         integral: the new sum of errors [rad s].
 
     """
@@ -252,6 +253,8 @@ class Command:
     feedforward: Vector3
     feedback: Vector3
     desired: Reference
+    error: Vector3
+    error_rate: Vector3
     integral: Any
 
     @property
@@ -310,7 +313,7 @@ class ControlLaw(NamedTuple):
             torque = bound(total, self.limit)
             weight = 1.0 - is_above(dot(axpy(1.0, total, -1.0, torque), error))
         integral = at.integral and axpy(1.0, at.integral, weight * self.period, summed)
-        return Command(torque, feedforward, feedback, at.desired, integral)
+        return Command(torque, feedforward, feedback, at.desired, error, rates, integral)
 
     def _compute_torque(self, at: Sample, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
         """Torque of computed_torque, and the error to integrate."""

@@ -19,15 +19,19 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from sst_ros.control.controller import Command, Measurement
 from sst_ros.control.tracking import table
 from sst_ros.errors import SstError
-from sst_ros.mechanism.generic_math import ZERO, axpy
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
 from sst_ros.nodes.topics import ActionGoal
 from sst_ros.nodes.torque_commands import TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
-from sst_ros.runtime.trajectory_goal import ErrorCode, TrajectoryGoal
+from sst_ros.runtime.trajectory_following import (
+    ErrorCode,
+    Stage,
+    TrajectoryFollower,
+    TrajectoryGoal,
+)
 from sst_ros.scene import scene
 from sst_ros.simulation.simulation import NANOSECONDS
 from sst_ros.state import Vector3
@@ -118,7 +122,7 @@ class InverseDynamicsController:
             return
         self._began = True
         self._commands.send(command.torque)
-        self._publish(state, self._seen, command)
+        self._publish(state, command)
         self._goals.sample(state, self._seen, command)
         if self._follower.stage is Stage.ENDED:
             self.done.set()
@@ -149,13 +153,12 @@ class InverseDynamicsController:
         p, v = state.position, state.velocity
         return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
 
-    def _publish(self, state: JointState, seen: Measurement, command: Command) -> None:
+    def _publish(self, state: JointState, command: Command) -> None:
         """Publish reference and tracking error under the stamp of the sample."""
         at = command.desired
-        off = axpy(1.0, at.gamma, -1.0, seen.gamma), axpy(1.0, at.gamma_dot, -1.0, seen.gamma_dot)
         for publisher, (position, velocity), effort in (
             (self._reference, (at.gamma, at.gamma_dot), command.feedforward),
-            (self._error, off, command.feedback),
+            (self._error, (command.error, command.error_rate), command.feedback),
         ):
             message = JointState(name=list(ACTUATORS))
             message.header.stamp = state.header.stamp
@@ -274,7 +277,7 @@ class FollowJointTrajectoryServer:
             return
         time = self._follower.time
         active.feedback = state.header.stamp, time, measured, command
-        outcome = active.goal.outcome(time, command.desired, measured)
+        outcome = active.goal.outcome(time, command.error, command.error_rate)
         if outcome is None:
             return
         self._report()
@@ -337,12 +340,10 @@ class FollowJointTrajectoryServer:
         desired, total = command.desired, command.torque
         message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
         message.header.stamp, message.index = stamp, active.goal.index(time)
-        off = axpy(1.0, desired.gamma, -1.0, measured.gamma)
-        rates = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
         message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
         message.desired.accelerations = array("d", desired.gamma_ddot)
         message.actual = _point(time, measured.gamma, measured.gamma_dot, total)
-        message.error = _point(time, off, rates, command.feedback)
+        message.error = _point(time, command.error, command.error_rate, command.feedback)
         active.handle.publish_feedback(message)
 
 

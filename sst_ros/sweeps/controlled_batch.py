@@ -300,7 +300,7 @@ class ControlledBatch:
             limit,
             loop.channel.period,
         )
-        told = law.answer(
+        command = law.answer(
             Sample(
                 desired,
                 given["feedforward"],
@@ -311,12 +311,12 @@ class ControlledBatch:
                 memory["integral"],
             )
         )
-        new["integral"] = told.integral
+        new["integral"] = command.integral
         torque, new["queue"] = loop.channel.transmit(
-            told.torque, memory["queue"], given["first"][0]
+            command.torque, memory["queue"], given["first"][0]
         )
         if self._limited:
-            cut = axpy(1.0, told.total, -1.0, told.torque)
+            cut = axpy(1.0, command.total, -1.0, command.torque)
             new["limited"] = (memory["limited"][0] + is_above(dot(cut, cut)),)
             torque = bound(torque, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)

@@ -11,7 +11,7 @@ from ros.conftest import NAMES, foreign_types
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from sst_ros.runtime.trajectory_goal import ErrorCode
+from sst_ros.runtime.trajectory_following import ErrorCode
 from sst_ros.state import nanoseconds
 
 from .test_inverse_dynamics import AWAY, HOME, trajectory, written

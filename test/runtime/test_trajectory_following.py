@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without its node: when it begins, goes on, ends, and what it refuses."""
+"""The controller without its node: when it begins, goes on, ends, and what it refuses; goals."""
 
 import dataclasses
 import tracemalloc
+from types import SimpleNamespace as Message
 
 import numpy as np
 import pytest
@@ -12,16 +13,25 @@ from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
+from sst_ros.runtime.trajectory_following import (
+    ErrorCode,
+    Stage,
+    TrajectoryFollower,
+    TrajectoryGoal,
+)
 from sst_ros.scene import scene
 from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Initial
 from sst_ros.simulation.simulation import Simulation
 
 PERIOD_NS = 2_000_000
+REST = (0.0, 0.0, 0.0)
 START_NS = 1_700_000_000_123_456_789
 MOVE = DesiredMotion(spiral=Spiral(phi=0.02, theta=0.5, psi=0.03, duration=0.05))
 MODEL = dataclasses.replace(scene.load("example2_heavy"), motion=MOVE, torque=None)
+
+
+HERE = Measurement(MODEL.initial.gamma, REST)
 
 
 def seen(state):
@@ -55,21 +65,19 @@ def test_it_follows_holds_and_ends_with_zero_torque():
 
 def test_samples_that_come_twice_or_late_are_told_apart():
     follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
-    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
-        assert (follower.answer(START_NS + k * PERIOD_NS, here) is not None) == answered
+        assert (follower.answer(START_NS + k * PERIOD_NS, HERE) is not None) == answered
     assert (follower.samples, follower.irregular) == (3, 1)
 
 
 def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
     monkeypatch.setattr(tracking, "_KEPT", 100)
     follower = TrajectoryFollower(MODEL, ControllerNodeParameters(hold=1e6))
-    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     for k in range(600):
-        follower.answer(START_NS + k * PERIOD_NS, here)
+        follower.answer(START_NS + k * PERIOD_NS, HERE)
     tracemalloc.start()
     for k in range(600, 1200):
-        follower.answer(START_NS + k * PERIOD_NS, here)
+        follower.answer(START_NS + k * PERIOD_NS, HERE)
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 70_000  # 600 rows of a record are 106 000
@@ -78,7 +86,7 @@ def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
 
 def test_a_reset_of_the_simulator_begins_the_motion_anew():
     follower = TrajectoryFollower(MODEL, ControllerNodeParameters(mode="pd", integral_rate=1.0))
-    here = Measurement(tuple(np.add(MODEL.initial.gamma, 0.01)), (0.0, 0.0, 0.0))
+    here = Measurement(tuple(np.add(MODEL.initial.gamma, 0.01)), REST)
     told = [follower.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
     follower.restart()
     assert follower.stage is Stage.READY and follower.tracking() is None
@@ -139,12 +147,11 @@ def test_it_begins_only_near_the_start_of_the_motion():
 
 def test_what_is_not_finite_is_nowhere_near():
     follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
-    here = Measurement(MODEL.initial.gamma, (0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="where the motion begins"):
-        follower.preview(dataclasses.replace(here, gamma=(np.nan,) * 3))
-    follower.answer(START_NS, here)
+        follower.preview(dataclasses.replace(HERE, gamma=(np.nan,) * 3))
+    follower.answer(START_NS, HERE)
     with pytest.raises(ControlStopped, match="must be finite"):
-        follower.answer(START_NS + PERIOD_NS, dataclasses.replace(here, gamma_dot=(np.nan,) * 3))
+        follower.answer(START_NS + PERIOD_NS, dataclasses.replace(HERE, gamma_dot=(np.nan,) * 3))
 
 
 def test_a_stop_comes_to_rest_on_the_path_and_holds():
@@ -172,3 +179,112 @@ def test_a_stop_before_the_run_forgets_the_trajectory():
     follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
     follower.stop()
     assert follower.stage is Stage.READY  # the scene's own motion stays
+
+
+DEFAULTS = ControllerNodeParameters(motion="topic", path_tolerance=0.1, goal_tolerance=0.01)
+
+
+def duration(seconds):
+    sec, nanosec = divmod(round(seconds * 1e9), 10**9)
+    return Message(sec=sec, nanosec=nanosec)
+
+
+def tolerance(name="gamma_2", position=0.0, velocity=0.0, acceleration=0.0):
+    return Message(name=name, position=position, velocity=velocity, acceleration=acceleration)
+
+
+def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0):
+    points = [Message(time_from_start=duration(time)) for time in times]
+    return Message(
+        trajectory=Message(points=points),
+        multi_dof_trajectory=Message(joint_names=[], points=[]),
+        path_tolerance=path,
+        goal_tolerance=goal,
+        component_path_tolerance=[],
+        component_goal_tolerance=[],
+        goal_time_tolerance=duration(goal_time),
+    )
+
+
+def outcome(time, off=0.0, rate=0.0, defaults=DEFAULTS, **given):
+    """At a time, with errors of gamma_2 and its rate."""
+    goal = TrajectoryGoal(message(**given), defaults)
+    found = goal.outcome(time, (0.0, off, 0.0), (0.0, rate, 0.0))
+    return found and found.code
+
+
+PATH, GOAL = ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED
+DONE = ErrorCode.SUCCESSFUL
+
+
+@pytest.mark.parametrize(
+    ("expected", "case"),
+    [
+        (None, {"time": 0.999999, "off": 0.099}),
+        (PATH, {"time": 0.999999, "off": -0.101}),
+        (PATH, {"time": 0.0, "off": np.nan}),
+        (None, {"time": 0.5, "off": 0.101, "path": [tolerance(position=0.2)]}),
+        (PATH, {"time": 0.5, "off": 0.201, "path": [tolerance(position=0.2)]}),
+        (None, {"time": 0.5, "off": 9.0, "path": [tolerance(position=-1.0)]}),
+        (None, {"time": 0.5, "rate": 9.0}),
+        (PATH, {"time": 0.5, "rate": 9.0, "path": [tolerance(velocity=8.0)]}),
+        (PATH, {"time": 0.5, "off": 0.101, "path": [tolerance("gamma_1", position=-1.0)]}),
+        (None, {"time": 0.5, "path": [tolerance(acceleration=1e-9)]}),
+        (DONE, {"time": 1.0, "off": 0.0099, "rate": 0.0099}),
+        (None, {"time": 1.0, "off": 0.0101}),
+        (None, {"time": 1.0, "rate": 0.0101}),
+        (DONE, {"time": 1.0, "off": 0.09, "goal": [tolerance(position=-1.0)]}),
+        (DONE, {"time": 1.0, "rate": 9.0, "goal": [tolerance(velocity=-1.0)]}),
+        (None, {"time": 2.0, "off": 0.0101}),
+        (GOAL, {"time": 2.001, "off": 0.0101}),
+        (DONE, {"time": 2.001, "off": 0.0099}),
+        (GOAL, {"time": 1.21, "off": 0.0101, "goal_time": 0.2}),
+        (None, {"time": 1e6, "off": 0.0101, "goal_time": -1.0}),
+    ],
+)
+def test_a_goal_goes_on_or_ends(expected, case):
+    assert outcome(**case) == expected
+
+
+def test_without_tolerances_a_goal_ends_with_its_last_point():
+    free = dataclasses.replace(
+        DEFAULTS, path_tolerance=0.0, goal_tolerance=0.0, stopped_velocity_tolerance=0.0
+    )
+    assert outcome(0.999, 9.0, 9.0, free) is None
+    assert outcome(1.0, 9.0, 9.0, free) is DONE
+
+
+def test_the_message_names_the_joint_and_both_numbers():
+    goal, off = TrajectoryGoal(message(), DEFAULTS), (0.0, 0.0, 0.25)
+    found = goal.outcome(0.2, off, REST)
+    assert found.message == "gamma_3: position error 0.25 rad, path tolerance 0.1 rad"
+    assert goal.outcome(2.5, off, REST).message == (
+        "gamma_3: position error 0.25 rad, goal tolerance 0.01 rad 1.500 s after the end, "
+        "goal_time_tolerance 1 s"
+    )
+
+
+def test_the_index_is_that_of_the_point_ahead():
+    goal = TrajectoryGoal(message(times=(0.0, 0.5, 1.0)), DEFAULTS)
+    assert [goal.index(time) for time in (0.0, 0.49, 0.5, 0.99, 1.0, 9.0)] == [1, 1, 2, 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("given", "place"),
+    [
+        ({"path": [tolerance("gamma_4")]}, r"path_tolerance\[0\].name = 'gamma_4'"),
+        ({"goal": [tolerance(), tolerance(velocity=-0.5)]}, r"goal_tolerance\[1\].velocity"),
+        ({"path": [tolerance(position=np.nan)]}, r"path_tolerance\[0\].position"),
+        ({"goal_time": -2.0}, "goal_time_tolerance"),
+    ],
+)
+def test_bad_tolerances_are_refused(given, place):
+    with pytest.raises(InputError, match=place):
+        TrajectoryGoal(message(**given), DEFAULTS)
+
+
+def test_joints_of_several_freedoms_are_refused():
+    given = message()
+    given.multi_dof_trajectory.joint_names = ["base"]
+    with pytest.raises(InputError, match=r"multi_dof_trajectory\.joint_names"):
+        TrajectoryGoal(given, DEFAULTS)
