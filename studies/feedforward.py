@@ -35,7 +35,7 @@ from sst_ros.control.controller import INSTANTS, MODES, ControlChannel, Controll
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.tracking import evaluate
+from sst_ros.control.tracking import evaluate_tracking
 from sst_ros.errors import InputError, Problem
 from sst_ros.report.results import markdown, provenance, records, table, write
 from sst_ros.scene.scene import Scene, load
@@ -196,7 +196,7 @@ def _tracked(
     )
     if failure:
         return named | {"failure": failure}
-    found = evaluate(track, int(limited.sum()))
+    found = evaluate_tracking(track, int(limited.sum()))
     late = track.time >= motion.duration + 0.5 * REST_S
     swing, saturated = float(np.ptp(track.error[late], axis=0).max()), limited[late].any()
     if not open_loop and (saturated or not swing <= found.band):

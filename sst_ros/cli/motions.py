@@ -6,9 +6,9 @@ from __future__ import annotations
 import argparse
 
 from sst_ros.cli.commands import free_out, function
-from sst_ros.control.plan import examine
+from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.time_scaling import as_json, table, time_scaling, write_torques
+from sst_ros.control.time_scaling import plan_json, plan_table, time_scaling, write_torques
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import require_free
 from sst_ros.scene.scene import load
@@ -31,8 +31,8 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     scene = load(options.scene)
-    plan = examine(reference_motion(scene, _read_motion), scene)
-    write = as_json if options.json else table
+    plan = examine_motion(reference_motion(scene, _read_motion), scene)
+    write = plan_json if options.json else plan_table
     print(write(plan, time_scaling(plan)).rstrip())
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)

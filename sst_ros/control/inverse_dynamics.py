@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -106,9 +106,12 @@ class InverseDynamics:
         return self.torque((x, y, z, w), REST, REST)
 
     def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> Exception:
-        problems = list(_problems(quaternion, given))
-        if problems:
-            return InputError("inverse dynamics", problems)
+        if not all(map(math.isfinite, given)):
+            problem = Problem("state", tuple(given), "must be finite numbers")
+            return InputError("inverse dynamics", [problem])
+        if math.hypot(*quaternion) < 1e-100:
+            problem = Problem("quaternion", quaternion, "must have a length > 0")
+            return InputError("inverse dynamics", [problem])
         geometry = Geometry.of(self.scene)
         # t_k x w_k is r_k times sin(mu_k); J2 has the rows t_k x r_k.
         t = geometry.e @ rotation_matrix(quaternion).T
@@ -117,16 +120,8 @@ class InverseDynamics:
         least = float(sines.min())
         if least <= SINGULAR:
             return SingularConfiguration("serial singularity, sin(mu)", least)
-        j2 = np.cross(t, across / sines[:, None])
+        determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
         said = "no finite torque gives this acceleration: det J2"
-        determinant = float(np.linalg.det(j2))
         if abs(determinant) <= 2.0 * SINGULAR:
             said = "parallel singularity, det J2"
         return SingularConfiguration(said, determinant)
-
-
-def _problems(quaternion: Quaternion, given: Sequence[float]) -> Iterator[Problem]:
-    if not all(map(math.isfinite, given)):
-        yield Problem("state", tuple(given), "must be finite numbers")
-    elif math.hypot(*quaternion) < 1e-100:
-        yield Problem("quaternion", quaternion, "must have a length > 0")

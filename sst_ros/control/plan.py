@@ -109,7 +109,7 @@ class MotionPlan:
     problems: tuple[Problem, ...]
 
 
-def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
+def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     """Examine a motion and raise if it is infeasible.
 
     Raises:
@@ -118,13 +118,13 @@ def check(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
         SingularConfiguration: it meets a singularity.
 
     """
-    plan = examine(motion, scene)
+    plan = examine_motion(motion, scene)
     if plan.problems:
         raise MotionRefused("motion", plan.problems)
     return plan
 
 
-def examine(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
+def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     """Compute demands of a motion and its distances from all limits, between samples too.
 
     An external moment from a topic counts as zero; the lag of actuators is not included.

@@ -70,8 +70,14 @@ def reference_motion(
     if spiral := motion.spiral:
         angles = (spiral.theta, spiral.phi, spiral.psi)
         return SpiralMotion(geometry, start, angles, spiral.duration)
-    if motion.waypoints:
-        return _through(scene, geometry, start)
+    if points := motion.waypoints:
+        rows = zip(
+            *((at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in points), strict=True
+        )
+        try:
+            return through_points(geometry, start, *rows)
+        except InputError as error:
+            raise InputError(f"{scene.name}: motion.waypoints", error.problems) from None
     if motion.sweep:
         centre = motion.sweep.centre or gamma
         if centre != gamma:
@@ -82,22 +88,6 @@ def reference_motion(
         path = straight_path(gamma, motion.to_angles)
         pieces = equal_pieces(motion.to_angles.duration, 2 * PIECES)
     return ActuatorMotion(geometry, path, pieces, start)
-
-
-def _through(scene: Scene, geometry: Geometry, start: Quaternion) -> ReferenceMotion:
-    assert scene.motion is not None
-    points = scene.motion.waypoints
-    try:
-        return through_points(
-            geometry,
-            start,
-            [point.time for point in points],
-            [point.gamma for point in points],
-            [point.gamma_dot for point in points],
-            [point.gamma_ddot for point in points],
-        )
-    except InputError as error:
-        raise InputError(f"{scene.name}: motion.waypoints", error.problems) from None
 
 
 StarState = tuple[Quaternion, Vector3, Vector3]

@@ -148,27 +148,22 @@ class _Torques:
 
 def _last(torques: _Torques, grid: list[float], start: int, *, feasible: bool) -> int | None:
     """Index of the last factor up to `start` that is feasible, or is not; None if there is none."""
-    for index in range(start, -1, -1):
-        if torques.fit(grid[index]) == feasible:
-            return index
-    return None
+    down = range(start, -1, -1)
+    return next((index for index in down if torques.fit(grid[index]) == feasible), None)
 
 
 def _between(torques: _Torques, fits: float, fails: float) -> float:
     """Return the feasible end of a change between two factors."""
     for _ in range(_HALVINGS):
         middle = 0.5 * (fits + fails)
-        if torques.fit(middle):
-            fits = middle
-        else:
-            fails = middle
+        fits, fails = (middle, fails) if torques.fit(middle) else (fits, middle)
     return float(fits)
 
 
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 
 
-def table(plan: MotionPlan, fastest: TimeScaling) -> str:
+def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for people."""
     lines = [
         f"{plan.scene.name}: {plan.motion.duration:g} s, {len(plan.times)} samples and the "
@@ -237,7 +232,7 @@ def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
         )
 
 
-def as_json(plan: MotionPlan, fastest: TimeScaling) -> str:
+def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
     highest = fastest.highest
     return json.dumps(

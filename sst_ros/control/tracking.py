@@ -176,14 +176,14 @@ class TrackingSums:
             self._settled = float(track.time[first])
 
 
-def evaluate(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
+def evaluate_tracking(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
     """Return the metrics of a record of one sample or more; `limited` is passed on."""
     sums = TrackingSums()
     sums.add(track)
     return sums.metrics(limited)
 
 
-def table(found: TrackingMetrics) -> str:
+def tracking_table(found: TrackingMetrics) -> str:
     """Return the metrics as text; what is unknown is a dash."""
     return "\n".join(_lines(found)) + "\n"
 

@@ -25,7 +25,7 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.plan import examine
+from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, MotionRefused, Problem
@@ -117,7 +117,7 @@ def design(
     found = minimize(cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
     for _ in range(40):
         designed = _write_scene(scene, series, found)
-        plan = examine(reference_motion(designed), designed)
+        plan = examine_motion(reference_motion(designed), designed)
         if not plan.problems and cost.violation(found) <= 0.0:
             return cost.result(designed, found)
         found = 0.95 * found

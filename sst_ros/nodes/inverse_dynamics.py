@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.control.controller import Command, Measurement
-from sst_ros.control.tracking import table
+from sst_ros.control.tracking import tracking_table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
@@ -182,7 +182,7 @@ class InverseDynamicsController:
         finally:
             self._commands.restart_timeout()  # no message could be received during the check
         if tracking is not None:
-            print(table(tracking), flush=True)
+            print(tracking_table(tracking), flush=True)
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
         return True
 
@@ -223,7 +223,7 @@ class InverseDynamicsController:
     def _print(self) -> None:
         """Print the tracking errors of the last motion."""
         if (tracking := self._follower.tracking()) is not None:
-            print(table(tracking), flush=True)
+            print(tracking_table(tracking), flush=True)
 
 
 class _ActiveGoal(ActionGoal):

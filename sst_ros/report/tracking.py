@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, evaluate, table
+from sst_ros.control.tracking import (
+    TrackingMetrics,
+    TrackingRecord,
+    evaluate_tracking,
+    tracking_table,
+)
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import continuation
@@ -95,7 +100,7 @@ def of(run: Recording) -> TrackedRun | None:
 
 def metrics(tracked: TrackedRun) -> TrackingMetrics:
     """Return the figures of the tracking."""
-    return evaluate(tracked.track, tracked.limited)
+    return evaluate_tracking(tracked.track, tracked.limited)
 
 
 def report(bag: Path, out: Path) -> str:
@@ -107,7 +112,11 @@ def report(bag: Path, out: Path) -> str:
 
     """
     tracked = read(bag)
-    lines = [f"Tracking of {tracked.recording.scene.name}, from {bag}", "", table(metrics(tracked))]
+    lines = [
+        f"Tracking of {tracked.recording.scene.name}, from {bag}",
+        "",
+        tracking_table(metrics(tracked)),
+    ]
     if np.isfinite(tracked.orientation_error).any():
         worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")

@@ -206,7 +206,7 @@ class RunLoop(TickLoop):
         """Go back to the scene's initial state; stamps go on, the command is forgotten."""
         self._original.reset()
         self.fault = ""
-        self._restart(self._original)
+        self.restart(self._original)
         self.counters.resets += 1
         if self.phase is not Phase.PAUSED:
             self._to(Phase.WAITING)
@@ -219,16 +219,12 @@ class RunLoop(TickLoop):
         try:
             initial = Initial(gamma=gamma, gamma_dot=gamma_dot)
             scene = dataclasses.replace(self._original.scene, initial=initial)
-            self._restart(self._build(scene))
+            self.restart(self._build(scene))
         except SstError as error:
             return Reply(False, f"refused: {error}")
         self.warm_up()
         self.counters.states_set += 1
         return Reply(True, f"the state is set, {self.phase.value}")
-
-    def _restart(self, simulation: Simulation) -> None:
-        self.restart(simulation)
-        self._show()
 
     def _serve(self) -> None:
         self.requested.clear()
@@ -250,7 +246,7 @@ class RunLoop(TickLoop):
                 return
             if time.monotonic() - shown > IDLE_PERIOD_S:
                 shown = time.monotonic()
-                self._show()
+                self.show(fault=bool(self.fault))
             time.sleep(_POLL_S)
 
     def _start(self) -> bool:
@@ -298,11 +294,8 @@ class RunLoop(TickLoop):
         self._to(Phase.FAULT)
 
     def _idle(self) -> None:
-        self._show()
-        self.requested.wait(IDLE_PERIOD_S)
-
-    def _show(self) -> None:
         self.show(fault=bool(self.fault))
+        self.requested.wait(IDLE_PERIOD_S)
 
     def _end_of_run(self) -> None:
         self.publish_rest()

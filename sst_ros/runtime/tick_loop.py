@@ -245,10 +245,11 @@ class TickLoop:
         self.simulation.reset()
 
     def restart(self, simulation: Simulation) -> None:
-        """Take another simulation, or the same at its start; stamps go on."""
+        """Take another simulation, or the same at its start, and show it; stamps go on."""
         self.simulation, self.begun, self._tick, self._kept = simulation, False, 0, None
         self._input.clear()
         self.held.clear()
+        self.show(fault=False)
 
     def begin(self) -> bool:
         """Publish the first sample; False as long as a followed clock has no time."""

@@ -163,7 +163,7 @@ class TorqueInput:
 
     def _take(self, now_ns: int) -> None:
         for message in self._commands.read(now_ns):
-            self._use(three, message.data, now_ns)
+            self._use(three_numbers, message.data, now_ns)
         if found := self._stamped.read(now_ns):
             for message in self._complete(found):
                 self._use(torque_by_name, message, now_ns)
@@ -185,7 +185,7 @@ class TorqueInput:
         for message in self._moments.read(math.inf if self._run.lockstep else now_ns):
             vector = message.wrench.torque
             try:
-                self.moment = three((vector.x, vector.y, vector.z), "moments [N m]")
+                self.moment = three_numbers((vector.x, vector.y, vector.z), "moments [N m]")
                 self._moment_since = now_ns
             except MessageRefused as refused:
                 self._drop(refused)
@@ -219,7 +219,7 @@ class TorqueInput:
         return old
 
 
-def three(data: Sequence[float], what: str = "torques [N m]") -> Vector3:
+def three_numbers(data: Sequence[float], what: str = "torques [N m]") -> Vector3:
     """Return three finite numbers.
 
     Raises:
@@ -251,4 +251,4 @@ def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3
     if len(values) != 3:
         raise MessageRefused("wrong size", f"{list(values)[:6]} must be 3 finite {what}")
     at = dict(zip(names, values, strict=True))
-    return three([at[name] for name in ACTUATORS], what)
+    return three_numbers([at[name] for name in ACTUATORS], what)

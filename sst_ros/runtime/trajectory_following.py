@@ -21,7 +21,7 @@ import numpy as np
 from sst_ros.control.actuator_motions import through_points
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Command, Controller, Measurement, command_limit
-from sst_ros.control.plan import check
+from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, StoppingMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, TrackingSums
@@ -267,7 +267,7 @@ class TrajectoryFollower:
         self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
-            check(self._planned, self._model)
+            check_motion(self._planned, self._model)
         self.samples = self.irregular = self.limited = self.refused = 0
         self.last_refusal = ""
         self._start_ns: int | None = None
@@ -301,7 +301,7 @@ class TrajectoryFollower:
             allowed = "must come when the motion has ended, outside lockstep"
             raise InputError("joint_trajectory", [Problem("points", "", allowed)])
         motion = motion_of(message, self._geometry, begin)
-        check(motion, self._model)
+        check_motion(motion, self._model)
         if self._last is None:
             self._prepare(motion)
             return
@@ -439,4 +439,4 @@ class TrajectoryFollower:
 def _read_motion(bag: str) -> Trajectory:
     from sst_ros.recording.recording import read_motion  # needs rosbags, which others do not
 
-    return samples(bag)
+    return read_motion(bag)

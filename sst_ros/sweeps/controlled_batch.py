@@ -8,9 +8,10 @@ of tracking errors. It is traced, without branches: what the settings do not use
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import cached_property
+from itertools import islice
 from types import ModuleType
 from typing import Any
 
@@ -69,16 +70,13 @@ a pair of them becomes a normal number by the method of Box and Muller (1958).""
 NEWTON_STEPS = 5
 """Of the observer at a sample. They square the error; from one sample to the next it is small."""
 
-_DESIRED = [(field.name, 4 if field.name == "quaternion" else 3)
-            for field in dataclasses.fields(Reference)]  # fmt: skip
+_DESIRED = {part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)}
 
-REFERENCES = (("first", 1), *_DESIRED, ("feedforward", 3), ("held", 3))
-"""Names and sizes of what a sample is given: whether it is the first, reference, torques."""
+REFERENCES = {"first": 1, **_DESIRED, "feedforward": 3, "held": 3}
+"""Sizes of what a sample is given: whether it is the first, the reference, its torques."""
 
-GAINS = (
-    ("kp", 3), ("kd", 3), ("inertia", 3), ("integral_rate", 1), ("limit", 1), ("plant_limit", 1),
-    ("noise", 2),
-)  # fmt: skip
+GAINS = {"kp": 3, "kd": 3, "inertia": 3, "rate": 1, "limit": 1, "plant_limit": 1, "noise": 2}
+"""Sizes of what may differ between scenarios; `rate` is that of the integral."""
 
 _NOISE = 6
 _NEVER = 2**62
@@ -88,13 +86,10 @@ Group = dict[str, Any]
 """Tuples of numbers by name."""
 
 
-def divide(names: Iterable[tuple[str, int]], numbers: Sequence[Any]) -> Group:
+def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> Group:
     """Divide numbers into groups of the sizes given."""
-    found, at = {}, 0
-    for name, size in names:
-        found[name] = tuple(numbers[at : at + size])
-        at += size
-    return found
+    rest = iter(numbers)
+    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
 
 class ControlledBatch:
@@ -213,7 +208,7 @@ class ControlledBatch:
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
-        found = divide(self._memory_sizes.items(), list(memory))
+        found = divide(self._memory_sizes, memory)
         desired = divide(REFERENCES, self._references[-1])
         final = np.array(desired["gamma"]) - result.gamma
         complete = (result.code == 0)[:, None]
@@ -235,7 +230,7 @@ class ControlledBatch:
             time = k * round(period * 1e9) / 1e9
             at = loop.motion.at(time)
             torques = feed_forward(loop.settings, inverse, loop.motion, at, time + 0.5 * period)
-            desired = (number for name, _ in _DESIRED for number in getattr(at, name))
+            desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
 
@@ -244,21 +239,21 @@ class ControlledBatch:
         model = self._batch.model
         drive, state = model.ode.drive[3:], model.ode.state
         sizes = {
-            "references": sum(size for _, size in REFERENCES),
+            "references": sum(REFERENCES.values()),
             "state": len(state),
             "memory": sum(self._memory_sizes.values()),
             "noise": self._noise,
             "parameters": len(drive) + len(model.names),
-            "gains": sum(size for _, size in GAINS),
+            "gains": sum(GAINS.values()),
         }
 
         def command(*inputs: Expression) -> tuple[Any, ...]:
-            given = divide(sizes.items(), inputs)
+            given = divide(sizes, inputs)
             constants = model.constants(given["parameters"][len(drive) :])
             return self._command(
                 kernel.joints(constants.model, given["state"]),
                 divide(REFERENCES, given["references"]),
-                divide(self._memory_sizes.items(), given["memory"]),
+                divide(self._memory_sizes, given["memory"]),
                 divide(GAINS, given["gains"]),
                 given["noise"],
             )
@@ -287,30 +282,20 @@ class ControlledBatch:
             joints.gamma, joints.gamma_dot, memory["before"], scaled
         )
         new["observed"] = self._observe(gamma, memory["observed"])
-        desired = Reference(**{name: given[name] for name, _ in _DESIRED})
-        limit = gains["limit"][0] if self._limited else None
-        law = ControlLaw(
+        desired = Reference(**{name: given[name] for name in _DESIRED})
+        torques = given["feedforward"], given["held"]
+        at = Sample(desired, *torques, gamma, gamma_dot, new["observed"], memory["integral"])
+        command = ControlLaw(
             loop.settings,
             self._torque,
             self._accelerate,
             gains["kp"],
             gains["kd"],
             gains["inertia"],
-            gains["integral_rate"][0],
-            limit,
+            gains["rate"][0],
+            gains["limit"][0] if self._limited else None,
             loop.channel.period,
-        )
-        command = law.answer(
-            Sample(
-                desired,
-                given["feedforward"],
-                given["held"],
-                gamma,
-                gamma_dot,
-                new["observed"],
-                memory["integral"],
-            )
-        )
+        ).answer(at)
         new["integral"] = command.integral
         torque, new["queue"] = loop.channel.transmit(
             command.torque, memory["queue"], given["first"][0]

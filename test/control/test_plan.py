@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
-from sst_ros.control.plan import check, examine, maximum, minimum
+from sst_ros.control.plan import check_motion, examine_motion, maximum, minimum
 from sst_ros.control.reference_motions import GeodesicMotion, reference_motion
 from sst_ros.control.time_scaling import time_scaling
 from sst_ros.errors import MotionRefused, SingularConfiguration
@@ -54,7 +54,7 @@ def with_motion(scene, motion, **more):
 
 
 def planned(scene):
-    return examine(reference_motion(scene), scene)
+    return examine_motion(reference_motion(scene), scene)
 
 
 def swing(duration=TIME, **more):
@@ -203,11 +203,11 @@ def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
     free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
     scene = with_motion(EXAMPLE1, away, workspace=free["workspace"])
     with pytest.raises(MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"):
-        check(reference_motion(scene), scene)
+        check_motion(reference_motion(scene), scene)
     elastic = replace(scene, stroke=Stroke(at_end="elastic", stiffness=1e3))
     assert planned(elastic).problems
     ignoring = replace(scene, stroke=free["stroke"])
-    assert not check(reference_motion(ignoring), ignoring).problems
+    assert not check_motion(reference_motion(ignoring), ignoring).problems
 
 
 def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
@@ -230,10 +230,10 @@ def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
 def test_limits_are_held_between_samples_and_told_with_the_instant():
     limit = abs(summit(lambda time: swing_torque(time)[0])[0])
     fits = swing(actuators=Actuators(torque_limit=limit * (1.0 + 1e-12)))
-    assert not check(reference_motion(fits), fits).problems
+    assert not check_motion(reference_motion(fits), fits).problems
     tight = swing(actuators=Actuators(torque_limit=limit * (1.0 - 1e-9)))
     with pytest.raises(MotionRefused) as told:
-        check(reference_motion(tight), tight)
+        check_motion(reference_motion(tight), tight)
     assert [problem.key for problem in told.value.problems] == ["torque_1", "torque_2", "torque_3"]
     rates = Actuators(velocity_limit=1.1, acceleration_limit=6.9)
     keys = {problem.key.partition("_")[0] for problem in planned(swing(actuators=rates)).problems}
@@ -256,7 +256,7 @@ def test_a_turn_through_a_parallel_singularity_is_refused():
     with pytest.raises(
         SingularConfiguration, match=r"parallel singularity at t = 0\.\d+ s"
     ) as told:
-        check(GeodesicMotion(geometry, first, last, 1.0), scene)
+        check_motion(GeodesicMotion(geometry, first, last, 1.0), scene)
     assert abs(told.value.measure) < 1e-9
 
 
@@ -269,13 +269,13 @@ def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
         for off in (-0.2, 0.2)
     )
     with pytest.raises(SingularConfiguration, match="serial singularity"):
-        check(GeodesicMotion(geometry, first, last, 1.0), scene)
+        check_motion(GeodesicMotion(geometry, first, last, 1.0), scene)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_motions_are_feasible_and_end_where_they_should(name):
     scene = load(name)
-    plan = check(reference_motion(scene), scene)
+    plan = check_motion(reference_motion(scene), scene)
     assert scene.duration == plan.motion.duration
     assert time_scaling(plan).highest > 1.0
     assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1

@@ -43,17 +43,12 @@ def test_a_sine_starts_at_its_phase():
     assert torque.at(123.0) == (0.0, 2.0, 3.0 * math.sin(-1.0))
 
 
-def test_rows_hold_until_the_next(tmp_path):
+def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_path):
     profile, last = table(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
     assert last == 1.0
+    assert profile(math.nextafter(0.5, 0.0)) == profile(-1.0) == (0.0, 0.0, 0.0)
     assert profile(0.5) == profile(0.75) == profile(math.nextafter(1.0, 0.0)) == (1.0, 2.0, 3.0)
     assert profile(1.0) == profile(9.0) == (-4.0, 0.5, 6.0)
-
-
-def test_before_the_first_row_there_is_no_torque(tmp_path):
-    profile, _ = table(written(tmp_path, HEADER + "0.5,1,2,3\n"))
-    assert profile(math.nextafter(0.5, 0.0)) == (0.0, 0.0, 0.0)
-    assert profile(-1.0) == (0.0, 0.0, 0.0)
 
 
 def test_spaces_and_windows_line_ends_are_taken(tmp_path):
@@ -78,6 +73,7 @@ def test_spaces_and_windows_line_ends_are_taken(tmp_path):
         (HEADER + "0,1,2,3\n0,1,2,3\n", r"line 3: time = 0\.0: must be > 0 s, the last"),
         (HEADER + "1,1,2,3\n0.5,1,2,3\n", r"line 3: time = 0\.5: must be > 1 s, the last"),
         (HEADER + '"0\n', r"line 2: row = .*: must be four finite numbers"),
+        (HEADER + "1" * 200_000, r"must be readable .*field larger"),
     ],
 )
 def test_refused_tables(tmp_path, text, message):
@@ -85,31 +81,24 @@ def test_refused_tables(tmp_path, text, message):
         table(written(tmp_path, text))
 
 
-def test_all_bad_rows_are_told(tmp_path):
+@pytest.mark.parametrize(
+    ("rows", "lines"),
+    [
+        ("0,1,2,x\n1,1,2,3\n1,1,2,3\n2,,,\n", [2, 4, 5]),
+        ('0,1,2,"3\n"\n1,1,2,x\n', [4]),  # a field spans two lines
+    ],
+)
+def test_all_bad_rows_are_told_with_their_lines_in_the_file(tmp_path, rows, lines):
     with pytest.raises(InputError) as caught:
-        table(written(tmp_path, HEADER + "0,1,2,x\n1,1,2,3\n1,1,2,3\n2,,,\n"))
-    assert [problem.line for problem in caught.value.problems] == [2, 4, 5]
+        table(written(tmp_path, HEADER + rows))
+    assert [problem.line for problem in caught.value.problems] == lines
 
 
-def test_lines_are_counted_in_the_file_where_a_field_spans_some(tmp_path):
-    with pytest.raises(InputError) as caught:
-        table(written(tmp_path, HEADER + '0,1,2,"3\n"\n1,1,2,x\n'))
-    assert [problem.line for problem in caught.value.problems] == [4]
-
-
-def test_a_missing_file_is_told(tmp_path):
+def test_files_that_cannot_be_read_are_told(tmp_path):
     with pytest.raises(InputError, match=r"none\.csv.*must be readable .*No such file"):
         table(tmp_path / "none.csv")
-
-
-def test_a_file_that_is_no_text_is_told(tmp_path):
     with pytest.raises(InputError, match=r"must be readable"):
         table(written(tmp_path, HEADER, encoding="utf-16"))
-
-
-def test_a_field_that_is_far_too_long_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"must be readable .*field larger"):
-        table(written(tmp_path, HEADER + "1" * 200_000))
 
 
 @FAST

@@ -4,7 +4,13 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import BAND, TrackingRecord, TrackingSums, evaluate, table
+from sst_ros.control.tracking import (
+    BAND,
+    TrackingRecord,
+    TrackingSums,
+    evaluate_tracking,
+    tracking_table,
+)
 
 TIME = np.linspace(0.0, 2.0, 2001)
 
@@ -22,7 +28,7 @@ def track(error, gamma=None, **given):
 
 
 def test_errors_of_a_sine():
-    found = evaluate(track(0.3 * np.sin(2.0 * np.pi * TIME)))
+    found = evaluate_tracking(track(0.3 * np.sin(2.0 * np.pi * TIME)))
     assert found.rms == pytest.approx(0.3 / np.sqrt(2.0), rel=1e-3)
     assert found.largest == pytest.approx(0.3, rel=1e-5)
     assert found.last == pytest.approx(0.0, abs=1e-15)
@@ -30,7 +36,7 @@ def test_errors_of_a_sine():
 
 
 def test_error_against_run_time_only_grows_in_its_largest():
-    found = evaluate(track(TIME))
+    found = evaluate_tracking(track(TIME))
     time, rms, largest = found.history.T
     assert time[0] == 0.0 and time[-1] == 2.0
     assert largest == pytest.approx(time)
@@ -39,15 +45,17 @@ def test_error_against_run_time_only_grows_in_its_largest():
 
 def test_settling_time_of_a_decay_after_the_motion():
     error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
-    found = evaluate(track(error))
+    found = evaluate_tracking(track(error))
     assert found.band == pytest.approx(BAND)  # the way is 1 rad
     assert found.settling == pytest.approx(0.1 * np.log(0.5 / BAND), abs=2e-3)
 
 
 def test_settling_time_is_unknown_where_it_is_not_seen():
-    assert evaluate(track(np.full_like(TIME, 0.5))).settling is None  # never settles
-    assert evaluate(track(0.0 * TIME, gamma=TIME)).settling is None  # the motion never ends
-    assert evaluate(track(0.0 * TIME)).settling == 0.0
+    assert evaluate_tracking(track(np.full_like(TIME, 0.5))).settling is None  # never settles
+    assert (
+        evaluate_tracking(track(0.0 * TIME, gamma=TIME)).settling is None
+    )  # the motion never ends
+    assert evaluate_tracking(track(0.0 * TIME)).settling == 0.0
 
 
 def test_shares_are_those_of_the_torque_and_sum_to_one():
@@ -56,15 +64,15 @@ def test_shares_are_those_of_the_torque_and_sum_to_one():
     whole = track(
         0.0 * TIME, feedforward=np.append(feedforward, 0.0), feedback=np.append(feedback, 0.0)
     )
-    found = evaluate(whole)
+    found = evaluate_tracking(whole)
     assert found.feedforward == pytest.approx(0.9) and found.feedback == pytest.approx(0.1)
     assert found.torque_rms == pytest.approx(np.sqrt(5.0), rel=1e-3)
-    nothing = evaluate(track(0.0 * TIME))
+    nothing = evaluate_tracking(track(0.0 * TIME))
     assert np.isnan(nothing.feedforward).all()
 
 
 def test_the_table_says_what_it_knows():
-    lines = table(evaluate(track(0.0 * TIME, gamma=TIME), limited=7))
+    lines = tracking_table(evaluate_tracking(track(0.0 * TIME, gamma=TIME), limited=7))
     assert "nan" not in lines
     assert "7  (of 2001)" in lines
     assert lines.count("\n") == 10 + 2 + 11
@@ -77,6 +85,6 @@ def test_a_record_in_parts_has_the_metrics_of_the_whole(size):
     for first in range(0, len(TIME), size):
         part = {name: column[first : first + size] for name, column in vars(whole).items()}
         sums.add(TrackingRecord(**part))
-    found, expected = vars(sums.metrics(3)), vars(evaluate(whole, 3))
+    found, expected = vars(sums.metrics(3)), vars(evaluate_tracking(whole, 3))
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, rel=1e-12), name

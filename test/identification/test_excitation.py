@@ -6,7 +6,7 @@ import pytest
 from identification import manipulators
 
 from sst_ros import load_scene, reference_motion
-from sst_ros.control.plan import examine
+from sst_ros.control.plan import examine_motion
 from sst_ros.errors import InputError, MotionRefused
 from sst_ros.identification import parameters
 from sst_ros.identification.excitation import design
@@ -45,7 +45,7 @@ def designed():
 def test_a_designed_motion_keeps_within_all_limits_and_rests_at_both_ends(designed):
     _, found = designed
     motion = reference_motion(found.scene)
-    assert examine(motion, found.scene).problems == ()
+    assert examine_motion(motion, found.scene).problems == ()
     for time in (0.0, motion.duration):
         at = motion.at(time)
         assert np.abs([*at.gamma_dot, *at.gamma_ddot]).max() < 1e-9

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sst_ros import __main__ as cli
-from sst_ros.control.plan import examine
+from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.recording.recording import read, read_motion
@@ -30,7 +30,7 @@ def following(bag):
 def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag):
     """Held for 1 ms they are a staircase; the smooth motion asks for what lies between."""
     recording, held = read(bag), following(bag)
-    plan = examine(reference_motion(held, read_motion), held)
+    plan = examine_motion(reference_motion(held, read_motion), held)
     assert plan.motion.duration == pytest.approx(recording.seconds[-1], abs=1e-12)
     for row in (0, 40, len(recording.gamma) - 1):
         at = plan.motion.at(recording.seconds[row])

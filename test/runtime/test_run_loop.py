@@ -96,11 +96,23 @@ class Bench:
             self.thread.join(10)
             assert not self.thread.is_alive()
 
+    def begin(self):
+        """Answer the state that is shown before a run in lockstep."""
+        self.stamped.append(answer(0))
+        self.until(lambda: self.output.samples)
+
     def until(self, condition, timeout=10.0):
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline
             time.sleep(0.001)
+
+
+@contextlib.contextmanager
+def running(*args, **given):
+    bench = Bench(*args, **given)
+    with bench.running() as loop:
+        yield bench, loop
 
 
 def answer(stamp_ns):
@@ -128,8 +140,7 @@ def test_no_torque_is_unpublished_when_a_run_does_not_go_on():
     bench.loop.run()
     assert bench.output.unpublished["finished"] == 0 < bench.output.flushed == 11
 
-    bench = Bench(scene="example2_heavy")
-    with bench.running() as loop:
+    with running(scene="example2_heavy") as (bench, loop):
         bench.until(lambda: bench.output.acted)
         loop.ask(partial(loop.pause, True))
         assert bench.output.unpublished["paused"] == 0 < bench.output.flushed
@@ -138,8 +149,7 @@ def test_no_torque_is_unpublished_when_a_run_does_not_go_on():
         bench.until(lambda: loop.phase is Phase.FAULT)
         assert bench.output.unpublished["fault"] == 0
 
-    bench = Bench()
-    with bench.running() as loop:
+    with running() as (bench, loop):
         bench.until(lambda: bench.output.acted)
         loop.ask(partial(loop.pause, True))
         assert loop.ask(loop.step).success
@@ -147,8 +157,7 @@ def test_no_torque_is_unpublished_when_a_run_does_not_go_on():
 
 
 def test_a_run_that_is_stepped_to_its_end_is_finished_and_has_no_fault():
-    bench = Bench(duration=0.02, real_time_factor=0.01)
-    with bench.running() as loop:
+    with running(duration=0.02, real_time_factor=0.01) as (bench, loop):
         bench.until(lambda: bench.output.acted)
         loop.ask(partial(loop.pause, True))
         assert loop.ask(partial(loop.step, 20)).success
@@ -221,8 +230,7 @@ def test_code_that_takes_long_to_load_is_no_fault():
 
 
 def test_pause_is_idempotent_and_a_step_is_one_sample():
-    bench = Bench()
-    with bench.running() as loop:
+    with running() as (bench, loop):
         bench.until(lambda: len(bench.output.samples) > 3)
         assert loop.ask(loop.step) == (
             False,
@@ -244,8 +252,7 @@ def test_pause_is_idempotent_and_a_step_is_one_sample():
 
 
 def test_requests_are_served_while_a_deadline_is_far():
-    bench = Bench(real_time_factor=1e-3)  # a tick takes 1 s, a sample 2 s
-    with bench.running() as loop:
+    with running(real_time_factor=1e-3) as (bench, loop):  # a tick takes 1 s, a sample 2 s
         bench.until(lambda: loop.counters.ticks == 1)
         assert loop.ask(partial(loop.pause, True), timeout=0.5) == (True, "paused")
         last = stamps(bench)[-1]
@@ -259,10 +266,8 @@ def test_requests_are_served_while_a_deadline_is_far():
 
 
 def test_an_answer_outlives_a_request_before_its_deadline():
-    bench = Bench(sync="lockstep", real_time_factor=1e-3, lockstep_timeout=1.0)
-    with bench.running() as loop:
-        bench.stamped.append(answer(0))
-        bench.until(lambda: stamps(bench))
+    with running(sync="lockstep", real_time_factor=1e-3, lockstep_timeout=1.0) as (bench, loop):
+        bench.begin()
         bench.stamped.append(answer(stamps(bench)[0]))
         bench.until(lambda: not bench.stamped)
         assert loop.ask(lambda: Reply(True, "served"), timeout=0.5) == (True, "served")
@@ -271,8 +276,7 @@ def test_an_answer_outlives_a_request_before_its_deadline():
 
 
 def test_resume_makes_no_burst():
-    bench = Bench(real_time_factor=1.0)
-    with bench.running() as loop:
+    with running(real_time_factor=1.0) as (bench, loop):
         bench.until(lambda: len(bench.output.samples) > 3)
         loop.ask(partial(loop.pause, True))
         time.sleep(0.2)
@@ -300,8 +304,7 @@ def test_reset_goes_back_and_stamps_go_on():
 
 
 def test_a_fault_is_latched_until_a_reset():
-    bench = Bench(scene="example2_heavy")
-    with bench.running() as loop:
+    with running(scene="example2_heavy") as (bench, loop):
         loop.ask(partial(loop.pause, True))
         bench.queue.append(Box(data=(50.0, 0.0, 0.0)))
         loop.ask(partial(loop.pause, False))
@@ -335,8 +338,7 @@ def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick():
 
 
 def test_set_state_is_checked():
-    bench = Bench(wait_for_command=True)
-    with bench.running() as loop:
+    with running(wait_for_command=True) as (_, loop):
         given = (0.6, 0.7, 0.8), (0.1, 0.0, -0.1)
         assert loop.ask(partial(loop.set_state, *given)) == (True, "the state is set, waiting")
         assert loop.simulation.state.joints.gamma == pytest.approx(given[0], abs=1e-12)
@@ -357,8 +359,7 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
                 raise error
             super().advance(*args)
 
-    bench = Bench(build=Broken)
-    with bench.running() as loop:
+    with running(build=Broken) as (bench, loop):
         bench.until(lambda: len(bench.output.samples) > 2)
         loop.simulation.broken = True
         bench.until(lambda: loop.phase is Phase.FAULT)
@@ -369,10 +370,8 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(error):
 
 
 def test_lockstep_times_out_into_a_fault():
-    bench = Bench(sync="lockstep", lockstep_timeout=0.05)
-    with bench.running() as loop:
-        bench.stamped.append(answer(0))
-        bench.until(lambda: bench.output.samples)
+    with running(sync="lockstep", lockstep_timeout=0.05) as (bench, loop):
+        bench.begin()
         bench.stamped.append(answer(stamps(bench)[0]))
         bench.until(lambda: loop.phase is Phase.FAULT)
         last = stamps(bench)[-1]
@@ -382,10 +381,8 @@ def test_lockstep_times_out_into_a_fault():
 
 @pytest.mark.parametrize("factor", [0.0, 1.0])
 def test_requests_do_not_put_off_the_timeout_in_lockstep(factor):
-    bench = Bench(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
-    with bench.running() as loop:
-        bench.stamped.append(answer(0))
-        bench.until(lambda: bench.output.samples)
+    with running(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor) as (bench, loop):
+        bench.begin()
         began = time.monotonic()
 
         def asked():
@@ -398,10 +395,8 @@ def test_requests_do_not_put_off_the_timeout_in_lockstep(factor):
 
 
 def test_a_pause_does_not_count_as_waiting_for_an_answer():
-    bench = Bench(sync="lockstep", lockstep_timeout=0.3)
-    with bench.running() as loop:
-        bench.stamped.append(answer(0))
-        bench.until(lambda: bench.output.samples)
+    with running(sync="lockstep", lockstep_timeout=0.3) as (bench, loop):
+        bench.begin()
         loop.ask(partial(loop.pause, True))
         time.sleep(0.4)
         loop.ask(partial(loop.pause, False))
@@ -411,8 +406,7 @@ def test_a_pause_does_not_count_as_waiting_for_an_answer():
 
 def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests():
     """Its wait has a bound of its own, and an answer that comes later is used by the next step."""
-    bench = Bench(sync="lockstep", lockstep_timeout=10.0)
-    with bench.running() as loop:
+    with running(sync="lockstep", lockstep_timeout=10.0) as (bench, loop):
         assert loop.ask(partial(loop.pause, True)).success
         began = time.monotonic()
         waiting = threading.Thread(target=loop.ask, args=(loop.step,))
@@ -438,8 +432,7 @@ def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
                 pass
             super().advance(*args)
 
-    bench = Bench(build=Stuck)
-    with bench.running() as loop:
+    with running(build=Stuck) as (bench, loop):
         bench.until(lambda: len(bench.output.samples) > 2)
         bench.loop.simulation.stuck.set()
         began = time.monotonic()
@@ -509,10 +502,8 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold():
 
 @pytest.mark.parametrize(("of_the_run_before", "starts"), [(True, False), (False, True)])
 def test_after_a_reset_a_late_answer_does_not_start_the_run(of_the_run_before, starts):
-    bench = Bench(sync="lockstep")
-    with bench.running() as loop:
-        bench.stamped.append(answer(0))
-        bench.until(lambda: bench.output.samples)
+    with running(sync="lockstep") as (bench, loop):
+        bench.begin()
         loop.ask(loop.reset)
         shown = bench.output.idles[-1][2]
         bench.stamped.append(answer(stamps(bench)[-1] if of_the_run_before else shown))
@@ -529,8 +520,7 @@ def test_requests_after_the_end_are_refused():
 
 @pytest.mark.parametrize(("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)])
 def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(waits, phase):
-    bench = Bench(wait_for_command=waits)
-    with bench.running() as loop:
+    with running(wait_for_command=waits) as (_, loop):
         for request in (partial(loop.pause, True), loop.reset):
             assert loop.ask(request).success
         assert loop.ask(partial(loop.pause, False)) == Reply(True, phase.value)

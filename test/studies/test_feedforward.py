@@ -20,8 +20,6 @@ from studies.control_loop import (
     SHARE,
     ControlLoop,
     RestMotion,
-    bandwidth_in_theory,
-    bandwidth_limit,
     ideal_plant,
     is_stable,
     model_errors,
@@ -96,13 +94,6 @@ def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
 def test_with_delay_the_limit_lies_where_theory_says():
     loop, bound = held(ideal_plant(SHORT), 2), stability_limit(1.0, 2) * 1e9 / PERIOD_NS
     assert is_stable(loop, 0.97 * bound) and not is_stable(loop, 1.03 * bound)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delay", range(6))
-def test_the_limit_is_found_at_every_delay(delay):
-    loop = held(ideal_plant(SHORT), delay)
-    assert bandwidth_limit(loop) == pytest.approx(bandwidth_in_theory(loop), rel=0.02)
 
 
 @pytest.mark.slow
