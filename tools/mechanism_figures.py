@@ -15,16 +15,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sst_ros import load_scene
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.virtual_work import link_frames, posture
+from sst_ros.plot.style import BLUE, GREEN, GREY, INK, VERMILION
 
-Array = NDArray[np.float64]
-
-BLUE, GREEN, GREY, VERMILION, INK = "#0072b2", "#009e73", "#666666", "#d55e00", "#222222"
 GAMMA = np.array([0.95, 0.62, 0.80])
 """The pose of all pictures [rad]: no two lines of geometry.png fall together in it."""
 VIEW = (1.0, 0.72, 0.42)

@@ -20,10 +20,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pandas import DataFrame
+
+from benchmark import measure
 from sst_ros.cli import commands
 from sst_ros.nodes import arguments, inverse_dynamics, simulation_interfaces, topics
 from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
+from sst_ros.report.results import markdown
 from sst_ros.runtime import diagnostics
 from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import Scene
@@ -158,30 +162,21 @@ PAGES = {
 
 def fill(name: str, text: str) -> str:
     """Put the generated parts of a page between their marks."""
-    for part, content in PAGES[name]():
-        begin, end = f"<!-- begin {part} -->", f"<!-- end {part} -->"
-        if text.count(begin) != 1 or text.count(end) != 1:
-            raise ValueError(f"{name} has not one part {part}")
-        text = f"{text.partition(begin)[0]}{begin}\n{content}{end}{text.partition(end)[2]}"
-    return text
+    return measure.fill(text, {part: content[:-1] for part, content in PAGES[name]()})
 
 
 def policy(node: Described) -> str:
     """Write the SROS2 policy of a node: what it needs by its declarations, and nothing else."""
     publish = {*LOG_AND_EVENTS, *_names(node, PUBLISHES)}
-    subscribe = set(_names(node, SUBSCRIBES))
-    reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES.split()} | set(
-        _names(node, SERVES)
-    )
+    subscribe = {"/clock", *_names(node, SUBSCRIBES)}  # the clock with use_sim_time
+    reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES.split()}
+    reply |= set(_names(node, SERVES))
     executed = set(_names(node, EXECUTES))
     if node.command == "simulator":
-        subscribe.add("/clock")  # with use_sim_time
         reply |= {f"/{node.name}/{name}" for name in SIMULATION_INTERFACES}
         executed.add(f"/{node.name}/simulate_steps")
     if node.command == "recorder":
-        subscribe |= {*default_topics(), "/clock"}
-    if node.command in ("torque_player", "inverse_dynamics", "viewer"):
-        subscribe.add("/clock")
+        subscribe |= set(default_topics())
     return "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
@@ -251,9 +246,7 @@ def _endpoint_rows(listed: Iterable[Endpoint]) -> Iterator[tuple[str, ...]]:
 
 
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    heads = list(heads)
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return markdown(DataFrame(map(list, rows), columns=list(heads))) + "\n"
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 from datetime import date
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -57,8 +58,12 @@ def picture(path: Path) -> None:
             taken = Image.open(io.BytesIO(page.picture())).convert("RGB")
     finally:
         server.stop()
-    size = (WIDTH, WIDTH * SIZE[1] // SIZE[0])
-    taken.resize(size, Image.Resampling.LANCZOS).save(path, optimize=True)
+    _shrink(taken, WIDTH).save(path, optimize=True)
+
+
+def _shrink(taken: Image.Image, width: int) -> Image.Image:
+    size = (width, width * taken.height // taken.width)
+    return taken.resize(size, Image.Resampling.LANCZOS)
 
 
 def _build(server: PageServer, scene: Scene) -> None:
@@ -125,18 +130,10 @@ def film(path: Path) -> None:
                 taken = [Image.open(io.BytesIO(png)).convert("RGB") for png in _pictures(page)]
         finally:
             process.send_signal(signal.SIGINT)
-    size = (FILM_WIDTH, FILM_WIDTH * FILM_SIZE[1] // FILM_SIZE[0])
-    frames = [picture.resize(size, Image.Resampling.LANCZOS) for picture in taken]
-    frames[0].save(
-        path,
-        save_all=True,
-        append_images=frames[1:],
-        duration=1000 // RATE,
-        loop=0,
-        quality=_QUALITY,
-        method=6,
-    )
-    print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1e6:.2f} MB, {date.today()}")
+    first, *others = (_shrink(picture, FILM_WIDTH) for picture in taken)
+    first.save(path, save_all=True, append_images=others, duration=1000 // RATE, loop=0,
+               quality=_QUALITY, method=6)  # fmt: skip
+    print(f"{path}: {len(taken)} frames, {path.stat().st_size / 1e6:.2f} MB, {date.today()}")
 
 
 def _pictures(page: Browser) -> list[bytes]:
@@ -145,14 +142,14 @@ def _pictures(page: Browser) -> list[bytes]:
     begin, taken = page.time() or 0.0, []
     for frame in range(FRAMES):
         due = begin + (frame + 1) / RATE - 1e-9
-
-        def is_shown(due: float = due) -> bool:
-            return (page.time() or 0.0) >= due
-
-        page.until(is_shown, f"time {due:.2f} s")
+        page.until(partial(_has_reached, page, due), f"time {due:.2f} s")
         page.drawn()
         taken.append(page.picture())
     return taken
+
+
+def _has_reached(page: Browser, due: float) -> bool:
+    return (page.time() or 0.0) >= due
 
 
 if __name__ == "__main__":
