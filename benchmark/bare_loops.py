@@ -28,7 +28,7 @@ from typing import Any
 
 import rclpy
 
-from benchmark.nodes import Client, Process, start_simulator, wait_for
+from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import scheduling
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
@@ -169,15 +169,12 @@ def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> d
         try:
             watch.wait_for_runs(full)
             watch.spin(2.5)
-            before, used, began = watch.values[full], simulator.processor_s(), time.monotonic()
+            account = Account(watch, {full: simulator})
             watch.spin(seconds)
-            wall = time.monotonic() - began
-            used, now = simulator.processor_s() - used, watch.values[full]
+            return {"processor": account.busy(), "missed": account.missed()[full]}
         finally:
             simulator.end()
             watch.spin(1.5)  # until its last diagnostics have come
-    ticks, missed = (int(now[key]) - int(before[key]) for key in ("ticks", "ticks_missed"))
-    return {"processor": 100.0 * used / wall, "missed": 100.0 * missed / max(1, ticks + missed)}
 
 
 def explain_refusal(latency_us: int) -> str | None:

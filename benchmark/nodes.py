@@ -198,3 +198,32 @@ class Client:
             return (future.result() if done else None), time.monotonic() - began
         finally:
             self.node.destroy_client(client)
+
+
+class Account:
+    """Processor time and ticks of simulators, by full name, from now on."""
+
+    def __init__(self, watch: Client, nodes: dict[str, Process]) -> None:
+        self._watch, self._nodes, self._began = watch, nodes, time.monotonic()
+        self._before, self._used = self._ticks(), self._processor_s()
+
+    def _ticks(self) -> dict[str, tuple[int, int]]:
+        values = {name: self._watch.values[name] for name in self._nodes}
+        return {name: (int(one["ticks"]), int(one["ticks_missed"])) for name, one in values.items()}
+
+    def _processor_s(self) -> float:
+        return sum(node.processor_s() for node in self._nodes.values())
+
+    def busy(self) -> float:
+        """Return the processor time, in percent of a core."""
+        used, wall = self._processor_s() - self._used, time.monotonic() - self._began
+        return 100.0 * used / wall
+
+    def missed(self) -> dict[str, float]:
+        """Return the ticks missed by each, and by all under "", in percent."""
+        now, before = self._ticks(), self._before
+        found = {
+            name: [a - b for a, b in zip(now[name], before[name], strict=True)] for name in now
+        }
+        found[""] = [sum(column) for column in zip(*found.values(), strict=True)]
+        return {name: 100.0 * lost / max(1, kept + lost) for name, (kept, lost) in found.items()}

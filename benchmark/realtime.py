@@ -39,7 +39,7 @@ from benchmark.measure import (
     format_columns,
     join_line,
 )
-from benchmark.nodes import Client, Process, start_simulator
+from benchmark.nodes import Account, Client, Process, start_simulator
 from sst_ros.nodes.topics import NeverSpun
 
 TITLES = {
@@ -166,32 +166,21 @@ def fleet(watch: Client, number: int, rate: int, seconds: float, given: dict[str
     try:
         watch.wait_for_runs(*names)
         watch.spin(5.0)  # until all have found each other
-        before, used = dict(watch.values), sum(node.processor_s() for node in nodes)
+        account = Account(watch, dict(zip(names, nodes, strict=True)))
         watch.spin(seconds)
-        used = sum(node.processor_s() for node in nodes) - used
-        since = [_since(before[name], watch.values[name]) for name in names]
+        missed, busy = account.missed(), account.busy()
         return {
             "simulators": str(number),
             "rate [Hz]": str(rate),
             "scheduling": watch.values[names[0]]["scheduling"],
             "length [min]": f"{seconds / 60.0:.1f}",
-            "missed ticks, all [%]": f"{_missed(since):.3f}",
-            "missed ticks, worst of them [%]": f"{max(_missed([one]) for one in since):.3f}",
-            "processor, all [% of a core]": f"{100.0 * used / seconds:.0f}",
+            "missed ticks, all [%]": f"{missed.pop(''):.3f}",
+            "missed ticks, worst of them [%]": f"{max(missed.values()):.3f}",
+            "processor, all [% of a core]": f"{busy:.0f}",
         }
     finally:
         for node in nodes:
             node.end()
-
-
-def _since(before: dict[str, str], now: dict[str, str]) -> dict[str, str]:
-    return {key: str(int(now[key]) - int(before[key])) for key in ("ticks", "ticks_missed")}
-
-
-def _missed(all_said: list[dict[str, str]]) -> float:
-    ticks = sum(int(said["ticks"]) for said in all_said)
-    missed = sum(int(said["ticks_missed"]) for said in all_said)
-    return 100.0 * missed / max(ticks + missed, 1)
 
 
 def _compare(blocks: np.ndarray) -> Figures:

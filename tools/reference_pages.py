@@ -70,7 +70,7 @@ def commands_tables() -> Iterator[tuple[str, str]]:
     yield "commands", text
 
 
-def _argument_row(argument: commands.Argument) -> tuple[str, str]:
+def _argument_row(argument: commands.Arg) -> tuple[str, str]:
     name, options = argument.name, argument.options
     shown = options.get("metavar") or name.lstrip("-").replace("-", "_").upper()
     if not name.startswith("-"):

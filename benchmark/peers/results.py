@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -187,42 +188,21 @@ def write(results: Results, folder: Path) -> None:
     """Write peers.md, .png, .csv, a row for each setting timed or failed, and peers.json."""
     rows = [row for curve in results.curves for row in _list_points(curve)]
     pd.DataFrame(rows).to_csv(folder / "peers.csv", index=False, lineterminator="\n")
-    reached = [
-        (engine, "best of all", target, results.best(engine, target))
-        for engine in results.engines
-        for target in TARGETS
-    ]
-    reached += [
-        (curve.series.engine, curve.series.name, target, reach([curve], target))
-        for curve in results.curves
-        for target in TARGETS
-    ]
+    best = [(engine, "best of all", partial(results.best, engine)) for engine in results.engines]
+    best += [(c.series.engine, c.series.name, partial(reach, [c])) for c in results.curves]
+    reached = []
+    for engine, method, find in best:
+        for target in TARGETS:
+            point = find(target)
+            row: dict[str, Any] = {"engine": engine, "method": method, "error_rad": target}
+            row["ms"] = None if point is None else 1e3 * point.time
+            row["setting"] = None if point is None else point.setting.label
+            reached.append({**row, "over_ours": results.ratio(point, target)})
     document = {
         "machine": results.machine,
-        "rounds": results.rounds,
-        "quick": results.quick,
         "reference_error_rad": results.reference.error,
-        "missing": results.missing,
-        "settings_run": sum(len(curve.points) for curve in results.curves),
-        "gates": {
-            f"{c.series.engine}: {c.series.name}": {
-                "relative_difference": c.gate,
-                "tolerance": c.series.tolerance,
-            }
-            for c in results.curves
-        },
-        "reached": [
-            {
-                "engine": engine,
-                "method": method,
-                "error_rad": target,
-                "ms": None if point is None else 1e3 * point.time,
-                "setting": None if point is None else point.setting.label,
-                "over_ours": results.ratio(point, target),
-            }
-            for engine, method, target, point in reached
-        ],
-        "verdicts": results.verdicts(),
+        "gates": {f"{c.series.engine}: {c.series.name}": c.gate for c in results.curves},
+        "reached": reached,
         "floor": {
             "evaluations": {f"{t:.0e}": n for t, n in results.floor.evaluations.items()},
             "ns_of_one_in_c": results.floor.seconds and 1e9 * results.floor.seconds,

@@ -11,7 +11,7 @@ import argparse
 import importlib
 import re
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 from sst_ros.errors import InputError, Problem, printable, suggestion
 from sst_ros.host.output import require_free
@@ -20,12 +20,13 @@ from sst_ros.version import VERSION
 PROGRAM = "sst-ros"
 
 
-class Argument(NamedTuple):
+class Arg:
     """What `argparse.ArgumentParser.add_argument` gets, and what completes it in a shell."""
 
-    name: str
-    options: dict[str, Any]
-    completer: str = ""
+    def __init__(
+        self, name: str, what: str | None = None, *, completer: str = "", **options: Any
+    ) -> None:
+        self.name, self.options, self.completer = name, {**options, "help": what}, completer
 
 
 class Subcommand:
@@ -38,7 +39,7 @@ class Subcommand:
         self,
         what: str,
         run: str,
-        *arguments: Argument,
+        *arguments: Arg,
         needs: tuple[str, ...] = (),
         description: str | None = None,
     ) -> None:
@@ -46,34 +47,24 @@ class Subcommand:
         self.needs, self.description = needs, description
 
 
-def _arg(name: str, what: str | None = None, **options: Any) -> Argument:
-    """Describe an argument or an option."""
-    return Argument(name, options | {"help": what})
-
-
-def _flag(name: str, what: str) -> Argument:
+def _flag(name: str, what: str) -> Arg:
     """Describe an option without a value."""
-    return _arg(name, what, action="store_true")
+    return Arg(name, what, action="store_true")
 
 
-def _number(name: str, what: str, **options: Any) -> Argument:
-    """Describe an option that is a number."""
-    return _arg(name, what, type=float, **options)
-
-
-def _path(name: str, what: str | None = None, **options: Any) -> Argument:
+def _path(name: str, what: str | None = None, **options: Any) -> Arg:
     """Describe an argument or an option that is a path."""
-    return _arg(name, what, type=Path, **options)
+    return Arg(name, what, type=Path, **options)
 
 
 def _scene(
     name: str, what: str = "name of a scene, or path of a .yaml file", **options: Any
-) -> Argument:
+) -> Arg:
     """Describe an argument that is a scene, which shells complete by argcomplete."""
-    return Argument(name, options | {"help": what}, "scene.scene:names")
+    return Arg(name, what, completer="scene.scene:names", **options)
 
 
-def _out(what: str, default: str) -> tuple[Argument, Argument]:
+def _out(what: str, default: str) -> tuple[Arg, Arg]:
     """Describe `--out` and `--force`, which `free_out` obeys."""
     force = _flag("--force", "overwrite earlier results in --out")
     return _path("--out", f"{what}; default: {default}"), force
@@ -102,10 +93,10 @@ COMMANDS: dict[str, Subcommand | str] = {
         "simulate a scene under its own torques",
         "cli.runs:run_simulation",
         SCENE,
-        _number("--duration", "length [s]; default: that of the scene"),
-        _arg("--method", "integrator; default: auto", default="auto"),
-        _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
-        _arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
+        Arg("--duration", "length [s]; default: that of the scene", type=float),
+        Arg("--method", "integrator; default: auto", default="auto"),
+        Arg("--tolerance", "allowed error [rad]; default: 1e-9", type=float, default=1e-9),
+        Arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
         _path("--out", "trajectory, .parquet or .csv", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
         _flag("--force", "overwrite earlier results"),
@@ -137,7 +128,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _flag("--json", "print JSON instead of a table"),
         _path("--csv", "write the torques to play", metavar="OUT"),
         _flag("--force", "overwrite the file of --csv"),
-        _number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
+        Arg("--period", "length of a row of --csv [s]; default 0.001", type=float, default=1e-3),
     ),
     "describe": Subcommand(
         "write a scene as URDF",
@@ -152,12 +143,12 @@ COMMANDS: dict[str, Subcommand | str] = {
         "compile a scene before its first fast run",
         "cli.runs:compile_code",
         _scene("scene", nargs="?", default="example2", metavar="SCENE"),
-        _arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
+        Arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
     ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
         "cli.reports:run_demo",
-        _arg(
+        Arg(
             "kind",
             "the paper's examples; or the node inverse_dynamics following a scene's motion",
             nargs="?",
@@ -166,7 +157,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         ),
         *_out("folder of the results", "demo_out or demo_out/feedforward"),
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
-        _arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
+        Arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
         needs=("rclpy", "rosbags", "matplotlib"),
     ),
     "view": Subcommand(
@@ -174,10 +165,10 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.runs:view",
         _path("bag", "folder of a bag to play", nargs="?"),
         _scene("--scene", "start a simulator of this scene to look at", metavar="S"),
-        _arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
-        _arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
-        _arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        _arg(
+        Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
+        Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
+        Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
+        Arg(
             "--port",
             "port; the next free one is taken",
             type=integer_from(1024, 65535),
@@ -211,7 +202,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "stable steps along the motion of a scene; runs at its limits and with other numbers",
         "cli.reports:report_stability",
         _scene("scene", metavar="SCENE"),
-        _arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
+        Arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
         *_out("folder of the results", "stability_out"),
         needs=("pandas", "matplotlib"),
     ),
@@ -220,7 +211,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.reports:draw_pictures",
         _path("bags", "folder of the bag", nargs="*", metavar="BAG"),
         *_out("folder of the pictures", "BAG_plots, beside the first bag"),
-        _arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
+        Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _flag("--list", "list the pictures, and draw none"),
         _path(
             "--compare",
@@ -234,7 +225,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a recorded run as CSV or Parquet",
         "cli.recordings:write_tables",
         BAG,
-        _arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
+        Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
         *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
     "recover": Subcommand(
@@ -249,15 +240,15 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("study", "study as a .yaml file; or the word plot", metavar="STUDY"),
         _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
         _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
-        _arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
-        _arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
+        Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
+        Arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
         _flag("--resume", "compute only the chunks that are missing in --out"),
         description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation motions",
         "cli.identification:run_identification",
-        _arg("bag", "folder of the bag, or the word design", metavar="BAG"),
+        Arg("bag", "folder of the bag, or the word design", metavar="BAG"),
         _scene(
             "designed",
             "after design: the scene to make a motion for, about its initial pose",
@@ -269,7 +260,7 @@ COMMANDS: dict[str, Subcommand | str] = {
             "what is known, and the values to start from; default: the recorded scene",
             metavar="S",
         ),
-        _arg(
+        Arg(
             "--parameters",
             "unknowns by the beginning of their names, as in: star friction.gamma offset; "
             "default: bodies, friction, springs and rotors of the scene; by simulation full names, "
@@ -277,16 +268,22 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="+",
             metavar="P",
         ),
-        _arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
-        _number(
+        Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
+        Arg(
             "--cutoff",
             "of the zero-phase filter of measured angles; default: none, rates as recorded",
+            type=float,
             metavar="HZ",
         ),
-        _number("--delay", "by which measured torques come late; default: 0", metavar="SECONDS"),
-        _number("--duration", "of a designed motion [s]; default: 6"),
-        _arg("--harmonics", "of a designed motion; default: 5", type=int),
-        _arg("--seed", "of a designed motion; default: 0", type=int),
+        Arg(
+            "--delay",
+            "by which measured torques come late; default: 0",
+            type=float,
+            metavar="SECONDS",
+        ),
+        Arg("--duration", "of a designed motion [s]; default: 6", type=float),
+        Arg("--harmonics", "of a designed motion; default: 5", type=int),
+        Arg("--seed", "of a designed motion; default: 0", type=int),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
         description="`identify BAG` fits the torques of a recorded run by weighted least squares: "

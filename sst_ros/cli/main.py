@@ -68,30 +68,23 @@ def _abandon_stdout() -> None:
 
 def failure(error: BaseException) -> tuple[int, str]:
     """Return the exit status and the message, "" for none."""
-    message = _message(error)
-    if message is not None:
-        return (INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED), message
-    bug = " ".join(f"{type(error).__name__}: {error}".split())
-    return BUG, f"internal error, please report it with the output of --debug: {bug}"
-
-
-def _message(error: BaseException) -> str | None:
-    """Return the message for an error that is not a fault of this program, else None."""
+    message, status = "", FAILED
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
-    if isinstance(error, BrokenPipeError):
-        return ""
-    if isinstance(error, SstError):
-        return str(error)
-    if isinstance(error, ModuleNotFoundError):
-        return explanation(error)
-    if isinstance(error, OSError):
+        message, status = "interrupted", INTERRUPTED
+    elif isinstance(error, SstError):
+        message = str(error)
+    elif isinstance(error, ModuleNotFoundError) and (said := explanation(error)):
+        message = said
+    elif isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        return f"{where}{error.strerror or error}"
-    if isinstance(error, UnicodeError):
-        return f"text cannot be encoded or decoded: {error}"
-    if isinstance(error, MemoryError):
-        return "not enough memory"
-    if type(error).__module__.partition(".")[0] in ("rclpy", "rosbags"):
-        return " ".join(str(error).split())
-    return None
+        message = f"{where}{error.strerror or error}"
+    elif isinstance(error, UnicodeError):
+        message = f"text cannot be encoded or decoded: {error}"
+    elif isinstance(error, MemoryError):
+        message = "not enough memory"
+    elif type(error).__module__.partition(".")[0] in ("rclpy", "rosbags"):
+        message = " ".join(str(error).split())
+    elif not isinstance(error, BrokenPipeError):
+        bug = " ".join(f"{type(error).__name__}: {error}".split())
+        return BUG, f"internal error, please report it with the output of --debug: {bug}"
+    return status, message
