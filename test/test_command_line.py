@@ -3,10 +3,10 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from programs import python
 
 from sst_ros.__main__ import main
 from sst_ros.cli.commands import COMMANDS, NODES, function, parser
@@ -158,12 +158,10 @@ def test_output_that_is_not_taken_is_no_traceback(reader, said):
     ours, theirs = os.pipe() if reader == "gone" else (None, os.open("/dev/full", os.O_WRONLY))
     if ours is not None:
         os.close(ours)
-    done = subprocess.run(
-        [sys.executable, "-m", "sst_ros", "scene", "schema"],
-        stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60,
-    )  # fmt: skip
+    pipes = {"stdout": theirs, "stderr": subprocess.PIPE, "capture_output": False}
+    done = python("-m", "sst_ros", "scene", "schema", status=1, **pipes)
     os.close(theirs)
-    assert (done.returncode, done.stderr) == (1, said)
+    assert done.stderr == said
 
 
 @pytest.mark.parametrize(
@@ -194,11 +192,7 @@ def test_output_that_is_not_taken_is_no_traceback(reader, said):
 )
 def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
     """After a plain installation, every path ends in the line that says what to install."""
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, commands=[words])],
-        capture_output=True, text=True, timeout=60, cwd=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 1, done.stderr
+    done = python(BLOCKED.format(names=OPTIONAL, commands=[words]), status=1, cwd=tmp_path)
     assert done.stderr.count("\n") == 1, done.stderr
     found = [
         name
@@ -212,28 +206,18 @@ def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
 def test_what_needs_no_extra_runs_without_any():
     commands = [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
                 ["describe"], [], ["--version"]]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCKED.format(names=OPTIONAL, commands=commands)],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    python(BLOCKED.format(names=OPTIONAL, commands=commands))
 
 
 def test_scene_names_are_completed(tmp_path):
     pytest.importorskip("argcomplete", reason="needs argcomplete")
     line = "sst-ros scene show exam"
-    subprocess.run(
-        [sys.executable, "-m", "sst_ros"],
-        env={**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
-             "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "found"), "_ARGCOMPLETE_IFS": "\n"},
-        timeout=60, check=True,
-    )  # fmt: skip
-    assert (tmp_path / "found").read_text().split() == [
-        "example1",
-        "example2",
-        "example2_heavy",
-        "example2_stroke",
-    ]
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
+             "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "found"),
+             "_ARGCOMPLETE_IFS": "\n"}  # fmt: skip
+    python("-m", "sst_ros", env=asked)
+    known = "example1 example2 example2_heavy example2_stroke"
+    assert (tmp_path / "found").read_text().split() == known.split()
 
 
 def test_every_command_names_itself_and_a_function_that_exists(capsys):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package, a plain run and the list of scenes load nothing that is slow to import."""
 
-import subprocess
-import sys
-
 import pytest
+from programs import python
 
 HEAVY = {"scipy", "matplotlib", "numba", "rclpy", "pandas", "rosbags", "dask"}
 DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "scene"}
@@ -25,10 +23,7 @@ RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_0
 )
 def test_what_is_loaded(program, rooms, excluded):
     """A command takes little more time than the import of NumPy: it loads what it needs."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sys.modules)"],
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+    done = python(f"{program}\nimport sys\nprint(*sys.modules)")
     names = [name.split(".") for name in done.stdout.splitlines()[-1].split()]
     assert ["sst_ros"] in names and not {first for first, *_ in names} & excluded
     if rooms is not None:
@@ -55,9 +50,5 @@ print(*sorted(set(sys.modules) - before))
 @pytest.mark.parametrize(("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)])
 def test_steps_import_nothing_after_the_code_is_loaded(scene, torque):
     """A limit or a stop that a run in real time meets costs no import: it takes 0.4 s."""
-    done = subprocess.run(
-        [sys.executable, "-c", STEPS.format(scene=scene, torque=torque)],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    done = python(STEPS.format(scene=scene, torque=torque))
     assert done.stdout.splitlines()[-1] == ""

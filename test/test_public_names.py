@@ -3,11 +3,10 @@
 
 import inspect
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from programs import python
 
 import sst_ros
 
@@ -50,13 +49,8 @@ def test_a_script_has_precise_types(tmp_path):
     pytest.importorskip("mypy", reason="types are checked by mypy")
     script = tmp_path / "script.py"
     script.write_text("\n".join([SCRIPT, *(f"sst_ros.{name}" for name in NAMES)]))
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(script)],
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parents[1],
-        check=False,
-    )
+    words = ("-m", "mypy", "--strict", "--no-error-summary", str(script))
+    done = python(*words, cwd=Path(__file__).parents[1], status=1, timeout=None)
     wrong = done.stdout.splitlines()
     assert len(wrong) == 1, done.stdout
     assert 'Module has no attribute "nothing"' in wrong[0]

@@ -4,11 +4,10 @@
 import importlib
 import os
 import re
-import subprocess
-import sys
 
 import pytest
 from docs.blocks import ROOT
+from programs import python
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SECTION = TEXT[TEXT.index("## Data paths") : TEXT.index("## Where to add")]
@@ -79,15 +78,7 @@ def test_the_counts_of_files_are_those_of_calls(tmp_path):
     found = []
     for scene in ('"example2"', "scene"):
         code = TRACE.format(scene=scene, folder=str(tmp_path / f"bag{len(found)}"))
-        environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"}
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            timeout=100,
-            env=environment,
-        )
-        assert done.returncode == 0, done.stderr
+        done = python(code, env={"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"})
         found.append([set(line.split()) for line in done.stdout.splitlines()])
     (by_name, step, report), (of_scene, *_) = found
     stated = [int(number) for number in re.findall(r"(\d+) files", SECTION)]

@@ -5,12 +5,11 @@ import os
 import pickle
 import resource
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import pytest
+from programs import python
 
 from sst_ros.host import cache_folder as module
 from sst_ros.host.cache_folder import cache_folder, objection
@@ -28,11 +27,7 @@ print(load([text], {}, numba=True).twice(21.0))
 
 
 def run(cache, **options):
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env={**os.environ, "SST_ROS_CACHE": str(cache)},
-        capture_output=True, text=True, timeout=100, check=True, **options,
-    )  # fmt: skip
+    return python(PROGRAM, env={"SST_ROS_CACHE": str(cache)}, **options)
 
 
 @pytest.fixture
@@ -44,13 +39,10 @@ def folder(tmp_path):
     return result
 
 
-def test_a_folder_of_the_user_is_trusted(folder):
-    assert objection(folder) is None
-
-
 @pytest.mark.parametrize(
     ("place", "mode", "said"),
     [
+        ("", 0o700, None),
         ("", 0o777, "mode 777 and must have 700"),
         ("", 0o1777, "must have 700"),
         ("", 0o755, "must have 700"),
@@ -60,7 +52,7 @@ def test_a_folder_of_the_user_is_trusted(folder):
         ("__pycache__", 0o777, None),  # nobody else gets there
     ],
 )
-def test_a_folder_that_is_not_for_the_user_alone_is_not(place, mode, said, folder):
+def test_a_folder_is_trusted_where_it_is_for_the_user_alone(place, mode, said, folder):
     (folder / place).resolve().chmod(mode)
     reason = objection(folder)
     assert reason is None if said is None else said in reason

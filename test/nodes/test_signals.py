@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals of a node."""
 
-import subprocess
-import sys
+from programs import python
 
 AMID = """
 import signal, sys
@@ -23,6 +22,4 @@ print(signals.stop.is_set())
 
 
 def test_a_signal_within_the_handler_of_another_does_not_block():
-    command = [sys.executable, "-c", AMID]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
-    assert done.stdout == "True\n", done.stderr
+    assert python(AMID, timeout=30).stdout == "True\n"
