@@ -15,6 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TypeVar
 
+from sst_ros.host.output import slices
 from sst_ros.report.results import markdown, processor, table
 
 Key = TypeVar("Key", bound=Hashable)
@@ -25,8 +26,8 @@ def time_in_turn(
     calls: dict[Key, Callable[[], Any]],
     rounds: int = 9,
     shortest: float = 2e-3,
-    progress: Callable[[int, int], None] = lambda done, of: None,
     clock: Callable[[], float] = time.perf_counter,
+    shown: bool = False,
 ) -> dict[Key, list[float]]:
     """Seconds of each call, one number a round.
 
@@ -40,11 +41,10 @@ def time_in_turn(
     collecting = gc.isenabled()
     gc.disable()
     try:
-        for done in range(rounds):
+        for _ in slices(rounds, 1, "rounds of times", shown):
             for key, call in calls.items():
                 seconds[key].append(_time(call, repeats[key], clock))
             gc.collect()
-            progress(done + 1, rounds)
     finally:
         if collecting:
             gc.enable()

@@ -11,7 +11,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -112,13 +113,12 @@ def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 def lines() -> Iterator[str]:
     """All motions, a line each; a refusal is its text."""
-    jobs: list[tuple[str, Any]] = []
+    jobs: dict[str, Callable[[], str]] = {}
     for name in SCENES:
-        jobs += [(f"simulate {name} {m}", lambda n=name, m=m: simulated(n, m)) for m in METHODS]
-        jobs += [(f"steps {name} {c}", lambda n=name, c=c: stepped(n, c)) for c in (False, True)]
-        jobs.append((f"whole {name}", lambda n=name: whole(n)))
-    jobs += [("batch", batched), ("sweep", swept)]
-    for what, job in jobs:
+        jobs |= {f"simulate {name} {m}": partial(simulated, name, m) for m in METHODS}
+        jobs |= {f"steps {name} {c}": partial(stepped, name, c) for c in (False, True)}
+        jobs[f"whole {name}"] = partial(whole, name)
+    for what, job in {**jobs, "batch": batched, "sweep": swept}.items():
         try:
             yield f"{what}: {job()}"
         except SstError as error:

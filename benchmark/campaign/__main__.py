@@ -19,18 +19,23 @@ from multiprocessing import get_context
 
 from benchmark.campaign.ledger import KINDS, PARTS, Ledger, run_part
 from benchmark.measure import DOCS, fill_page
+from sst_ros.report.results import markdown, table
 
 PAGE = DOCS / "robustness.md"
 
 
 def format_ledgers(ledgers: list[Ledger]) -> str:
     """Return the table of all parts, Markdown."""
-    titles = "what was tried | cases | hangs | tracebacks | silent differences | lost | longest [s]"
-    rows = [f"| {titles} |", f"| --- {'| ---: ' * titles.count('|')}|"]
-    for one in ledgers:
-        counts = " | ".join(str(getattr(one, kind)) for kind in KINDS)
-        rows.append(f"| {one.what} | {one.tried} | {counts} | {one.longest_s:.2f} |")
-    return "\n".join(rows)
+    rows = [
+        {
+            "what was tried": one.what,
+            "cases": one.tried,
+            **{name: getattr(one, kind) for kind, name in KINDS.items()},
+            "longest [s]": f"{one.longest_s:.2f}",
+        }
+        for one in ledgers
+    ]
+    return markdown(table(rows))
 
 
 def run_apart(part: str, share: float, seed: int) -> Ledger:

@@ -16,7 +16,13 @@ from sst_ros.errors import SstError
 HANG_S = 1.0
 """A call that takes longer than this is a hang, unless its part states another bound."""
 
-KINDS = ("hangs", "tracebacks", "silent", "lost")
+KINDS = {
+    "hangs": "hangs",
+    "tracebacks": "tracebacks",
+    "silent": "silent differences",
+    "lost": "lost",
+}
+"""Kinds of findings, and the heads of their columns."""
 
 
 @dataclass

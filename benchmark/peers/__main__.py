@@ -45,14 +45,12 @@ def main(arguments: list[str] | None = None) -> int:
     begin = time.monotonic()
     task = Task()
     series, missing = collect(task, options.quick, options.only)
-    progress("reference", 0, 0)
     truth = solve_task(task)
     rounds = options.rounds or (3 if options.quick else 9)
-    curves = run_study(task, truth, series, rounds, progress)
+    curves = run_study(task, truth, series, rounds)
     least = find_floor(task, TARGETS)
     seconds = time.monotonic() - begin
     result = results.Results(curves, missing, truth, rounds, options.quick, seconds, least)
-    progress("", 0, 0)
     print(results.write_table(result))
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)
@@ -79,14 +77,6 @@ def collect(
             continue
         found += module.series(task, quick)
     return found, missing
-
-
-def progress(what: str, done: int, of: int) -> None:
-    """Progress on a terminal; nothing in a pipe."""
-    if not sys.stderr.isatty():
-        return
-    share = f"{done}/{of}" if of else ""
-    print(f"\r\033[K{what} {share}", end="", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -19,11 +19,10 @@ import numpy as np
 
 from benchmark.measure import time_in_turn
 from benchmark.peers.task import DURATION, Moving, Pose, Task, find_relative, turn_between
+from sst_ros.host.output import slices
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 
 TARGETS = (1e-3, 1e-6, 1e-9)
-
-Progress = Callable[[str, int, int], None]
 
 
 class Failed(Exception):
@@ -155,33 +154,23 @@ class Curve:
         return self.gate <= self.series.tolerance
 
 
-def run_study(
-    task: Task, reference: Reference, series: list[Series], rounds: int, progress: Progress
-) -> list[Curve]:
+def run_study(task: Task, reference: Reference, series: list[Series], rounds: int) -> list[Curve]:
     """Gate all, run all settings for their errors, then time the worthwhile ones in rounds."""
     curves = [Curve(one, one.gate(task)) for one in series]
     passed = [curve for curve in curves if curve.passed]
-    total, done = sum(len(curve.series.settings) for curve in passed), 0
     calls: dict[int, Callable[[], Any]] = {}
     points: dict[int, Point] = {}
     for curve in passed:
-        tried = []
-        for setting in curve.series.settings:
-            done += 1
-            progress(f"errors: {curve.series.engine}", done, total)
-            tried.append(_try(setting, reference))
+        settings, label = curve.series.settings, f"{curve.series.engine}: errors"
+        parts = slices(len(settings), 1, label, True)
+        tried = [_try(settings[part.start], reference) for part in parts]
         best = math.inf
         for point, engine in sorted(tried, key=lambda both: (both[0].setting.steps, both[0].error)):
             if engine is not None and (not point.setting.steps or point.error < best):
                 calls[id(point)], points[id(point)] = engine.run, point
             best = min(best, point.error)
         curve.points += [point for point, _ in tried]
-    seconds = time_in_turn(
-        calls,
-        rounds,
-        progress=lambda a, b: progress("rounds of times", a, b),
-        clock=time.process_time,
-    )
+    seconds = time_in_turn(calls, rounds, clock=time.process_time, shown=True)
     for key, point in points.items():
         point.seconds = seconds[key]
     return curves
