@@ -99,73 +99,52 @@ class _Work:
     def __init__(self, scene: Scene, number: int, folder: Path | None) -> None:
         self.calls: dict[tuple[str, str], Callable[[], Any]] = {}
         self.notes: list[str] = []
-        self._scene, self._number = scene, number
+        self._scene, self._number, self._profile = scene, number, scene.torque is not None
         centre = np.array(scene.initial.gamma)
         self._gamma = centre + np.random.default_rng(1).uniform(-SPREAD, SPREAD, (number, 3))
         for name, method in METHODS.items():
             self._add(name, method, folder)
 
     def _add(self, name: str, method: Tableau, folder: Path | None) -> None:
-        profile = self._scene.torque is not None
-        batch = Batch(self._scene, method, profile=profile)
-
-        def run(threads: int) -> Any:
-            return batch.advance(0, STEPS, STEP, *start(), threads=threads)
-
+        batch = Batch(self._scene, method, profile=self._profile)
         y, code = batch.start(self._gamma, (0.0, 0.0, 0.0))
         given = batch.drives((0.0, 0.0, 0.0), self._number)
 
-        def start() -> tuple[np.ndarray, ...]:
+        def start(given: np.ndarray = given) -> tuple[np.ndarray, ...]:
             number = self._number
             return y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)
 
-        self.calls[name, ONE] = lambda: run(1)
-        self.calls[name, ALL] = lambda: run(len(os.sched_getaffinity(0)))
+        def run(threads: int, batch: Batch = batch, given: np.ndarray = given) -> Any:
+            arrays = start(given)
+            batch.advance(0, STEPS, STEP, *arrays, threads=threads)
+            return arrays
+
+        self.calls[name, ONE] = partial(run, 1)
+        self.calls[name, ALL] = partial(run, len(os.sched_getaffinity(0)))
         for who, parameters in vary(self._scene).items():
-            self._add_varied(name, who, method, parameters, start)
+            # The parameters of a hundred scenarios, again and again.
+            began = time.perf_counter()
+            varied = Batch(self._scene, method, profile=self._profile, parameters=parameters)
+            each = 1e3 * (time.perf_counter() - began) / COUNT
+            few = varied.drives((0.0, 0.0, 0.0), COUNT)
+            many = few[:, np.arange(self._number) % COUNT].copy()
+            self.notes.append(f"{name}, {who}: {len(few)} numbers, {each:.1f} ms to prepare one.")
+            self.calls[name, who] = partial(run, 1, varied, many)
         if folder is not None:
-            self._add_c(name, method, batch, start, folder)
-        columns = tuple(y.copy())
-        dynamics = Dynamics.of(self._scene)
+            self._add_c(name, method, batch, start, run(1)[0], folder)
+        dynamics, columns = Dynamics.of(self._scene), tuple(y.copy())
         system = ODE(dynamics, self._scene.torque)
         slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
         for who, slope in slopes.items():
             self.calls[name, who] = partial(_step, method, slope, 0.0, columns)
 
-    def _add_varied(
-        self,
-        name: str,
-        who: str,
-        method: Tableau,
-        parameters: dict[str, np.ndarray],
-        start: Callable[[], tuple[np.ndarray, ...]],
-    ) -> None:
-        """The same states, with the parameters of a hundred scenarios again and again."""
-        began = time.perf_counter()
-        profile = self._scene.torque is not None
-        batch = Batch(self._scene, method, profile=profile, parameters=parameters)
-        each = (time.perf_counter() - began) / COUNT
-        given = batch.drives((0.0, 0.0, 0.0), COUNT)
-        given = given[:, np.arange(self._number) % COUNT].copy()
-        self.notes.append(
-            f"{name}, {who}: {len(given)} numbers, {1e3 * each:.1f} ms to prepare a scenario."
-        )
-
-        def run() -> None:
-            y, _, *more = start()
-            batch.advance(0, STEPS, STEP, y, given, *more, threads=1)
-
-        self.calls[name, who] = run
-
     def _add_c(
-        self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any], folder: Path
-    ) -> None:
-        text, loops = c_floor.write_batch(
-            batch.program, batch.limit_distances, method, len(batch.state)
-        )
+        self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any],
+        expected: np.ndarray, folder: Path,
+    ) -> None:  # fmt: skip
+        size = len(batch.state)
+        text, loops = c_floor.write_batch(batch.program, batch.limit_distances, method, size)
         blocks = -(-self._number // SIMD_WIDTH)
-        expected = start()
-        batch.advance(0, STEPS, STEP, *expected, threads=1)
         for index, (who, flags) in enumerate(FLAGS.items()):
             library, done = c_floor.compile_batch(text, folder, f"{name}_{index}", *flags)
 
@@ -175,7 +154,7 @@ class _Work:
                 library.batch(STEP, 0, STEPS, 0, blocks, self._number, *pointers)
                 return arrays
 
-            apart = float(np.abs(run()[0] - expected[0]).max())
+            apart = float(np.abs(run()[0] - expected).max())
             if not apart < 1e-12:
                 raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
             same = "the bits of numba" if apart == 0.0 else f"{apart:.0e} from numba"
