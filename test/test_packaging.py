@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One version, the extras, and what a wheel and a source distribution install."""
+"""What a release consists of: version, extras, package.xml, changelogs, wheel, source archive."""
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 import venv
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -15,8 +17,42 @@ import yaml
 import sst_ros
 from sst_ros.cli.commands import NODES
 from sst_ros.extras import EXTRAS
+from tools import changelog_rst
 
 ROOT = Path(__file__).parents[1]
+
+MARKDOWN = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+RST = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+PYTHON_KEYS = {
+    "argcomplete": "python3-argcomplete",
+    "hypothesis": "python3-hypothesis",
+    "jinja2": "python3-jinja2",
+    "jsonschema": "python3-jsonschema",
+    "matplotlib": "python3-matplotlib",
+    "mcap": "mcap-ros2-support",  # which needs mcap
+    "mpmath": "python3-sympy",  # which needs mpmath
+    "numba": "python3-numba",
+    "numpy": "python3-numpy",
+    "pandas": "python3-pandas",
+    "pytest": "python3-pytest",
+    "pytest-timeout": "python3-pytest-timeout",
+    "PyYAML": "python3-yaml",
+    "rosbags": "python3-rosbags-pip",
+    "scipy": "python3-scipy",
+}
+"""Keys of rosdep/python.yaml of github.com/ros/rosdistro, commit 8468e88c of 2026-08-22."""
+
+WITHOUT_KEY = {"dask", "pyarrow", "viser", "xarray"}
+"""Python packages of setup.py that have no key there: `pip install sst_ros[all]`."""
+
+ROS_KEYS = {
+    *("ament_copyright", "ament_flake8", "ament_index_python", "ament_pep257", "ament_xmllint"),
+    *("builtin_interfaces", "control_msgs", "diagnostic_msgs", "geometry_msgs", "launch"),
+    *("launch_ros", "launch_testing", "rcl_interfaces", "rclpy", "robot_state_publisher"),
+    *("ros2bag", "ros2launch", "rosbag2_storage_mcap", "rosgraph_msgs", "rviz2", "sensor_msgs"),
+    *("simulation_interfaces", "std_msgs", "std_srvs", "trajectory_msgs"),
+}
+"""Packages of both jazzy/ and kilted/distribution.yaml of the same commit."""
 
 
 def test_the_version_is_the_same_everywhere():
@@ -38,6 +74,84 @@ def test_every_extra_that_a_message_names_brings_the_module():
 def test_every_node_has_an_executable_for_ros2_run():
     assert {path.name for path in (ROOT / "executables").iterdir()} == set(NODES)
     assert all(os.access(ROOT / "executables" / name, os.X_OK) for name in NODES)
+
+
+@pytest.fixture(scope="module")
+def depends():
+    root = ET.parse(ROOT / "package.xml").getroot()
+    return {found.text for found in root if found.tag.endswith("depend")}
+
+
+@pytest.fixture(scope="module")
+def required():
+    """Names of the Python packages that setup.py asks for, without the wheels of ROS."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        patch.setattr("setuptools.setup", lambda **_: None)
+        extras = runpy.run_path("setup.py")["EXTRAS"]
+    text = (ROOT / "setup.py").read_text(encoding="utf-8")
+    always = re.findall(r'"([\w.-]+)', text[text.index("install_requires=") :].partition("]")[0])
+    words = [*always, *extras["all"]]
+    names = {re.match(r"[\w-]+", word)[0] for word in words}
+    return {name for name in names if not name.startswith("ros-")}
+
+
+def test_every_key_is_known(depends):
+    assert depends <= ROS_KEYS | set(PYTHON_KEYS.values())
+
+
+def test_every_requirement_has_its_key(depends, required):
+    assert required <= PYTHON_KEYS.keys() | WITHOUT_KEY
+    missing = {PYTHON_KEYS[name] for name in required - WITHOUT_KEY} - depends
+    assert not missing
+
+
+def test_every_message_package_of_the_wheels_is_named(depends):
+    text = (ROOT / "setup.py").read_text(encoding="utf-8")
+    listed = text.partition("ROS_MESSAGES = (")[2].partition(")")[0]
+    kinds = re.findall(r'"(\w+)"', listed)
+    assert {f"{kind}_msgs" for kind in kinds} <= depends
+
+
+def test_the_changelogs_agree():
+    assert changelog_rst.text(MARKDOWN) == RST, "run python -m tools.changelog_rst"
+
+
+def test_the_parser_of_bloom_reads_every_release():
+    changelog = pytest.importorskip("catkin_pkg.changelog").get_changelog_from_path(ROOT, "sst_ros")
+    read = {version: (date, content) for version, date, content in changelog.foreach_version()}
+    assert list(read) == re.findall(r"^## \[(\d\S+)\] - ", MARKDOWN, re.M)
+    date, content = read[sst_ros.__version__]
+    assert f"## [{sst_ros.__version__}] - {date.date()}" in MARKDOWN
+    released = MARKDOWN.partition(f"## [{sst_ros.__version__}]")[2].partition("\n## ")[0]
+    items = [item for bullets in content if hasattr(bullets, "bullets") for item in bullets.bullets]
+    assert len(items) == len(re.findall(r"^- ", released, re.M)) > 10
+
+
+def test_the_changelog_is_restructured_text():
+    core = pytest.importorskip("docutils.core")
+    core.publish_doctree(RST, settings_overrides={"report_level": 1, "halt_level": 1})
+
+
+def test_an_unreleased_section_and_links_at_the_end_stay_out():
+    text = changelog_rst.text(
+        "# Changelog\n\n## [Unreleased]\n\n- Not yet.\n\n## [1.2.3] - 2026-01-02\n\n### Fixed\n\n"
+        "- A `code\n  span` and [a page](https://a.b/c).\n\n## [1.2.2] - 2026-01-01\n\n- First.\n\n"
+        "[1.2.3]: https://a.b\n"
+    )
+    assert "1.2.3 (2026-01-02)\n------------------\n\n**Fixed**\n\n- A ``code span``" in text
+    assert "`a page <https://a.b/c>`__" in text
+    assert text.endswith("1.2.2 (2026-01-01)\n------------------\n\n- First.\n")
+    assert "Not yet" not in text
+
+
+def test_package_xml_is_valid():
+    package = pytest.importorskip("catkin_pkg.package")
+    warnings = []
+    parsed = package.parse_package(ROOT, warnings=warnings)
+    parsed.validate(warnings)
+    assert warnings == []
+    assert (parsed.version, parsed.get_build_type()) == (sst_ros.__version__, "ament_python")
 
 
 def check_installed(python, folder):

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The floors that benchmarks measure against: C must be the same program, counts be counts."""
+"""Benchmarks that have a floor in C: they run, and C is the same program."""
 
-from __future__ import annotations
-
+import importlib
 import shutil
 
 import numpy as np
@@ -14,11 +13,23 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.scene.scene import load
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc"),
+]
+RUNS = {
+    "kernel": ("--rounds", "1"),
+    "batch": ("--scenarios", "200", "--rounds", "1"),
+}
 
 
-@needs_gcc
-@pytest.mark.slow
+@pytest.mark.parametrize("name", RUNS)
+def test_a_benchmark_runs(name, capsys):
+    pytest.importorskip("numba", reason="what is measured is compiled")
+    assert importlib.import_module(f"benchmark.{name}").main([*RUNS[name]]) == 0
+    assert "target" in capsys.readouterr().out
+
+
 def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monkeypatch):
     pytest.importorskip("numba", reason="a batch needs numba")
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
