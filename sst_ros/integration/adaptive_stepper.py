@@ -16,10 +16,9 @@ from sst_ros.integration.compiled_method import (
     JointRanges,
     Linearisation,
     Method,
-    StepPoint,
+    Point,
     Vector,
 )
-from sst_ros.integration.global_error import Point, rescaled
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -117,14 +116,26 @@ _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
 
 
-class AcceptedStep(NamedTuple):
-    """One accepted step: where it began, its length, solution and coarse solution at its end."""
+class Step(NamedTuple):
+    """An accepted step, or the part of it before an event.
+
+    Attributes:
+        t: when it begins [s], as `method` takes it.
+        h: its length [s].
+        begin, end: solutions.
+        drive: what acts.
+        method: what has taken it.
+        last: whether it ends with the period.
+
+    """
 
     t: float
     h: float
-    y: list[float]
-    z: list[float]
-    order: int
+    begin: Point
+    end: Point
+    drive: Vector
+    method: CompiledMethod
+    last: bool
 
 
 class MethodChange(NamedTuple):
@@ -153,6 +164,7 @@ class AdaptiveStepper:
         max_step: longest step [s].
         doubling: control the steps of RK4, too, by the distance of a pair from one step.
         ranges: see `CompiledMethod`.
+        joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
         budget: of evaluations; without one there is no bound.
 
     Attributes:
@@ -173,6 +185,7 @@ class AdaptiveStepper:
         linearise: Linearisation | None = None,
         find_jump: Callable[[float, float, Vector], tuple[float, float] | None] | None = None,
         ranges: JointRanges = (),
+        joints: Function = lambda *_: (),
         budget: EvaluationBudget | None = None,
         max_step: float = float("inf"),
         doubling: bool = False,
@@ -187,7 +200,7 @@ class AdaptiveStepper:
         self._derivative, self._linearise = derivative, linearise
         self._find_jump, self._max_step = find_jump, max_step
         self._doubling = doubling and method == RK4.name
-        self._ranges = ranges
+        self._ranges, self._joints = ranges, joints
         self._methods: dict[str, CompiledMethod] = {}
         self._current = self._method_of(DORMAND_PRINCE if self._auto else METHODS[method])
         self._h = float("inf")
@@ -198,23 +211,18 @@ class AdaptiveStepper:
         """The method in use."""
         return self._current.method
 
-    @property
-    def machine(self) -> CompiledMethod:
-        """The steps of the method in use."""
-        return self._current
-
-    def load(self, h: float, at: StepPoint, d: Vector) -> None:
+    def load(self, h: float, at: Point, d: Vector) -> None:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
         if self._derivative is not None:
             return  # plain Python, and an explicit method to the end
         methods = (DORMAND_PRINCE, DOP853, RODAS4) if self._auto else (self.method,)
         for method in methods:
             loaded = self._method_of(method)
-            loaded.step_pair(0.0, h, at[0], at[1], d)
+            loaded.step_pair(0.0, h, at.y, at.z, d)
             loaded.step_many(h, 1, self.tolerance, at, d)
         if self._auto:
             with contextlib.suppress(ArithmeticError, ValueError):  # no finite Jacobian here
-                self._ode.eigenvalues(0.0, at[0], d)
+                self._ode.eigenvalues(0.0, at.y, d)
 
     def compile(self) -> None:
         """Take compiled steps from now on, which have the same bits, but for a function."""
@@ -232,10 +240,8 @@ class AdaptiveStepper:
         self._current, self._h, self._since_choice, changes = checkpoint
         del self.history[changes:]
 
-    def accepted_steps(
-        self, t: float, end: float, y: Vector, z: Vector, d: Vector, order: int
-    ) -> Iterator[AcceptedStep]:
-        """Step from t to end; `order` is that of the method that has made the coarse solution z.
+    def accepted_steps(self, t: float, end: float, at: Point, d: Vector) -> Iterator[Step]:
+        """Step from t to end.
 
         Raises:
             CannotStep: steps shrink below the rounding of time.
@@ -250,15 +256,15 @@ class AdaptiveStepper:
                 h = left
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
-            z = rescaled(y, z, order, self.method.order)
-            order = self.method.order
-            self.budget.charge(self._current.pair_cost)
-            new_y, new_z, size = self._current.step_pair(t, h, y, z, d)
+            machine = self._current
+            z = at.coarse(machine.method.order)
+            self.budget.charge(machine.pair_cost)
+            y, new_z, size = machine.step_pair(t, h, at.y, z, d)
             if self._doubling and size < float("inf"):
-                size = self._current.doubling_error(h, (y, z), (new_y, new_z))
+                size = machine.doubling_error(h, (at.y, z), (y, new_z))
             factor = self._factor(size)
             if size > self.tolerance:
-                stops = self._jump_in(t, h, y)
+                stops = self._jump_in(t, h, at.y)
                 if stops:
                     self._h = h
                     continue
@@ -266,7 +272,7 @@ class AdaptiveStepper:
                 if self._h < 1e-15 * max(abs(t), end - t) or self._h < 1e-200:
                     raise CannotStep(f"steps of {self._h:.1e} s do not resolve it")
                 rejected += 1
-                self._choose_method(t, h, y, d, rejected)
+                self._choose_method(t, h, at.y, d, rejected)
                 continue
             rejected = 0
             stopped = bool(stops) and h == stops[0] - t
@@ -275,12 +281,13 @@ class AdaptiveStepper:
                     self._h = max(self._h, h * factor)
             else:
                 self._h = h * factor
-            yield AcceptedStep(t, h, new_y, new_z, order)
+            begin, at = at, Point(y, new_z, self._joints(*y[:7]), machine.method.order)
+            yield Step(t, h, begin, at, d, machine, h == left)
             if h < left or isinstance(self.method, Rosenbrock):
-                self._choose_method(t + h, h, new_y, d)
+                self._choose_method(t + h, h, y, d)
             if h == left:
                 return
-            t, y, z = stops.pop(0) if stopped else t + h, new_y, new_z
+            t = stops.pop(0) if stopped else t + h
 
     def step_many(self, h: float, count: int, at: Point, d: Vector) -> tuple[int, Point]:
         """Do what `accepted_steps` does for up to `count` periods of h, one step a period.
@@ -298,21 +305,20 @@ class AdaptiveStepper:
         implicit = isinstance(method, Rosenbrock)
         if implicit and self._auto:
             count = min(count, _CHOOSE_EVERY - 1 - self._since_choice)
-        y, z, joints, order = at
-        if order != method.order:
-            z = rescaled(y, z, order, method.order)
-        done, end = machine.step_many(h, count, self.tolerance, (y, z, joints), d)
+        if at.order != method.order:
+            at = at._replace(z=at.coarse(method.order), order=method.order)
+        done, end = machine.step_many(h, count, self.tolerance, at, d)
         self.budget.spent += done * cost
         if self._h < GROW * h:
             for size in machine.sizes[:done]:
                 self._h = max(self._h, h * self._factor(float(size)))
         if implicit:
             self._since_choice += done
-        return done, Point(*end, method.order)
+        return done, end
 
     def step_sequence(
-        self, first: int, periods: tuple[Any, Any, Any], at: StepPoint, reached: Any
-    ) -> tuple[int, StepPoint]:
+        self, first: int, periods: tuple[Any, Any, Any], at: Point, reached: Any
+    ) -> tuple[int, Point]:
         """Advance through periods that take one pair of steps each, from the first on.
 
         Arguments and results are those of `CompiledMethod.step_sequence`.
@@ -321,16 +327,14 @@ class AdaptiveStepper:
         self.budget.spent += (done - first) * self._current.pair_cost
         return done, end
 
-    def repeat(
-        self, start: float, x: float, y: Vector, z: Vector, d: Vector, order: int
-    ) -> tuple[list[float], list[float], int]:
-        """Repeat an accepted step with the shorter length x: solution, coarse solution, order."""
-        z = rescaled(y, z, order, self.method.order)
-        if not x:
-            return list(y), list(z), self.method.order
-        self.budget.charge(self._current.pair_cost)
-        new_y, new_z, _ = self._current.step_pair(start, x, y, z, d)
-        return new_y, new_z, self.method.order
+    def part(self, step: Step, x: float) -> Point:
+        """Repeat a part x [s] of an accepted step."""
+        machine, y = step.method, step.begin.y
+        z = step.begin.coarse(machine.method.order)
+        if x:
+            self.budget.charge(machine.pair_cost)
+            y, z, _ = machine.step_pair(step.t, x, y, z, step.drive)
+        return Point(y, z, self._joints(*y[:7]), machine.method.order)
 
     def _factor(self, size: float) -> float:
         order = self.method.order if self._doubling else self.method.error_order

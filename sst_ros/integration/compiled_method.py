@@ -27,9 +27,6 @@ Function = Callable[..., tuple[float, ...]]
 Linearisation = Callable[[float, Vector, Vector, Any, Any, Any, Any], None]
 """(t, y, d, numbers, slope, by_time, matrix) -> None: fills the derivative, df/dt and df/dy."""
 JointRanges = Sequence[tuple[int, float, float]]
-StepPoint = tuple[list[float], list[float], tuple[float, ...]]
-"""Solution, coarse solution, and the joints' nine angles and nine rates."""
-
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
@@ -42,6 +39,22 @@ _LOOPS = (
     step_loops.step_sequence,
 )
 _IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
+
+
+class Point(NamedTuple):
+    """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
+
+    y: list[float]
+    z: list[float]
+    joints: tuple[float, ...]
+    order: int
+
+    def coarse(self, order: int) -> list[float]:
+        """Return z moved so that with a method of that order it means the same error."""
+        if order == self.order:
+            return self.z
+        grow = (2.0**order - 1.0) / (2.0**self.order - 1.0)
+        return [a + grow * (b - a) for a, b in zip(self.y, self.z, strict=True)]
 
 
 class _MethodSource(NamedTuple):
@@ -104,7 +117,7 @@ class CompiledMethod:
         self._numbers = self._vector(source.numbers)
         self._error = self._vector([0.0] * len(system.state))
         self.sizes: Any = self._vector([])
-        self._at: StepPoint = ([], [], ())
+        self._at = Point([], [], (), method.order)
         self._place: list[Any] = []
         self._drive: tuple[Vector, Any] = (), None
         self._ranges = np.array(ranges, dtype=float).reshape(-1, 3) if compiled else ranges
@@ -149,15 +162,15 @@ class CompiledMethod:
         return float(self._module.size_of(error, self._vector(begin[0]), self._vector(end[0]), h))
 
     def step_many(
-        self, h: float, count: int, tolerance: float, at: StepPoint, d: Vector
-    ) -> tuple[int, StepPoint]:
+        self, h: float, count: int, tolerance: float, at: Point, d: Vector
+    ) -> tuple[int, Point]:
         """Advance by up to `count` periods of h, a pair of steps each, as long as that suffices.
 
         Args:
             h: length of a period [s].
             count: how many, at most.
             tolerance: largest local error estimate of a period.
-            at: where it begins.
+            at: where it begins, its coarse solution by this method.
             d: drive.
 
         Returns:
@@ -166,7 +179,7 @@ class CompiledMethod:
 
         """
         if not all(map(is_, at, self._at)):  # otherwise the numbers are there already
-            self._place = [self._vector(part) for part in at]
+            self._place = [self._vector(part) for part in at[:3]]
         if len(self.sizes) < count or not self.compiled:
             self.sizes = self._vector([-1.0] * count)
         # At each wake in real time the processor's caches are cold: to make an array takes 8 us, a
@@ -181,7 +194,7 @@ class CompiledMethod:
             )  # fmt: skip
         except (ArithmeticError, ValueError):
             done = sum(size >= 0.0 for size in self.sizes)
-        self._at = (self._listed(y), self._listed(z), tuple(self._listed(joints)))
+        self._at = self._point(y, z, joints)
         return done, self._at
 
     def step_sequence(
@@ -189,9 +202,9 @@ class CompiledMethod:
         first: int,
         periods: tuple[Any, Any, Any],
         tolerance: float,
-        at: StepPoint,
+        at: Point,
         reached: Any,
-    ) -> tuple[int, StepPoint]:
+    ) -> tuple[int, Point]:
         """Advance from period `first` by a pair of steps a period; stop before one that needs more.
 
         Args:
@@ -206,7 +219,7 @@ class CompiledMethod:
             The first period that was not done, and where it begins.
 
         """
-        y, z, joints = (self._vector(part) for part in at)
+        y, z, joints = (self._vector(part) for part in at[:3])
         lengths, drives, starts = periods
         try:
             done = self._module.step_sequence(
@@ -215,7 +228,11 @@ class CompiledMethod:
             )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
             done = next(k for k in range(first, len(lengths)) if math.isnan(reached[k][0][0]))
-        return done, (self._listed(y), self._listed(z), tuple(self._listed(joints)))
+        return done, self._point(y, z, joints)
+
+    def _point(self, y: Any, z: Any, joints: Any) -> Point:
+        order = self.method.order
+        return Point(self._listed(y), self._listed(z), tuple(self._listed(joints)), order)
 
     def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.
@@ -351,7 +368,7 @@ def make_code(scene: Scene, integrator: str) -> Iterator[str]:
                 machine = CompiledMethod(system, method, compiled=True)
                 # What comes out is of no interest: the calls have the code made.
                 machine.step_pair(0.0, 1e-3, y, y, drive)
-                machine.step_many(1e-3, 1, 1.0, (y, y, (0.0,) * 18), drive)
+                machine.step_many(1e-3, 1, 1.0, Point(y, y, (0.0,) * 18, method.order), drive)
             yield method.name
 
 

@@ -9,10 +9,11 @@ tends to 2^order - 1 times the error of the run as steps shrink, and costs half 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.adaptive_stepper import Step
+from sst_ros.integration.compiled_method import Point
 from sst_ros.scene.scene import Scene
 
 _ROUNDING = 64 * 2.220446049250313e-16
@@ -20,39 +21,6 @@ _ROUNDING = 64 * 2.220446049250313e-16
 _SHARP, _SLIDING = 10.0, 5.0
 """A step loses its order where a rate changes by 10 times the smoothing of a Coulomb torque, at
 rates below 5 times; RK4 resolves less sharp ones within the accuracy of the estimate."""
-
-
-class Point(NamedTuple):
-    """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
-
-    y: list[float]
-    z: list[float]
-    joints: tuple[float, ...]
-    order: int
-
-
-class Passage(NamedTuple):
-    """An accepted step, or the part of it before an event.
-
-    Attributes:
-        time: when it begins [s].
-        t: the same since the period began, as `method` takes it [s].
-        h: its length [s].
-        begin, end: solutions.
-        drive: what acts.
-        method: the steps that were taken.
-        last: whether it ends with the period.
-
-    """
-
-    time: float
-    t: float
-    h: float
-    begin: Point
-    end: Point
-    drive: tuple[float, ...]
-    method: CompiledMethod
-    last: bool
 
 
 class ErrorGrowth(NamedTuple):
@@ -113,14 +81,6 @@ def coulomb_joints(scene: Scene) -> Iterator[tuple[int, float]]:
                 yield from ((3 * kind + k, friction.smoothing) for k in range(3))
 
 
-def rescaled(y: Sequence[float], coarse: Sequence[float], order: int, new: int) -> list[float]:
-    """Move the coarse solution so that with a method of order `new` it means the same error."""
-    if order == new:
-        return coarse if isinstance(coarse, list) else list(coarse)
-    grow = (2.0**new - 1.0) / (2.0**order - 1.0)
-    return [a + grow * (b - a) for a, b in zip(y, coarse, strict=True)]
-
-
 _MARGIN = 2.0
 """Of the distance: an error that halves with the steps is twice as large."""
 _FLOOR = 8 * 2.220446049250313e-16
@@ -145,7 +105,7 @@ class HalvedSteps:
     def __init__(self, start: Point) -> None:
         self._y, self.steps = list(start.y), 0
 
-    def add(self, step: Passage) -> None:
+    def add(self, step: Step) -> None:
         """Go through a step of the run, which is itself a pair of steps."""
         method = step.method
         self.steps += 1

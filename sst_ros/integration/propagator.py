@@ -13,13 +13,14 @@ from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
-    AcceptedStep,
     AdaptiveStepper,
     EvaluationBudget,
     MethodChange,
+    Step,
     StepperCheckpoint,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
+from sst_ros.integration.compiled_method import Point
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,
@@ -28,7 +29,7 @@ from sst_ros.integration.events import (
     load_root_finder,
     may_occur,
 )
-from sst_ros.integration.global_error import ErrorGrowth, Passage, Point, coulomb_joints
+from sst_ros.integration.global_error import ErrorGrowth, coulomb_joints
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SineTorque
@@ -87,7 +88,7 @@ class Propagator:
         derivative: Function | None = None,
         limits: bool = True,
         max_step: float = float("inf"),
-        observe: Callable[[Passage], None] | None = None,
+        observe: Callable[[Step], None] | None = None,
     ) -> None:
         geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -105,6 +106,7 @@ class Propagator:
             tolerance=tolerance,
             compiled=compiled,
             ranges=self._ranges,
+            joints=self.dynamics.joints,
             budget=budget,
             max_step=max_step,
             doubling=observe is not None,
@@ -197,7 +199,7 @@ class Propagator:
     def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
         """Have the code loaded that periods of h [s] under constant torques may need."""
         load_root_finder()
-        self._constant.load(h, (at.y, at.z, at.joints), (0.0, 0.0, 0.0, *moment))
+        self._constant.load(h, at, (0.0, 0.0, 0.0, *moment))
 
     def compile(self) -> None:
         """Take compiled steps from now on; the bits are the same."""
@@ -264,43 +266,32 @@ class Propagator:
         self, at: Point, x: float, h: float, drive: tuple[float, ...]
     ) -> tuple[Point, float, Limit | None]:
         """Go on from x to h, or to the first limit or contact event before."""
-        for step in self._stepper.accepted_steps(x, h, at.y, at.z, drive, at.order):
-            end = self._point(step.y, step.z, step.order)
+        for step in self._stepper.accepted_steps(x, h, at, drive):
             self.accepted_steps += 1
-            self._growth = self._growth.after(at, end)
-            found = None
-            if not step_loops.all_far(self._ranges, at.joints, end.joints, step.h):  # type: ignore[no-untyped-call]
-                found = self._event_in(step, at, end, drive)
+            self._growth = self._growth.after(step.begin, step.end)
+            event = None
+            if not step_loops.all_far(self._ranges, step.begin.joints, step.end.joints, step.h):  # type: ignore[no-untyped-call]
+                step, event = self._until_first(step)
             if self._observe is not None:
-                point, x, _ = found or (end, step.t + step.h, None)
-                start, machine = self._stepper.origin + step.t, self._stepper.machine
-                last = found is None and step.h == h - step.t
-                self._observe(Passage(start, step.t, x - step.t, at, point, drive, machine, last))
-            if found is not None:
-                return found
-            at = end
+                self._observe(step)
+            if event is not None:
+                return step.end, step.t + step.h, event
+            at = step.end
         return at, h, None
 
-    def _event_in(
-        self, step: AcceptedStep, at: Point, end: Point, drive: tuple[float, ...]
-    ) -> tuple[Point, float, Limit] | None:
-        """Return state, time and event of the first one in an accepted step from `at` to `end`."""
+    def _until_first(self, step: Step) -> tuple[Step, Limit | None]:
+        """Return an accepted step up to the first event in it, and that, or all of it."""
 
         @cache
         def part(x: float) -> Point:
-            """Repeat a part x [s] of the step."""
-            if x == step.h:
-                return end
-            return self._point(*self._stepper.repeat(step.t, x, at.y, at.z, drive, at.order))
+            return step.end if x == step.h else self._stepper.part(step, x)
 
-        near = [event for event in self._events if may_occur(event, at.joints, end.joints)]
+        ends = step.begin.joints, step.end.joints
+        near = [event for event in self._events if may_occur(event, *ends)]
         found = first_event(near, lambda x: part(x).joints, step.h)
         if found is None:
-            return None
+            return step, None
         x, event = found
         if event.error is None:
             x = just_beyond(event, x, part(x).joints, step.h)
-        return part(x), step.t + x, event
-
-    def _point(self, y: list[float], z: list[float], order: int) -> Point:
-        return Point(y, z, self.dynamics.joints(*y[:7]), order)
+        return step._replace(h=x, end=part(x), last=False), event

@@ -110,8 +110,7 @@ class TickPropagator(Propagator):
         stepper = self._stepper_for(self._sine or (0.0, 0.0, 0.0))
         at, k = self.begin(starts[0, :-1].tolist()), 0
         while k < len(length):
-            k, (y, z, joints) = stepper.step_sequence(k, given, (at.y, at.z, at.joints), reached)
-            at = at._replace(y=y, z=z, joints=joints)
+            k, at = stepper.step_sequence(k, given, at, reached)
             if k == len(length):
                 break
             held = tuple(drives[k].tolist())

@@ -23,7 +23,7 @@ from sst_ros.errors import SstError
 from sst_ros.host.output import slices
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, StepperCheckpoint
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod, Method
+from sst_ros.integration.compiled_method import CompiledMethod, Method, Point
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report import states
@@ -300,12 +300,12 @@ def _adaptive(
         ) -> Array:
             stepper.restore(fresh)
             rows = [list(problem.start)]
-            y, coarse, order = list(problem.start), list(problem.start), method.order
+            at = Point(list(problem.start), list(problem.start), (), method.order)
             for k in range(problem.count):
                 begin, end = k * problem.interval, (k + 1) * problem.interval
-                for step in stepper.accepted_steps(begin, end, y, coarse, problem.drive, order):
-                    y, coarse, order = step.y, step.z, step.order
-                rows.append(y)
+                for step in stepper.accepted_steps(begin, end, at, problem.drive):
+                    at = step.end
+                rows.append(at.y)
             return np.array(rows)
 
         def solve(

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from sst_ros.host.output import Bar
-from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
+from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget, Step
 from sst_ros.integration.applied_torque import StateFeedback, Torque
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod, has_code
-from sst_ros.integration.global_error import HalvedSteps, Passage, Point
+from sst_ros.integration.compiled_method import CompiledMethod, Point, has_code
+from sst_ros.integration.global_error import HalvedSteps
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -140,7 +140,7 @@ class SteppedMotion:
         self._samples: list[tuple[float, Point, Vector3]] = []
         self._wanted: list[float] = (self._times(times) / NANOSECONDS)[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
-        self._time = self._period_end = 0.0
+        self._time, self._period = 0.0, (0.0, 0.0)
         known = numba_version() is not None
         self._spent, self._compile_after = spent, _WORTH_LOADING if known else math.inf
 
@@ -154,7 +154,7 @@ class SteppedMotion:
         try:
             for time, h, end in self._periods():
                 self._torque = self._propagator.torque.acting(self._asked(time, end))
-                self._period_end = end
+                self._period = time, end
                 self._propagator.advance(self._at, time, h, 1, self._torque, moment)
         except LimitReached as reached:
             status, time, stop = 1, reached.time, reached.limit.reason
@@ -212,14 +212,14 @@ class SteppedMotion:
             return piece.sine
         return piece.torque if isinstance(piece, ConstantTorque) else piece
 
-    def _pass(self, step: Passage) -> None:
+    def _pass(self, step: Step) -> None:
         """Go with the second solution through a step of the run, and take samples in it."""
         self._budget.charge(4 * step.method.pair_cost // 3)
         self._check.add(step)
         if self._spent + self._budget.spent > self._compile_after:
             self._compile(step.method)
-        end = self._period_end if step.last else step.time + step.h
-        self._last = step
+        self._last, self._last_begin = step, self._period[0] + step.t
+        end = self._period[1] if step.last else self._last_begin + step.h
         while self._wanted and self._wanted[-1] < end:
             self._sample(self._wanted.pop())
         if self._wanted and self._wanted[-1] == end:
@@ -238,7 +238,7 @@ class SteppedMotion:
 
     def _sample(self, time: float) -> None:
         """Take a sample inside the last step, by a pair of shorter ones."""
-        step, x = self._last, time - self._last.time
+        step, x = self._last, time - self._last_begin
         if x > 0.0:
             y = step.method.step_fixed(step.t, 0.5 * x, 2, step.begin.y, step.drive)
             self._take(time, self._propagator.begin(y))

@@ -23,7 +23,7 @@ from sst_ros.integration.adaptive_stepper import (
 )
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.global_error import Point
+from sst_ros.integration.compiled_method import Point
 from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
