@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from benchmark.measure import describe_machine, join_line, write_json
 from sst_ros.host.output import slices
-from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
+from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.topic_tables import JOINTS

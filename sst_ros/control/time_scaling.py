@@ -210,7 +210,7 @@ def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
         yield f"refused: {problem}"
     if plan.scene.moment is not None and plan.scene.moment.topic:
         yield "The external moment comes from a topic; it counts as zero here."
-    if plan.scene.actuators is not None and plan.scene.actuators.time_constant is not None:
+    if plan.scene.lags:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
     if any(distance.refused and distance.least < 0.0 for distance in plan.distances):

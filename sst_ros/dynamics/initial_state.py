@@ -140,7 +140,7 @@ def _foreign_terms(scene: Scene) -> Iterator[Problem]:
     for name in ("gravity", "friction", "springs"):
         if value := getattr(scene, name):
             yield Problem(name, value, REFUSED)
-    if scene.actuators is not None and scene.actuators.time_constant is not None:
+    if scene.lags and scene.actuators is not None:
         yield Problem("actuators.time_constant", scene.actuators.time_constant, REFUSED)
     if scene.stroke.at_end == "elastic":
         yield Problem("stroke.at_end", scene.stroke.at_end, REFUSED)

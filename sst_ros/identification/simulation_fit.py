@@ -207,7 +207,7 @@ class Sensitivities:
         if problems:
             raise InputError("identify", problems)
         self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]
-        lag = scene.actuators is not None and scene.actuators.time_constant is not None
+        lag = scene.lags
         self._state = (*QUATERNION, *RATE, *(LAG if lag else ()))
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:

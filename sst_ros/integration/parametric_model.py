@@ -21,7 +21,7 @@ from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.limit_distances import limit_distances
+from sst_ros.integration.events import limit_distances
 from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque

@@ -5,21 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AdaptiveStepper,
+    CannotStep,
     EvaluationBudget,
     MethodChange,
     Step,
     StepperCheckpoint,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
+from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import Point
 from sst_ros.integration.events import (
     contact_events_of,
@@ -30,9 +33,10 @@ from sst_ros.integration.events import (
     may_occur,
 )
 from sst_ros.integration.global_error import ErrorGrowth, coulomb_joints
-from sst_ros.integration.methods import RK4
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.integration.methods import DOP853, RK4
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.state import NANOSECONDS, Vector3
 
 
 class LimitReached(Exception):
@@ -98,8 +102,7 @@ class Propagator:
         contacts = tuple(contact_events_of(scene, geometry))
         self._events = (*ends, *contacts)
         self._ranges = ranges_of([*ends, *free_range(contacts)])
-        limit = scene.actuators.torque_limit if scene.actuators else None
-        self.torque = AppliedTorque(self.ode, limit, derivative)
+        self.torque = AppliedTorque(self.ode, scene.torque_limit, derivative)
         self._new_stepper = partial(
             AdaptiveStepper,
             method=integrator,
@@ -207,6 +210,12 @@ class Propagator:
         for stepper in (self._constant, *self._others.values()):
             stepper.compile()
 
+    def acting(self, torque: Torque, time: float, at: Point) -> Vector3:
+        """Torques that the actuators give at a time [s] and a point [N m]."""
+        if len(self.dynamics.state) > 7:  # they lag
+            return at.y[7], at.y[8], at.y[9]
+        return self.torque.at(torque, time, at.y)
+
     def errors(self, at: Point) -> tuple[float, float]:
         """Estimated global errors of orientation [rad] and body rate [rad/s]."""
         return self._growth.errors(at, self.accepted_steps)
@@ -295,3 +304,108 @@ class Propagator:
         if event.error is None:
             x = just_beyond(event, x, part(x).joints, step.h)
         return step._replace(h=x, end=part(x), last=False), event
+
+
+LONGEST_TICK_NS = 1_000_000
+"""Longer ticks are divided [ns]: a pair of steps then takes half a millisecond each."""
+
+_TICK_TOLERANCE, _TICK_BUDGET = 1e-13, 3600
+"""Largest local error estimate of a pair of steps; evaluations that a tick may take: a hundred
+pairs of steps."""
+
+
+class TickSequence(NamedTuple):
+    """Ticks in order of time.
+
+    Attributes:
+        start_ns, end_ns: relative to the start of the run [ns], shape (m,).
+        drives: what is held over a tick, shape (m, 3 or 6 or 0): actuator torques [N m], and a
+            moment on the star in {B} [N m] if it comes from a topic.
+
+    """
+
+    start_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
+    drives: Array
+
+    def part(self, ticks: slice) -> TickSequence:
+        """Return some of the ticks."""
+        return TickSequence(self.start_ns[ticks], self.end_ns[ticks], self.drives[ticks])
+
+
+class TickPropagator(Propagator):
+    """Propagates a scene by DOP853 through ticks, all of one call in compiled code.
+
+    Limits of the scene do not end the motion.
+
+    Args:
+        scene: what moves.
+        torque: torques over time, within the limit of the actuators; without them they are those
+            of each tick.
+        compiled: by numba, where it is installed.
+
+    """
+
+    def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
+        self.compiled = compiled and numba_version() is not None
+        budget = EvaluationBudget(_TICK_BUDGET)
+        super().__init__(
+            scene, DOP853.name, _TICK_TOLERANCE, compiled=self.compiled, budget=budget, limits=False
+        )
+        self._sine = torque
+
+    def follow(self, ticks: TickSequence, starts: Array) -> Array:
+        """Propagate through ticks.
+
+        Args:
+            ticks: m ticks.
+            starts: states (quaternion, body rate, lagged torques) at which ticks begin, shape
+                (m, 7 or 10); NaN where a tick goes on from the one before.
+
+        Returns:
+            Solution and coarse solution at the end of each tick, with the work since the start
+            [J], shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
+
+        """
+        length_ns = ticks.end_ns - ticks.start_ns
+        parts = np.maximum(1, -(-length_ns // LONGEST_TICK_NS))
+        first = np.cumsum(parts) - parts
+        length = np.repeat(length_ns / NANOSECONDS / parts, parts)
+        begin = np.repeat(ticks.start_ns / NANOSECONDS, parts)
+        begin += length * (np.arange(len(length)) - np.repeat(first, parts))
+        begins = np.full((len(length), len(self.ode.state)), np.nan)
+        begins[first] = np.hstack([starts, 0.0 * starts[:, :1]])
+        reached = self._reached(begin, length, self._drives(begin, ticks, parts), begins)
+        return np.asarray(reached[first + parts - 1])
+
+    def _drives(self, begin: Array, ticks: TickSequence, parts: NDArray[np.int64]) -> Array:
+        """Return the drives of the parts of ticks: torques within the limit, or phases of sines."""
+        if self._sine is not None:
+            phases = np.multiply.outer(begin, self._sine.frequency) + self._sine.phase
+            return np.asarray(np.fmod(phases, 2.0 * np.pi))
+        drives = np.repeat(ticks.drives, parts, axis=0)
+        if self.torque.limit is not None:
+            drives[:, :3] = np.clip(drives[:, :3], -self.torque.limit, self.torque.limit)
+        return drives
+
+    def _reached(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:
+        reached: Any = np.full((len(length), 2, len(self.ode.state)), np.nan)
+        given: Any = (length, drives, starts)
+        if not self.compiled:
+            reached, given = reached.tolist(), tuple(array.tolist() for array in given)
+        stepper = self._stepper_for(self._sine or (0.0, 0.0, 0.0))
+        at, k = self.begin(starts[0, :-1].tolist()), 0
+        while k < len(length):
+            k, at = stepper.step_sequence(k, given, at, reached)
+            if k == len(length):
+                break
+            held = tuple(drives[k].tolist())
+            torque = self._sine or (held[0], held[1], held[2])
+            try:
+                at, _ = self.advance(at, float(begin[k]), float(length[k]), 1, torque, held[3:])
+                reached[k][0][:], reached[k][1][:] = at.y, at.z
+                k += 1
+            except (LimitReached, CannotStep, ArithmeticError, ValueError):
+                later = np.flatnonzero(np.isfinite(starts[k + 1 :, 0]))
+                k = k + 1 + int(later[0]) if len(later) else len(length)
+        return np.asarray(reached)

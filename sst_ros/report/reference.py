@@ -18,7 +18,7 @@ import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.host.output import slices
-from sst_ros.integration.tick_propagator import LONGEST_NS, TickPropagator, TickSequence
+from sst_ros.integration.propagator import LONGEST_TICK_NS, TickPropagator, TickSequence
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
@@ -182,7 +182,7 @@ class _Reference:
         if count < len(ticks.start_ns):
             until = ticks.end_ns[count - 1] / NANOSECONDS
             reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
-        steps = 2 * -(-self._tick_ns // LONGEST_NS)
+        steps = 2 * -(-self._tick_ns // LONGEST_TICK_NS)
         return Comparison(self._error, self._own, tuple(restarts), steps, tuple(reasons))
 
     def _count(self) -> int:

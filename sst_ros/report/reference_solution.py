@@ -93,7 +93,7 @@ class InitialValueProblem:
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)
         self.torque: Vector3 | TorqueFunction = scene.torque.at if scene.torque else (0.0, 0.0, 0.0)
-        limit = scene.actuators.torque_limit if scene.actuators else None
+        limit = scene.torque_limit
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"

@@ -173,7 +173,7 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
     for k, t in enumerate(instants.t.tolist()):
         state = (*instants.quaternion[k].tolist(), *instants.body_rate[k].tolist())
         torque = instants.torque[k].tolist()
-        lags = scene.actuators is not None and scene.actuators.time_constant is not None
+        lags = scene.lags
         values = eigenvalues(scene, (*state, *torque) if lags else state, torque)
         row = {"t_s": t, "decay": max(0.0, float(-values.real.min())),
                "oscillation": float(np.abs(values.imag).max())}  # fmt: skip

@@ -49,7 +49,7 @@ def initial(scene: Scene) -> tuple[float, ...]:
 
 def lags(scene: Scene) -> bool:
     """Return whether the torques of the actuators are part of the state."""
-    return scene.actuators is not None and scene.actuators.time_constant is not None
+    return scene.lags
 
 
 def of_samples(geometry: Geometry, recording: Recording, samples: Places) -> Array:

@@ -29,7 +29,7 @@ from sst_ros.dynamics.expression import Program, trace
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.host.output import slices
 from sst_ros.integration import codegen
-from sst_ros.integration.tick_propagator import TickPropagator, TickSequence
+from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.signals import Integers
@@ -187,7 +187,7 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     if not len(commands.torque):
         missing.append("no commands are recorded: their latency is not known")
         return Latency(*np.empty((3, 0)))
-    limit = recording.scene.actuators.torque_limit if recording.scene.actuators else None
+    limit = recording.scene.torque_limit
     asked, applied = _digest(commands.torque, limit), _digest(ticks.torque, limit)
     new, changed = _changes(asked), _changes(applied)
     step_ns = _received(recording, ticks.end_ns[changed])

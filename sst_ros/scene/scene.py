@@ -126,6 +126,16 @@ class Scene(Section):
         return build(Scene, changed, self.name)
 
     @property
+    def torque_limit(self) -> float | None:
+        """Largest torque of an actuator [N m]; None without one."""
+        return None if self.actuators is None else self.actuators.torque_limit
+
+    @property
+    def lags(self) -> bool:
+        """Whether the torques of the actuators lag behind what is commanded."""
+        return self.actuators is not None and self.actuators.time_constant is not None
+
+    @property
     def star_inertia(self) -> Matrix:
         """Inertia of the star and its payload about O in {E}, shape (3, 3) [kg m^2]."""
         own = self.star.inertia.matrix

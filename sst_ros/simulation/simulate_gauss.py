@@ -15,9 +15,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, number_constants, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
-from sst_ros.integration.events import first_event
+from sst_ros.integration.events import first_event, limit_distances
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
-from sst_ros.integration.limit_distances import limit_distances
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.simulation.simulation import start_of
@@ -281,7 +280,7 @@ class CollocatedMotion:
         self, scene: Scene, law: Any, span: int, period: int | None, tolerance: float, asked: bool
     ) -> None:
         torque = _traced(scene, law, period)
-        lag = scene.actuators is not None and scene.actuators.time_constant is not None
+        lag = scene.lags
         start = [*start_of(scene), *((0.0,) * 3 if lag else ())]
         duration = span / NANOSECONDS
         finest = _FINEST if asked else min(_FINEST, round(16 + _FINEST_PER_SECOND * duration))
@@ -335,7 +334,7 @@ def _traced(scene: Scene, law: Any, period: int | None) -> SineTorque | tuple[fl
         NotSmooth: there is none, or the scene has jumps.
 
     """
-    limit = scene.actuators.torque_limit if scene.actuators else None
+    limit = scene.torque_limit
     if period is not None or not isinstance(law, (SineProfile, ConstantTorque)):
         raise NotSmooth("collocation takes constant torques and sines only")
     if scene.stroke.at_end not in ("stop", "ignore"):

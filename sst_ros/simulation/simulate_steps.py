@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sst_ros.host.output import Bar
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget, Step
-from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod, Point, has_code
 from sst_ros.integration.global_error import HalvedSteps
@@ -23,15 +22,15 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, start_of, unresolved
 from sst_ros.simulation.torque_profile import (
-    ConstantTorque,
     FeedbackFunction,
-    SineProfile,
     TorqueProfile,
     TorqueTable,
-    three,
+    kinks_of,
+    refusing,
+    smooth_pieces,
 )
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, State, Vector3, clamp
+from sst_ros.state import NANOSECONDS, State, Vector3
 
 SAMPLES = 200
 """Intervals of a motion without `t_eval`."""
@@ -149,12 +148,13 @@ class SteppedMotion:
         status, message, stop = 0, "reached the end", None
         time = 0.0
         moment = (0.0, 0.0, 0.0) if self._propagator.dynamics.has_moment_topic else ()
-        if self._wanted[-1] == 0.0:
-            self._take(self._wanted.pop(), self._at)
+        if self._task.period is not None:
+            self._take_first()
         try:
-            for time, h, end in self._periods():
-                self._torque = self._propagator.torque.acting(self._asked(time, end))
+            for time, h, end, torque in self._periods():
+                self._torque = self._propagator.torque.acting(torque)
                 self._period = time, end
+                self._take_first()
                 self._propagator.advance(self._at, time, h, 1, self._torque, moment)
         except LimitReached as reached:
             status, time, stop = 1, reached.time, reached.limit.reason
@@ -177,40 +177,25 @@ class SteppedMotion:
             return np.append(np.arange(0, span, period, dtype=np.int64), span)
         return np.unique(np.rint(np.linspace(0, span, SAMPLES + 1)).astype(np.int64))
 
-    def _periods(self) -> Iterator[tuple[float, float, float]]:
-        """Yield begin, length and end of periods [s]: none has a jump of the torque inside."""
-        span, period = self._task.span, self._task.period
+    def _periods(self) -> Iterator[tuple[float, float, float, Torque]]:
+        """Yield begin, length and end of periods [s], and the torque, smooth in each."""
+        span, period, law = self._task.span, self._task.period, self._task.torque
         if period is not None:
             for start in range(0, span, period):
-                end = min(start + period, span)
-                yield start / NANOSECONDS, (end - start) / NANOSECONDS, end / NANOSECONDS
+                time, stop = start / NANOSECONDS, min(start + period, span)
+                if isinstance(law, TorqueProfile):
+                    held = law(time)
+                else:
+                    held = refusing(law)(time, self._state(time, self._at))
+                self._held.append((time, held))
+                yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held
             return
-        breaks = self._task.breaks
-        if isinstance(self._task.torque, TorqueProfile):
-            actuators = self._scene.actuators
-            limit = actuators.torque_limit if actuators else None
-            torque = self._task.torque
-            breaks = np.concatenate([breaks, torque.breaks(), torque.crossings(limit, self._end)])
-        inside = breaks[(breaks > 0.0) & (breaks < self._end)]
-        for first, last in pairwise([0.0, *np.unique(inside).tolist(), self._end]):
-            yield first, last - first, last
-
-    def _asked(self, time: float, end: float) -> Torque:
-        """Return the torques that are asked for from `time` to `end` [s]."""
-        torque = self._task.torque
-        if self._task.period is not None:
-            if isinstance(torque, TorqueProfile):
-                held = torque(time)
-            else:
-                held = _checked(torque)(time, self._state(time, self._at))
-            self._held.append((time, held))
-            return held
-        if not isinstance(torque, TorqueProfile):
-            return StateFeedback(_checked(torque), self._propagator.dynamics)
-        piece = torque.between(time, end)
-        if isinstance(piece, SineProfile):
-            return piece.sine
-        return piece.torque if isinstance(piece, ConstantTorque) else piece
+        kinks = kinks_of(law, self._scene.torque_limit, self._end)
+        breaks = np.unique(np.concatenate([self._task.breaks, kinks]))
+        inside = breaks[(breaks > 0.0) & (breaks < self._end)].tolist()
+        ends = [0.0, *inside, self._end]
+        for time, end, torque in smooth_pieces(law, self._propagator.dynamics, ends):
+            yield time, end - time, end, torque
 
     def _pass(self, step: Step) -> None:
         """Go with the second solution through a step of the run, and take samples in it."""
@@ -243,18 +228,17 @@ class SteppedMotion:
             y = step.method.step_fixed(step.t, 0.5 * x, 2, step.begin.y, step.drive)
             self._take(time, self._propagator.begin(y))
 
+    def _take_first(self) -> None:
+        if self._wanted and self._wanted[-1] == 0.0:
+            self._take(self._wanted.pop(), self._at)
+
     def _take(self, time: float, at: Point) -> None:
         if not self._samples or self._samples[-1][0] < time:
-            self._samples.append((time, at, self._acting(time, at)))
-
-    def _acting(self, time: float, at: Point) -> Vector3:
-        """Torques that the actuators give, until this time."""
-        if len(self._propagator.dynamics.state) > 7:  # they lag
-            return at.y[7], at.y[8], at.y[9]
-        return self._propagator.torque.at(self._torque, time, at.y)
+            self._samples.append((time, at, self._propagator.acting(self._torque, time, at)))
 
     def _state(self, time: float, at: Point) -> State:
-        return State.of(round(time * NANOSECONDS), at.y, at.joints, self._acting(time, at))
+        acting = self._propagator.acting(self._torque, time, at)
+        return State.of(round(time * NANOSECONDS), at.y, at.joints, acting)
 
     def _trajectory(self, status: int, message: str) -> Trajectory:
         propagator, at = self._propagator, self._at
@@ -264,8 +248,6 @@ class SteppedMotion:
             times, torques = zip(*self._held, strict=True)
             torque = TorqueTable(times, torques)
         acting = np.array([acting for _, _, acting in self._samples]).reshape(-1, 3)
-        if self._task.period is None and self._samples and self._samples[0][0] == 0.0:
-            acting[0] = self._first(torque)
         states = np.array([point.y[:7] for _, point, _ in self._samples]).reshape(-1, 7)
         stored = dynamics.total_energy(at.y) - dynamics.total_energy(self._start.y)
         changes = [f"{to} from {at:g} s ({why})" for at, to, why in propagator.changes]
@@ -285,17 +267,3 @@ class SteppedMotion:
             step=self._time / max(self._check.steps, 1),
             law=torque,
         )
-
-    def _first(self, torque: Any) -> Vector3:
-        """Torques that act at t = 0; a state before the first step does not know them."""
-        actuators = self._scene.actuators
-        if actuators is not None and actuators.time_constant is not None:
-            return (0.0, 0.0, 0.0)
-        known = isinstance(torque, TorqueProfile)
-        found = torque(0.0) if known else torque(0.0, self._state(0.0, self._start))
-        return clamp(found, actuators.torque_limit if actuators else None)
-
-
-def _checked(function: FeedbackFunction) -> Callable[[float, State], Vector3]:
-    """Refuse anything but three finite torques by the time of the call."""
-    return lambda t, state: three(function(t, state), f"torque({t:g})")

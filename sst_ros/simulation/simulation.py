@@ -202,7 +202,7 @@ class Simulation:
             budget=EvaluationBudget(self.step_budget),
             derivative=derivative,
         )
-        self._warned = not self.compiled
+        self._warned, self._lags = not self.compiled, scene.lags
         self._start = self._propagator.begin(list(start_of(scene)))
         self._now = self._before = _Instant(0, self._start)
         self.reset()
@@ -394,12 +394,9 @@ class Simulation:
         return State.of(at.time_ns, at.point.y, at.point.joints, self._torque(at))
 
     def _torque(self, at: _Instant) -> Vector3:
-        y = at.point.y
-        if len(self.dynamics.state) > 7:  # the torques of the actuators lag
-            return y[7], y[8], y[9]
-        if type(at.torque) is tuple:
+        if type(at.torque) is tuple and not self._lags:
             return at.torque
-        return self._propagator.torque.at(at.torque, at.time_ns / NANOSECONDS, y)
+        return self._propagator.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
 
 
 @lru_cache(maxsize=64)

@@ -7,13 +7,16 @@ import csv
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
+from sst_ros.integration.applied_torque import StateFeedback, Torque
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import State, Vector3, finite_vector
 
@@ -286,6 +289,40 @@ def profile_of(torque: Any) -> TorqueProfile | FeedbackFunction:
         function: FeedbackFunction = torque
         return function if _arguments(torque) == 2 else FunctionTorque(torque)
     return ConstantTorque(three(torque, "torque"))
+
+
+def smooth_pieces(
+    law: TorqueProfile | FeedbackFunction, dynamics: Dynamics, ends: Sequence[float]
+) -> Iterator[tuple[float, float, Torque]]:
+    """Yield begin and end [s] of pieces of a motion, and what acts there, without a kink inside.
+
+    Args:
+        law: torques that are asked for.
+        dynamics: of the scene.
+        ends: those of the pieces, ascending, see `kinks_of`.
+
+    """
+    for begin, end in pairwise(ends):
+        if not isinstance(law, TorqueProfile):
+            yield begin, end, StateFeedback(refusing(law), dynamics)
+            continue
+        piece = law.between(begin, end)
+        if isinstance(piece, SineProfile):
+            yield begin, end, piece.sine
+        else:
+            yield begin, end, piece.torque if isinstance(piece, ConstantTorque) else piece
+
+
+def kinks_of(law: TorqueProfile | FeedbackFunction, limit: float | None, end: float) -> Array:
+    """Return the times from 0 to `end` [s] at which a law has kinks, or passes the limit [N m]."""
+    if not isinstance(law, TorqueProfile):
+        return np.empty(0)
+    return np.concatenate([law.breaks(), law.crossings(limit, end)])
+
+
+def refusing(function: FeedbackFunction) -> Callable[[float, State], Vector3]:
+    """Refuse anything but three finite torques by the time of the call."""
+    return lambda t, state: three(function(t, state), f"torque({t:g})")
 
 
 def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:

@@ -10,7 +10,7 @@ import contextlib
 import html
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -24,7 +24,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import MissingDependency, require
 from sst_ros.host.table_file import SUFFIXES, read_table, write_table
 from sst_ros.integration.adaptive_stepper import EvaluationBudget
-from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import Propagator
 from sst_ros.mechanism import frames, kinematics
@@ -32,11 +32,12 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.torque_profile import (
-    ConstantTorque,
     FeedbackFunction,
     LostTorque,
     TorqueProfile,
+    kinks_of,
     profile_from,
+    smooth_pieces,
 )
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
@@ -384,8 +385,7 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
         states = trajectory.dense(times)
         if states.shape[1] > 7 or not isinstance(trajectory.law, TorqueProfile):
             return states
-        actuators = trajectory.scene.actuators
-        limit = (actuators.torque_limit if actuators else None) or np.inf
+        limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
     samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
     before = np.searchsorted(trajectory.t, times, side="right") - 1
@@ -407,6 +407,9 @@ class _Gap:
             compiled=False, budget=EvaluationBudget(), limits=False,
         )  # fmt: skip
         self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
+        if self._law is not None:
+            limit, end = trajectory.scene.torque_limit, float(self._t[-1])
+            self._kinks = np.unique(kinks_of(self._law, limit, end))
 
     def states(self, k: int, sample: Array, times: Array) -> Array:
         """States at ascending times between sample k and the next, shape (m, 10)."""
@@ -414,30 +417,19 @@ class _Gap:
         moment = (0.0,) * (len(dynamics.drive) - 3)
         at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
         found = []
-        for end, asked in self._pieces(k, t, float(times[-1])):
+        for _, end, asked in self._pieces(k, t, float(times[-1])):
             torque = propagator.torque.acting(asked)
             for time in (*times[(times > t) & (times < end)].tolist(), end):
                 if time > t:
                     at, _ = propagator.advance(at, t, time - t, 1, torque, moment)
                     t = time
-                    lagged = at.y[7:10] if len(dynamics.state) > 7 else None
-                    acting = lagged or propagator.torque.at(torque, t, at.y)
-                    found.append((t, *at.y[:7], *acting))
+                    found.append((t, *at.y[:7], *propagator.acting(torque, t, at)))
         states = np.array(found)
         return np.asarray(states[np.searchsorted(states[:, 0], times), 1:])
 
-    def _pieces(self, k: int, begin: float, end: float) -> list[tuple[float, Torque]]:
-        """List the ends of the pieces with a smooth torque, and the torque there."""
-        law = self._law
-        if law is None:
+    def _pieces(self, k: int, begin: float, end: float) -> Iterable[tuple[float, float, Torque]]:
+        if self._law is None:
             first, second, third = self._torque[k + 1].tolist()
-            return [(end, (first, second, third))]
-        if not isinstance(law, TorqueProfile):
-            return [(end, StateFeedback(law, self._propagator.dynamics))]
-        breaks = law.breaks()
-        ends = [*breaks[(breaks > begin) & (breaks < end)].tolist(), end]
-        pieces = (law.between(*span) for span in zip([begin, *ends], ends, strict=False))
-        return [
-            (stop, piece.torque if isinstance(piece, ConstantTorque) else piece)
-            for stop, piece in zip(ends, pieces, strict=True)
-        ]
+            return [(begin, end, (first, second, third))]
+        inside = self._kinks[(self._kinks > begin) & (self._kinks < end)].tolist()
+        return smooth_pieces(self._law, self._propagator.dynamics, [begin, *inside, end])

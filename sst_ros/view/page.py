@@ -295,7 +295,7 @@ class _RunControls:
     def __init__(self, server: ViserServer, scene: Scene, run: RunControl) -> None:
         self._run, self._paused = run, False
         gui = server.gui
-        limit = scene.actuators.torque_limit if scene.actuators is not None else None
+        limit = scene.torque_limit
         most = limit or _LARGEST_TORQUE
         with gui.add_folder("run", order=1.0):
             self._pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_ros.integration.tick_propagator import TickPropagator
+from sst_ros.integration.propagator import TickPropagator
 from sst_ros.recording import recording
 from sst_ros.report import reference, timing
 from sst_ros.report.run import report
