@@ -263,16 +263,27 @@ def test_rodas4_runs_under_a_sine_profile():
 
 
 @pytest.mark.skipif(numba_version() is None, reason="needs numba")
-@pytest.mark.parametrize(("scene", "method"), [("swing", "auto"), ("example2_heavy", "rk4")])
-def test_a_run_that_goes_on_in_compiled_code_has_the_same_digits(scene, method, monkeypatch):
-    plain = simulate(scene, duration=0.6, method=method, tolerance=1e-9)
+@pytest.mark.parametrize(
+    ("scene", "method", "torque"),
+    [
+        ("swing", "auto", None),
+        ("example2_heavy", "rk4", None),
+        ("gravity_payload", "auto", lambda t: (0.3 * t, -0.1, 0.2)),
+        ("example2_heavy", "dopri5", lambda t, state: [-rate for rate in state.joints.gamma_dot]),
+    ],
+)
+def test_a_run_that_goes_on_in_compiled_code_has_the_same_digits(
+    scene, method, torque, monkeypatch
+):
+    how = {"duration": 0.6, "method": method, "tolerance": 1e-8}
+    plain = simulate(scene, torque, **how)
     monkeypatch.setattr(simulate_steps, "_WORTH_LOADING", 100)
     monkeypatch.setattr(simulate_steps, "_WORTH_COMPILING", 200)
     compiled = []
     monkeypatch.setattr(
         Propagator, "compile", lambda self, do=Propagator.compile: compiled.append(do(self))
     )
-    found = simulate(scene, duration=0.6, method=method, tolerance=1e-9)
+    found = simulate(scene, torque, **how)
     assert compiled
     assert found.quaternion.tobytes() == plain.quaternion.tobytes()
     assert found.gamma_dot.tobytes() == plain.gamma_dot.tobytes()

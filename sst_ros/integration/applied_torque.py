@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compile_program
+from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
 
@@ -71,7 +72,7 @@ class AppliedTorque:
 
     def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
         self._ode, self.limit, self._rhs = ode, limit, rhs
-        self._traced = rhs is None
+        self._traced, self._compiled = rhs is None, False
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
 
@@ -108,6 +109,11 @@ class AppliedTorque:
         self._torque, self._start = torque, start
         return (0.0, 0.0, 0.0)
 
+    def compile(self) -> None:
+        """Evaluate the derivative in machine code from now on; the digits are the same."""
+        if self._traced and not self._compiled:
+            self._compiled, self._rhs = True, None
+
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""
         if isinstance(torque, StateFeedback):
@@ -119,7 +125,8 @@ class AppliedTorque:
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
         if self._rhs is None:
-            self._rhs = compile_program(self._ode.program)
+            ode = self._ode
+            self._rhs = compile_derivative(ode) if self._compiled else compile_program(ode.program)
         assert self._torque is not None
         size = len(self._ode.state)
         torque = self.at(self._torque, self._start + t, inputs[:size])

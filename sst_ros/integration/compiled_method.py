@@ -255,6 +255,14 @@ def has_code(
     return codegen.has_code(source.texts, source.constants, functions, base=source.base)
 
 
+def compile_derivative(system: ODE) -> Function:
+    """Return the derivative of a system in machine code, with the digits of plain Python."""
+    source = _source(system, DORMAND_PRINCE, by_structure=True)
+    base, numbers = source.base, np.array(source.numbers)
+    rhs: Function = codegen.load(list(base.texts), base.constants, numba=True).rhs
+    return lambda *inputs: rhs(*inputs, numbers)
+
+
 @lru_cache(maxsize=64)
 def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource:
     """Return what the steps of a system by a method consist of.

@@ -107,10 +107,10 @@ class HalvedSteps:
 
     def add(self, step: Step) -> None:
         """Go through a step of the run, which is itself a pair of steps."""
-        method = step.method
+        method, h = step.method, (step.t + step.h) - step.t  # between its ends, which are rounded
         self.steps += 1
         try:
-            self._y = method.step_fixed(step.t, 0.25 * step.h, 4, self._y, step.drive)
+            self._y = method.step_fixed(step.t, 0.25 * h, 4, self._y, step.drive)
         except (ArithmeticError, ValueError):
             self._y = [math.nan] * len(self._y)
 

@@ -207,6 +207,7 @@ class Propagator:
     def compile(self) -> None:
         """Take compiled steps from now on; the bits are the same."""
         self._new_stepper.keywords["compiled"] = True
+        self.torque.compile()
         for stepper in (self._constant, *self._others.values()):
             stepper.compile()
 

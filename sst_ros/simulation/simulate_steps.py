@@ -43,7 +43,7 @@ UNMET = 2
 
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
 """Evaluations after which a run goes on with compiled code that is there, and makes it: in plain
-Python they take half a second and two to three; to compile the steps of a method takes four."""
+Python they take one second and five; to compile the steps of a method takes four."""
 
 _ATTEMPTS, _FINEST = 4, 1e-14
 """Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
@@ -213,8 +213,13 @@ class SteppedMotion:
         self._bar.draw(end / self._end)
 
     def _compile(self, method: CompiledMethod) -> None:
-        """Take compiled steps from now on, if their code is there or the run is long."""
-        there = has_code(method.system, method.method, ("step_pair", "step_fixed"))
+        """Take compiled steps from now on, if their code is there or the run is long.
+
+        Under a function only the derivative is compiled, which takes a second.
+        """
+        there = callable(self._torque) or has_code(
+            method.system, method.method, ("step_pair", "step_fixed")
+        )
         if there or self._spent + self._budget.spent > _WORTH_COMPILING:
             self._propagator.compile()
             self._compile_after = math.inf
