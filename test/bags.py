@@ -3,6 +3,7 @@
 
 import copy
 import dataclasses
+import itertools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import RunStopped
@@ -27,26 +28,20 @@ TICK_NS = 1_000_000
 TICKS_A_SAMPLE = 2
 NAMES = [f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3)]
 
-JOINTS, ORIENTATION, EULER = (
-    "/joint_states",
-    "/sst_simulator/orientation",
-    "/sst_simulator/euler_zyz",
-)
+JOINTS = "/joint_states"
+ORIENTATION, EULER = "/sst_simulator/orientation", "/sst_simulator/euler_zyz"
 APPLIED, SCENE = "/sst_simulator/applied_torques", "/sst_simulator/scene"
 DIAGNOSTICS, COMMANDS = "/diagnostics", "/sst_simulator/commands"
 DESIRED, ERROR = "/sst_inverse_dynamics/reference", "/sst_inverse_dynamics/tracking_error"
 STAMPED = "/sst_simulator/commands_stamped"
 KINDS = {
-    JOINTS: "sensor_msgs/msg/JointState",
+    **dict.fromkeys((JOINTS, STAMPED, DESIRED, ERROR), "sensor_msgs/msg/JointState"),
     ORIENTATION: "geometry_msgs/msg/QuaternionStamped",
     EULER: "geometry_msgs/msg/Vector3Stamped",
     APPLIED: "trajectory_msgs/msg/JointTrajectory",
     SCENE: "std_msgs/msg/String",
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     COMMANDS: "std_msgs/msg/Float64MultiArray",
-    STAMPED: "sensor_msgs/msg/JointState",
-    DESIRED: "sensor_msgs/msg/JointState",
-    ERROR: "sensor_msgs/msg/JointState",
 }
 
 
@@ -73,25 +68,24 @@ class Entry:
     sample: int = -1
 
 
+def joint_state(stamp_ns: int, position: Any, velocity: Any, torque: Any) -> Any:
+    """Numbers of the first joints; the torques are those of the actuators."""
+    parts = {"position": position, "velocity": velocity, "effort": np.zeros(len(position))}
+    parts["effort"][:3] = torque
+    names = NAMES[: len(position)]
+    return make("sensor_msgs/JointState", header=header(stamp_ns), name=names, **parts)
+
+
 def state_entries(state, stamp_ns: int, received_ns: int, sample: int) -> list[Entry]:
-    joints = state.joints
-    effort = np.zeros(9)
-    effort[:3] = state.torque
-    joint_state = make(
-        "sensor_msgs/JointState",
-        header=header(stamp_ns),
-        name=list(NAMES),
-        position=np.array([*joints.gamma, *joints.mu, *joints.beta]),
-        velocity=np.array([*joints.gamma_dot, *joints.mu_dot, *joints.beta_dot]),
-        effort=effort,
-    )
+    position, velocity = np.reshape(state.joints, (2, 9))
+    joints = joint_state(stamp_ns, position, velocity, state.torque)
     x, y, z, w = state.quaternion
     turn = make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
     theta, phi, psi = zyz_angles(rotation_matrix(state.quaternion)).tolist()
     angles = make("geometry_msgs/Vector3", x=theta, y=phi, z=psi)
     orientation = make("geometry_msgs/QuaternionStamped", header=header(stamp_ns), quaternion=turn)
     euler = make("geometry_msgs/Vector3Stamped", header=header(stamp_ns), vector=angles)
-    contents = {JOINTS: joint_state, ORIENTATION: orientation, EULER: euler}
+    contents = {JOINTS: joints, ORIENTATION: orientation, EULER: euler}
     return [Entry(topic, received_ns, content, sample) for topic, content in contents.items()]
 
 
@@ -201,30 +195,54 @@ def tracked(entries: list[Entry], desired) -> list[Entry]:
                 (DESIRED, wanted, 0.75 * effort),
                 (ERROR, wanted - measured, 0.25 * effort),
             ):
-                content = make(
-                    "sensor_msgs/JointState",
-                    header=header(stamp),
-                    name=NAMES[:3],
-                    position=position,
-                    velocity=velocity,
-                    effort=torque,
-                )
+                content = joint_state(stamp, position, velocity, torque)
                 more.append(Entry(topic, entry.received_ns + 1, content, entry.sample))
     return sorted([*entries, *more], key=lambda entry: entry.received_ns)
 
 
-def write(path: Path, entries: list[Entry], *, sqlite: bool = False, namespace: str = "") -> Path:
+def write(
+    path: Path, entries: list[Entry], *, sqlite: bool = False, namespace: str = "",
+    mode: CompressionMode | None = None, chunks: Any = None,
+) -> Path:  # fmt: skip
+    """Write messages by rosbags, compressed as rosbag2 does it, or in chunks of some other kind."""
     plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
-    connections: dict[str, Any] = {}
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
-        for entry in entries:
-            topic, kind = entry.topic, KINDS[entry.topic]
-            if topic not in connections:
-                name = topic if topic == DIAGNOSTICS else namespace + topic
-                connections[topic] = writer.add_connection(name, kind, typestore=STORE)
-            raw = STORE.serialize_cdr(entry.content, kind)
-            writer.write(connections[topic], entry.received_ns, raw)
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        if chunks is not None:
+            writer.storage.compression, writer.storage.compressor = chunks
+
+        def connect(topic: str, kind: str) -> Any:
+            name = topic if topic == DIAGNOSTICS else namespace + topic
+            return writer.add_connection(name, kind, typestore=STORE)
+
+        _send(entries, connect, writer.write)
     return path
+
+
+def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:
+    """Write messages as the recorder does; with `flush_every`, a chunk for so many messages."""
+    writer = BagWriter(path)
+
+    def flush(number: int) -> None:
+        if flush_every and number % flush_every == flush_every - 1:
+            writer._flushed = -1e9
+            writer.save()
+
+    _send(entries, writer.connect, writer.write, flush)
+    writer.close()
+    return path
+
+
+def _send(entries: list[Entry], connect: Any, send: Any, then: Any = lambda _: None) -> None:
+    connections: dict[str, Any] = {}
+    for number, entry in enumerate(entries):
+        topic, kind = entry.topic, KINDS[entry.topic]
+        if topic not in connections:
+            connections[topic] = connect(topic, kind)
+        send(connections[topic], entry.received_ns, bytes(STORE.serialize_cdr(entry.content, kind)))
+        then(number)
 
 
 def without(entries: list[Entry], *topics: str) -> list[Entry]:
@@ -241,27 +259,22 @@ def edited(entries: list[Entry], topic: str, sample: int, change) -> list[Entry]
     ]
 
 
+def same(one: Recording, other: Recording) -> None:
+    """Check that two recorded runs have the same numbers."""
+    arrays = {name: mine for name, mine in vars(one).items() if isinstance(mine, np.ndarray)}
+    assert len(arrays) == 11
+    for name, mine in arrays.items():
+        assert np.array_equal(mine, getattr(other, name), equal_nan=True), name
+    assert np.array_equal(one.ticks.torque, other.ticks.torque)
+    assert np.array_equal(one.commands.torque, other.commands.torque)
+    assert one.scene == other.scene and one.reports == other.reports
+
+
 def altered(run: Recording, **values: Any) -> Recording:
     """Copy a recorded run with other attributes."""
     again = copy.copy(run)
     vars(again).update(values)
     return again
-
-
-def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:
-    """Write messages as the recorder does; with `flush_every`, a chunk for so many messages."""
-    writer, connections = BagWriter(path), {}
-    for number, entry in enumerate(entries):
-        topic, kind = entry.topic, KINDS[entry.topic]
-        if topic not in connections:
-            connections[topic] = writer.connect(topic, kind)
-        raw = bytes(STORE.serialize_cdr(entry.content, kind))
-        writer.write(connections[topic], entry.received_ns, raw)
-        if flush_every and number % flush_every == flush_every - 1:
-            writer._flushed = -1e9
-            writer.save()
-    writer.close()
-    return path
 
 
 @pytest.fixture(scope="session")
@@ -277,9 +290,6 @@ def example2(bags):
 
 @pytest.fixture
 def written(tmp_path):
-    """Write messages and return the path of the bag."""
-
-    def write_bag(entries, **options):
-        return write(tmp_path / "bag", entries, **options)
-
-    return write_bag
+    """Write messages into a new folder and return its path."""
+    names = (f"bag{number or ''}" for number in itertools.count())
+    return lambda entries, **options: write(tmp_path / next(names), entries, **options)

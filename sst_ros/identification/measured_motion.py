@@ -117,20 +117,21 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     return MeasuredMotion(t, gamma, gamma_dot, torque, start, saturated)
 
 
+def _take(motion: Trajectory, rows: Any = slice(None)) -> dict[str, Any]:
+    return {
+        "t": motion.t[rows],
+        "gamma": np.unwrap(motion.gamma[rows], axis=0),
+        "gamma_dot": motion.gamma_dot[rows],
+        "torque": motion.torque[rows],
+        "quaternion": next(iter(motion.quaternion[rows]), None),
+    }
+
+
 def _take_trajectory(motion: Trajectory) -> dict[str, Any]:
     """Take a simulated motion; torques without a law are held to their sample, see `Trajectory`."""
-    given = {
-        "t": motion.t,
-        "gamma": np.unwrap(motion.gamma, axis=0),
-        "gamma_dot": motion.gamma_dot,
-        "torque": motion.torque,
-        "quaternion": motion.quaternion[0] if len(motion) else None,
-    }
+    given = _take(motion)
     if isinstance(motion.law, (TorqueTable, ConstantTorque)):
-        given |= {
-            "torque": _average(motion.law.values, motion.law.breaks(), motion.t),
-            "held": True,
-        }
+        given |= {"torque": _average(motion.law, motion.t), "held": True}
     elif motion.law is None:
         given |= {"torque": motion.torque[1:], "held": True}
     return given
@@ -138,33 +139,23 @@ def _take_trajectory(motion: Trajectory) -> dict[str, Any]:
 
 def _take_recording(recording: Recording) -> dict[str, Any]:
     """Take a recorded run from the first sample that has an orientation and a torque after it."""
-    ticks, times = recording.ticks, recording.seconds
-    known = np.isfinite(recording.quaternion).all(axis=1)
+    ticks, motion = recording.ticks, recording.trajectory
     begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
-    inside = known & (times >= begins[0] - 1e-12) & (times <= ends[-1] + 1e-12)
-    table = TorqueTable(begins, ticks.torque)
+    given = _take(motion, (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12))
     if recording.scene.actuators is not None and recording.scene.actuators.time_constant:
         # The lag is between the tick's torque and the joint; the recorded effort is behind it.
-        torque: dict[str, Any] = {"torque": recording.effort[inside]}
-    else:
-        means = _average(table.values, table.breaks(), times[inside])
-        torque = {"torque": means, "held": True}
-    return {
-        "t": times[inside],
-        "gamma": np.unwrap(recording.gamma[inside], axis=0),
-        "gamma_dot": recording.gamma_dot[inside],
-        "quaternion": recording.quaternion[inside][0] if inside.any() else None,
-        **torque,
-    }
+        return given
+    return given | {"torque": _average(TorqueTable(begins, ticks.torque), given["t"]), "held": True}
 
 
-def _average(values: Any, breaks: Array, t: Array) -> Array:
+def _average(law: TorqueProfile, t: Array) -> Array:
     """Means over the intervals of t of a torque that is constant between its breaks, (n - 1, 3)."""
     if len(t) < 2:
         return np.empty((0, 3))
+    breaks = law.breaks()
     edges = np.union1d(t, breaks[(breaks > t[0]) & (breaks < t[-1])])
     middle = 0.5 * (edges[1:] + edges[:-1])
-    areas = np.asarray(values(middle)) * np.diff(edges)[:, None]
+    areas = law.values(middle) * np.diff(edges)[:, None]
     total = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
     at = np.searchsorted(edges, t)
     # Sums over one interval each: a difference of long sums would lose digits.

@@ -13,6 +13,7 @@ from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
 from sst_ros.scene import yaml_document
+from sst_ros.state import Joints
 
 EXACT = 1e-9
 SCENES = (
@@ -53,7 +54,7 @@ def test_a_recording_gives_them_as_exactly(name, bags, tmp_path, monkeypatch):
     entries = [bags.Entry(bags.SCENE, begun, scene)]
     for i, quaternion in enumerate(motion.quaternion):
         passive = dict.fromkeys(("mu", "beta", "mu_dot", "beta_dot"), np.zeros(3))
-        joints = SimpleNamespace(gamma=motion.gamma[i], gamma_dot=motion.gamma_dot[i], **passive)
+        joints = Joints(gamma=motion.gamma[i], gamma_dot=motion.gamma_dot[i], **passive)
         torque, stamp = motion.torque[i], begun + i * tick
         state = SimpleNamespace(joints=joints, quaternion=tuple(quaternion), torque=torque)
         if i:

@@ -5,7 +5,7 @@ import gc
 import random
 import struct
 
-import numpy as np
+import bags
 import pytest
 from mcap.records import ChunkIndex, MessageIndex
 from mcap.writer import MCAP0_MAGIC
@@ -49,15 +49,6 @@ def messages_of(bag):
         return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
 
 
-def same(one, other):
-    names = ("time_ns", "received_ns", "gamma", "mu", "beta", "gamma_dot", "effort", "quaternion")
-    arrays = [(getattr(one, name), getattr(other, name)) for name in names]
-    arrays += [(one.ticks.torque, other.ticks.torque), (one.euler, other.euler)]
-    return one.reports == other.reports and all(
-        np.array_equal(mine, its, equal_nan=True) for mine, its in arrays
-    )
-
-
 def flips(content, count, seed):
     """Contents with one byte changed, at random places and in random ways."""
     generator = random.Random(seed)
@@ -74,7 +65,7 @@ def check_flips(whole, folder, count, seed):
     for number, (at, content) in enumerate(flips(content_of(whole), count, seed)):
         bag = damaged_copy(folder / str(number), whole, content)
         try:
-            assert same(recording.read(bag), expected), f"byte {at}: a silent difference"
+            bags.same(recording.read(bag), expected)  # else a silent difference
         except InputError as error:
             refused += 1
             assert "byte" in str(error) or "ends before" in str(error), str(error)
@@ -148,6 +139,8 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
     content = bytearray(content_of(whole))
     content[content.index(b"gamma_1", len(content) // 2)] ^= 1
     bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
+    with pytest.raises(InputError, match="wrong checksum"):
+        export(bag, tmp_path / "out")
     with pytest.raises(InputError, match=r"byte \d+: chunk with wrong checksum \(40 messages, 0\."):
         recording.read(bag)
     run = recording.read(bag, damaged=True)
@@ -159,14 +152,6 @@ def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, en
     file = McapFile(next(whole.glob("*.mcap")))
     assert sum(1 for _ in file.messages()) == len(entries) == len(messages_of(whole))
     assert file.intact and file.unverified == 0
-
-
-def test_export_of_a_damaged_recording_is_refused(whole, tmp_path):
-    content = bytearray(content_of(whole))
-    content[content.index(b"gamma_1", len(content) // 3)] ^= 4
-    bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
-    with pytest.raises(InputError, match="wrong checksum"):
-        export(bag, tmp_path / "out")
 
 
 def test_recordings_without_checksums_are_read_and_counted(written, example2):

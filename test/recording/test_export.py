@@ -2,6 +2,7 @@
 """Tables of a bag, against the bag read message by message by rosbags alone, to the bits."""
 
 import csv
+import functools
 import re
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from sst_ros.extras import MissingDependency
 from sst_ros.recording.signals import export, frame
 from sst_ros.recording.topic_tables import TABLES, TIMES
 
+pytest.importorskip("pandas")
+parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow: pip install .[record]")
 ROOT = Path(__file__).parents[2]
 
 
@@ -25,12 +28,8 @@ def home(t):
 @pytest.fixture(scope="module")
 def lossy(tmp_path_factory, bags, example2):
     """A bag with everything in it but some messages."""
-    entries = bags.tracked(example2, home)
-    kept = [
-        e
-        for e in entries
-        if (e.topic, e.sample) not in {(bags.EULER, 3), (bags.ERROR, 5), (bags.JOINTS, 7)}
-    ]
+    lost = {(bags.EULER, 3), (bags.ERROR, 5), (bags.JOINTS, 7)}
+    kept = [e for e in bags.tracked(example2, home) if (e.topic, e.sample) not in lost]
     return bags.write(tmp_path_factory.mktemp("lossy") / "bag", kept)
 
 
@@ -51,33 +50,26 @@ def stamp(message):
 def expected_samples(bags, path):
     """Rows of numbers by stamp, as a user would read them from the bag."""
     rows = {}
-    for topic, names in (
-        (bags.JOINTS, ("{}_rad", "{}_rad_per_s")),
-        (bags.DESIRED, ("gamma_desired_{}_rad", "gamma_dot_desired_{}_rad_per_s")),
-        (bags.ERROR, ("gamma_error_{}_rad", "gamma_dot_error_{}_rad_per_s")),
+    for topic, what, torque in (
+        (bags.JOINTS, "", "tau"),
+        (bags.DESIRED, "_desired", "tau_feedforward"),
+        (bags.ERROR, "_error", "tau_feedback"),
     ):
-        torque = {bags.JOINTS: "tau", bags.DESIRED: "tau_feedforward", bags.ERROR: "tau_feedback"}
         for message, _ in messages(bags, path, topic):
-            if not stamp(message):
-                continue
             row = rows.setdefault(stamp(message), {})
-            for i, name in enumerate(message.name):
-                kind, leg = name.split("_")
-                key, rate = (
-                    (name, f"{kind}_dot_{leg}") if topic == bags.JOINTS else (str(leg), str(leg))
-                )
-                row[names[0].format(key)] = message.position[i]
-                row[names[1].format(rate)] = message.velocity[i]
+            for i, joint in enumerate(message.name):
+                kind, leg = joint.split("_")
+                row[f"{kind}{what}_{leg}_rad"] = message.position[i]
+                row[f"{kind}_dot{what}_{leg}_rad_per_s"] = message.velocity[i]
                 if kind == "gamma":
-                    row[f"{torque[topic]}_{leg}_N_m"] = message.effort[i]
+                    row[f"{torque}_{leg}_N_m"] = message.effort[i]
     for message, _ in messages(bags, path, bags.ORIENTATION):
-        if stamp(message):
-            q = message.quaternion
-            rows.setdefault(stamp(message), {}).update(q_x=q.x, q_y=q.y, q_z=q.z, q_w=q.w)
+        q = message.quaternion
+        rows.setdefault(stamp(message), {}).update(q_x=q.x, q_y=q.y, q_z=q.z, q_w=q.w)
     for message, _ in messages(bags, path, bags.EULER):
-        if stamp(message):
-            v = message.vector
-            rows[stamp(message)].update(theta_rad=v.x, phi_rad=v.y, psi_rad=v.z)
+        v = message.vector
+        rows[stamp(message)].update(theta_rad=v.x, phi_rad=v.y, psi_rad=v.z)
+    del rows[0]  # states before the run
     return rows
 
 
@@ -86,8 +78,8 @@ def expected_ticks(bags, path):
     for message, _ in messages(bags, path, bags.APPLIED):
         start = stamp(message)
         for point in message.points if start else ():
-            end = stamp(message) + point.time_from_start.sec * 10**9
-            end += point.time_from_start.nanosec
+            after = point.time_from_start
+            end = stamp(message) + after.sec * 10**9 + after.nanosec
             efforts = zip(("tau_1_N_m", "tau_2_N_m", "tau_3_N_m"), point.effort, strict=True)
             rows[start] = {"length_ns": end - start, **dict(efforts)}
             start = end
@@ -106,40 +98,32 @@ def check(rows, expected, start):
             assert np.float64(said[key]).tobytes() == np.float64(value).tobytes(), key
 
 
-def from_csv(path):
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            yield {
-                key: int(text) if key.endswith("_ns") else float(text) if text else None
-                for key, text in row.items()
-            }
-
-
-def from_parquet(path):
-    from pyarrow import parquet
-
-    for row in parquet.read_table(path).to_pylist():
-        yield {key: None if value != value else value for key, value in row.items()}
-
-
-def from_frame(path):
-    for row in frame(path.parent, path.stem).reset_index().to_dict("records"):
-        yield {key: None if value != value else value for key, value in row.items()}
-
-
-@pytest.mark.parametrize("form", ["csv", "parquet"])
-def test_files_hold_the_bits_of_the_bag(form, lossy, bags, tmp_path):
+def read_rows(form, bag, folder, table):
+    """Rows of a table, key to number or None, as a user gets them."""
+    if form == "csv":
+        with (folder / f"{table}.csv").open(encoding="utf-8", newline="") as file:
+            return [
+                {k: int(x) if k[-3:] == "_ns" else float(x) if x else None for k, x in row.items()}
+                for row in csv.DictReader(file)
+            ]
     if form == "parquet":
-        pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
-    paths = export(lossy, tmp_path / "out", form)
-    assert [path.name for path in paths] == [
-        f"{n}.{form}" for n in ("samples", "ticks", "commands")
-    ]
-    read = {"csv": from_csv, "parquet": from_parquet}[form]
-    check(list(read(paths[0])), expected_samples(bags, lossy), bags.START_NS)
-    check(list(read(paths[1])), expected_ticks(bags, lossy), bags.START_NS)
+        rows = parquet.read_table(folder / f"{table}.parquet").to_pylist()
+    else:
+        rows = frame(bag, table).reset_index().to_dict("records")
+    return [{key: None if x != x else x for key, x in row.items()} for row in rows]
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "pandas"])
+def test_tables_hold_the_bits_of_the_bag(form, lossy, bags, tmp_path):
+    if form != "pandas":
+        paths = export(lossy, tmp_path / "out", form)
+        names = [f"{name}.{form}" for name in ("samples", "ticks", "commands")]
+        assert [path.name for path in paths] == names
+    read = functools.partial(read_rows, form, lossy, tmp_path / "out")
+    check(read("samples"), expected_samples(bags, lossy), bags.START_NS)
+    check(read("ticks"), expected_ticks(bags, lossy), bags.START_NS)
     ((command, received),) = messages(bags, lossy, bags.COMMANDS)
-    assert list(read(paths[2])) == [
+    assert read("commands") == [
         {
             "time_ns": received - bags.START_NS, "stamp_ns": 0, "received_ns": received,
             **{f"tau_{k}_N_m": command.data[k - 1] for k in (1, 2, 3)},
@@ -147,13 +131,13 @@ def test_files_hold_the_bits_of_the_bag(form, lossy, bags, tmp_path):
     ]  # fmt: skip
 
 
-def test_a_frame_holds_the_bits_of_the_bag_and_says_what_its_columns_are(lossy, bags):
-    pytest.importorskip("pandas")
-    check(list(from_frame(lossy / "samples")), expected_samples(bags, lossy), bags.START_NS)
-    check(list(from_frame(lossy / "ticks")), expected_ticks(bags, lossy), bags.START_NS)
-    samples = frame(lossy)
+def test_columns_say_what_they_are(lossy, tmp_path):
+    samples, text = frame(lossy), "rate of gamma [rad/s], from joint_states"
+    name = "gamma_dot_1_rad_per_s"
     assert set(samples.attrs) == {samples.index.name, *samples.columns}
-    assert samples.attrs["gamma_dot_1_rad_per_s"] == "rate of gamma [rad/s], from joint_states"
+    assert samples.attrs[name] == text
+    field = parquet.read_schema(export(lossy, tmp_path, "parquet")[0]).field(name)
+    assert field.metadata == {b"unit": b"rad/s", b"description": text.encode()}
     with pytest.raises(InputError, match="must be one of those in the bag: samples, ticks"):
         frame(lossy, "moments")
 
@@ -162,7 +146,8 @@ def test_a_bag_of_one_topic_is_enough(written, bags, example2, tmp_path, capsys)
     path = written([entry for entry in example2 if entry.topic == bags.APPLIED])
     assert cli.main(["export", str(path), "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / "out" / "ticks.csv")]
-    check(list(from_csv(tmp_path / "out/ticks.csv")), expected_ticks(bags, path), bags.START_NS)
+    rows = read_rows("csv", path, tmp_path / "out", "ticks")
+    check(rows, expected_ticks(bags, path), bags.START_NS)
 
 
 def test_a_bag_without_any_is_refused(written, bags, example2):
@@ -184,7 +169,6 @@ def test_a_moment_over_a_tick_is_a_column(written, bags, example2):
         object.__setattr__(fresh.content, "joint_names", names)
         return fresh
 
-    pytest.importorskip("pandas")
     table = frame(written([moved(entry) for entry in example2]), "ticks")
     assert {name: table[name].unique().tolist() for name in moment} == {
         name: [value] for name, value in moment.items()
