@@ -15,8 +15,8 @@ from sst_ros.version import VERSION
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
     from sst_ros.control.controller import Controller as Controller
-    from sst_ros.control.controller import ControllerSettings as ControllerSettings
     from sst_ros.control.inverse_dynamics import InverseDynamics as InverseDynamics
+    from sst_ros.control.law import ControllerSettings as ControllerSettings
     from sst_ros.control.reference import ReferenceMotion as ReferenceMotion
     from sst_ros.control.reference_motions import reference_motion as reference_motion
     from sst_ros.errors import AssemblyError as AssemblyError
@@ -56,7 +56,7 @@ _MODULES = {
     "AssemblyError": "errors",
     "Batch": "integration.batch",
     "Controller": "control.controller",
-    "ControllerSettings": "control.controller",
+    "ControllerSettings": "control.law",
     "Geometry": "mechanism.geometry",
     "Identification": "identification.identification",
     "InputError": "errors",

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.controller import ControlChannel, Controller, ControlStopped, Measurement
+from sst_ros.control.controller import Controller, ControlStopped, Measurement
+from sst_ros.control.law import ControlChannel
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
@@ -215,10 +216,10 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
         joints, now = simulation.state.joints, simulation.time_ns / NANOSECONDS
         command = controller.command(now, channel.measure(joints.gamma, joints.gamma_dot))
         acting, desired = channel.delayed(command.torque), command.desired
-        rows.append(
-            ((now,) * 3, desired.gamma, desired.gamma_dot, joints.gamma, joints.gamma_dot,
-             command.feedforward, command.feedback, acting)
-        )  # fmt: skip
+        error = axpy(1.0, desired.gamma, -1.0, joints.gamma)
+        error_rate = axpy(1.0, desired.gamma_dot, -1.0, joints.gamma_dot)
+        torques = *command.feedforward, *command.feedback, *acting
+        rows.append((now, *desired.gamma, *desired.gamma_dot, *error, *error_rate, *torques))
         limited.append(command.saturated)
         if math.dist(desired.gamma, joints.gamma) > loop.lost:
             raise ControlStopped(f"off by more than {loop.lost:g} rad", now)
@@ -230,12 +231,7 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
         torque(simulation)  # of the end, which is a sample, too
     except (RunStopped, ControlStopped) as error:
         failure = str(error)
-    table = np.array(rows).reshape(len(rows), 8, 3)
-    time_s, gamma, gamma_dot, at, rate, feedforward, feedback, torques = table.swapaxes(0, 1)
-    track = TrackingRecord(
-        time_s[:, 0], gamma, gamma_dot, gamma - at, gamma_dot - rate, feedforward, feedback, torques
-    )
-    return track, np.array(limited, dtype=bool), failure
+    return TrackingRecord.of_rows(rows), np.array(limited, dtype=bool), failure
 
 
 def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scene:

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.control.controller import INSTANTS, MODES, ControlChannel, ControllerSettings
 from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.law import INSTANTS, MODES, ControlChannel, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sst_ros.control.controller import MODES
+from sst_ros.control.law import MODES
 from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, free_figure, note, styled
 from sst_ros.report.results import provenance
 from studies.sampled_data import ORDERS

@@ -7,7 +7,7 @@ import argparse
 
 from sst_ros import demo
 from sst_ros.cli.commands import free_out, refuse
-from sst_ros.control.controller import MODES
+from sst_ros.control.law import MODES
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures

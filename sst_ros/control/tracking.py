@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.mechanism.geometry import Array
 
@@ -41,6 +41,12 @@ class TrackingRecord:
     feedforward: Array
     feedback: Array
     torque: Array
+
+    @classmethod
+    def of_rows(cls, rows: ArrayLike) -> TrackingRecord:
+        """Return a record of rows of its 22 numbers, in the order of the attributes."""
+        time, *columns = np.split(np.reshape(rows, (-1, 22)), range(1, 22, 3), axis=1)
+        return cls(time[:, 0], *columns)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.control.controller import Command, Measurement
+from sst_ros.control.controller import Measurement
+from sst_ros.control.law import Command
 from sst_ros.control.tracking import tracking_table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sst_ros.control.controller import ControllerSettings
+from sst_ros.control.law import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.scene import share_directory

@@ -16,11 +16,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from sst_ros.control.actuator_motions import through_points
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.controller import Command, Controller, Measurement, command_limit
+from sst_ros.control.controller import Controller, Measurement
+from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, StoppingMotion
 from sst_ros.control.reference_motions import reference_motion
@@ -225,10 +224,8 @@ def _multi_dof(message: Any) -> Iterator[Problem]:
             yield Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
 
 
-_COLUMNS = 22
-"""Numbers of a sample of a `TrackingRecord`."""
-_ROWS = 256
-"""Samples that are added to the tracking metrics at once."""
+_NUMBERS = 256 * 22
+"""Numbers of samples, 22 each, that are added to the tracking metrics at once."""
 
 
 class Stage(Enum):
@@ -400,15 +397,13 @@ class TrajectoryFollower:
         self._rows.append(time)
         for triple in (desired.gamma, desired.gamma_dot, *errors, *torques):
             self._rows.extend(triple)
-        if len(self._rows) >= _ROWS * _COLUMNS:
+        if len(self._rows) >= _NUMBERS:
             self._add_rows()
 
     def _add_rows(self) -> None:
         """Add the samples since the last call to the metrics."""
         if self._rows:
-            rows = np.array(self._rows).reshape(-1, _COLUMNS)
-            time, *columns = np.split(rows, range(1, _COLUMNS, 3), axis=1)
-            self._sums.add(TrackingRecord(time[:, 0], *columns))
+            self._sums.add(TrackingRecord.of_rows(self._rows))
             self._rows = array("d")
 
     def _reference_at_rest(self, seen: Measurement | None) -> Reference:

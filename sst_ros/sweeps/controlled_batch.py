@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.control.controller import (
+from sst_ros.control.controller import Controller
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.law import (
     ControlLaw,
-    Controller,
     Sample,
     bound,
     command_limit,
@@ -29,7 +30,6 @@ from sst_ros.control.controller import (
     feedback_gains,
     is_above,
 )
-from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, trace

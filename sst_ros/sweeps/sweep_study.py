@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sst_ros.control.controller import ControlChannel, ControllerSettings
+from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion

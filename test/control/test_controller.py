@@ -8,13 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap, OrientationObserver
-from sst_ros.control.controller import (
-    MODES,
-    Controller,
-    ControllerSettings,
-    ControlStopped,
-    Measurement,
-)
+from sst_ros.control.controller import Controller, ControlStopped, Measurement
+from sst_ros.control.law import MODES, ControllerSettings
 from sst_ros.control.reference_motions import GeodesicMotion
 from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work

@@ -35,13 +35,19 @@ def hand():
     return Hand()
 
 
+@pytest.fixture
+def pacer(hand):
+    """Deadlines 1 ms apart, from now on."""
+    found = Pacer(MS, 1.0, hand)
+    found.start()
+    return found
+
+
 def never():
     return False
 
 
-def test_deadlines_are_absolute(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_deadlines_are_absolute(hand, pacer):
     for k in range(1, 200):
         hand.now += 300_000  # the work of a tick
         assert pacer.wait(never)
@@ -49,9 +55,7 @@ def test_deadlines_are_absolute(hand):
     assert pacer.missed == 0
 
 
-def test_one_sleep_may_end_in_several_ticks(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_one_sleep_may_end_in_several_ticks(hand, pacer):
     assert [Pacer(MS, speed, hand).together for speed in (0.0, 0.5, 1.0, 2.6)] == [1, 1, 2, 5]
     assert Pacer(MS, 1.0, hand, tolerance_ns=200 * MS).together == 1
     assert pacer.wait(never, 2) and hand.now == 7 * MS
@@ -60,9 +64,7 @@ def test_one_sleep_may_end_in_several_ticks(hand):
     assert (pacer.missed, pacer.late_ns) == (1, 1_100_000)
 
 
-def test_an_overrun_drops_time_without_a_burst(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_an_overrun_drops_time_without_a_burst(hand, pacer):
     pacer.wait(never)
     hand.now += 4 * MS + 400_000
     assert pacer.wait(never)
@@ -73,17 +75,13 @@ def test_an_overrun_drops_time_without_a_burst(hand):
     assert pacer.missed == 3
 
 
-def test_lateness_below_a_period_is_no_miss(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_lateness_below_a_period_is_no_miss(hand, pacer):
     hand.now += 1_900_000
     assert pacer.wait(never)
     assert (pacer.missed, pacer.late_ns) == (0, 900_000)
 
 
-def test_what_is_excused_is_no_miss_and_costs_only_what_it_is_late(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_what_is_excused_is_no_miss_and_costs_only_what_it_is_late(hand, pacer):
     for waited, late in ((1_700_000, 0), (2_300_000, 300_000), (100_000, 0)):
         before = hand.now
         hand.now += waited
@@ -146,9 +144,7 @@ def test_a_coarse_clock_is_run_through_and_a_leap_dropped(hand):
     assert pacer.missed == 999
 
 
-def test_a_clock_that_goes_back_starts_anew(hand):
-    pacer = Pacer(MS, 1.0, hand)
-    pacer.start()
+def test_a_clock_that_goes_back_starts_anew(hand, pacer):
     pacer.wait(never)
     hand.now -= 3 * MS
     before = hand.now

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.control.controller import MODES, ControlChannel, ControllerSettings
+from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.report.results import write

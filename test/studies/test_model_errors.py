@@ -8,8 +8,9 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from sst_ros.control.controller import ControlChannel, Measurement
+from sst_ros.control.controller import Measurement
 from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.law import ControlChannel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load

@@ -1,0 +1,402 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control law, and the channel between plant and controller, on numbers of any kind.
+
+The five schemes, with e = desired - measured in gamma:
+
+    feedforward         tau = ID(desired)
+    pd                  tau = K e + D e_dot
+    gravity_pd          tau = K e + D e_dot + G(measured)           Takegaki and Arimoto 1981
+    feedforward_pd      tau = ID(desired) + K e + D e_dot
+    computed_torque     tau = ID(measured state, gamma_ddot + kd e_dot + kp e)
+
+ID is the inverse dynamics (Eq. 90) with all terms of the model, G its gravity torque.
+
+On SO(3) the error of computed_torque is the rotation vector phi = log(R^T R_d) in {E}, and W_dot =
+d/dt(R^T R_d W_d) + kd e_W + kp phi with e_W = R^T R_d W_d - W. As phi is an eigenvector of its own
+differential, kp phi^2 + e_W^2 falls at the rate 2 kd e_W^2 from every error below half a turn
+(Bullo and Murray 1995).
+
+Integral action adds K r times the integral of e. It is frozen while a torque is at its limit and
+the error would drive it further (conditional integration, Astrom and Hagglund 2006, section 3.5).
+
+Floats make it the law of a `Controller`, traced numbers the compiled loop of a batch: it branches
+on settings, never on numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.reference import Reference, ReferenceMotion
+from sst_ros.errors import Problem
+from sst_ros.mechanism.generic_math import (
+    ZERO,
+    Quadruple,
+    Scalar,
+    Triple,
+    add,
+    atan2,
+    axpy,
+    cross,
+    dot,
+    positive,
+    relative_quaternion,
+    rotation_rows,
+    sqrt,
+)
+from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import Section, choice, integer, number
+from sst_ros.state import Vector3
+
+MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
+
+SPACES = ("gamma", "so3")
+
+INSTANTS = ("start", "middle")
+
+_ROUND = 1.5 * 2.0**52
+"""Added and subtracted, it rounds to whole numbers, halves to even."""
+
+
+@dataclass(frozen=True)
+class ControllerSettings(Section):
+    """Mode and gains.
+
+    Gains are of a joint, tau_k = stiffness_k e_k + damping_k e_dot_k with e = desired - measured.
+    By bandwidth they are those of the inertia M_kk that joint k has at the start of the motion:
+    stiffness M_kk bandwidth^2, damping 2 damping_ratio M_kk bandwidth; so pd, gravity_pd and
+    feedforward_pd have equal gains. computed_torque takes them over M_kk, as accelerations.
+    """
+
+    mode: str = choice(
+        "feedforward: torque of the desired motion; feedforward_pd: and feedback; computed_torque: "
+        "the model at the measured state, and feedback; pd: feedback alone; gravity_pd: and the "
+        "weight at the measured position",
+        MODES,
+        default="feedforward",
+    )
+    space: str = choice(
+        "where computed_torque is linear: the actuator angles, or the orientation",
+        SPACES,
+        default="gamma",
+    )
+    bandwidth: float = number(
+        "natural frequency of the error", "rad/s", default=30.0, above=0.0, most=1e6
+    )
+    damping_ratio: float = number(
+        "damping ratio of the error", "1", default=1.0, above=0.0, most=1e3
+    )
+    stiffness: Vector3 = number(
+        "stiffness of the feedback, in place of bandwidth; zeros for that of bandwidth",
+        "N m/rad",
+        shape=(3,),
+        default=(0.0, 0.0, 0.0),
+        least=0.0,
+        most=1e9,
+    )
+    damping: Vector3 = number(
+        "damping of the feedback, in place of damping_ratio; zeros for that of bandwidth",
+        "N m s/rad",
+        shape=(3,),
+        default=(0.0, 0.0, 0.0),
+        least=0.0,
+        most=1e9,
+    )
+    integral_rate: float = number(
+        "integral action: stiffness times this is the torque per sum of errors; 0 for none",
+        "1/s",
+        default=0.0,
+        least=0.0,
+        most=1e6,
+    )
+    torque_limit: float = number(
+        "largest torque that is commanded, beside that of the scene's actuators; 0 for none",
+        "N m",
+        default=0.0,
+        least=0.0,
+        most=1e9,
+    )
+    feedforward_at: str = choice(
+        "instant of a control period whose feedforward is held over it",
+        INSTANTS,
+        default="start",
+    )
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse gains of a joint where there is none."""
+        if self.direct and self.mode == "computed_torque" and self.space == "so3":
+            allowed = "is a joint's: on so3 give bandwidth and damping_ratio"
+            yield Problem("stiffness", self.stiffness, allowed)
+        if self.direct and not any(self.stiffness) and self.integral_rate:
+            yield Problem("integral_rate", self.integral_rate, "acts on stiffness: give it")
+
+    @property
+    def direct(self) -> bool:
+        """Whether the gains are given as such, and not by bandwidth."""
+        return any(self.stiffness) or any(self.damping)
+
+    @property
+    def feeds(self) -> bool:
+        """Whether the torque of the desired motion is part of the command."""
+        return self.mode not in ("pd", "gravity_pd")
+
+    @property
+    def observes(self) -> bool:
+        """Whether the law needs the orientation at the measured angles."""
+        return self.mode in ("gravity_pd", "computed_torque")
+
+
+@dataclass(frozen=True)
+class ControlChannel(Section):
+    """What lies between plant and controller; zeros change nothing.
+
+    Until the first of delayed commands arrives it acts already. An encoder measures no rate: that
+    is the difference of its last two angles over the period. Noise is new at every sample.
+    """
+
+    period: float = number("control period", "s", default=1e-3, least=1e-6, most=1.0)
+    delay: int = integer("delay of commands", "periods", default=0, least=0, most=100)
+    counts: int = integer(
+        "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
+    )
+    angle_noise: float = number(
+        "standard deviation of noise on gamma", "rad", default=0.0, least=0.0, most=1.0
+    )
+    rate_noise: float = number(
+        "standard deviation of noise on gamma_dot", "rad/s", default=0.0, least=0.0, most=1e3
+    )
+
+    def count(self, angle: Scalar) -> Scalar:
+        """Round an angle [rad] to the steps of the encoders."""
+        step = 2.0 * math.pi / self.counts
+        return step * ((angle / step + _ROUND) - _ROUND)
+
+    def measure(
+        self, gamma: Triple, gamma_dot: Triple, before: Any, noise: Any
+    ) -> tuple[Triple, Triple, Any]:
+        """Return the angles and rates that the controller receives, and angles to remember.
+
+        Args:
+            gamma: angles [rad].
+            gamma_dot: rates [rad/s].
+            before: angles to remember of the last sample; none without encoders.
+            noise: six numbers that are added to gamma and gamma_dot; or none.
+
+        """
+        if self.counts:
+            gamma = (self.count(gamma[0]), self.count(gamma[1]), self.count(gamma[2]))
+            moved = axpy(1.0, gamma, -1.0, before)
+            gamma_dot = (moved[0] / self.period, moved[1] / self.period, moved[2] / self.period)
+            before = gamma
+        if noise:
+            gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
+        return gamma, gamma_dot, before
+
+    def transmit(self, command: Triple, queue: Any, first: Scalar) -> tuple[Triple, Any]:
+        """Return the command that acts, and the queue behind it: 3 `delay` numbers.
+
+        `first` is 1 at the first sample, else 0.
+        """
+        pairs = zip(command * self.delay, queue, strict=True)
+        line = (*(first * c + (1.0 - first) * q for c, q in pairs), *command)
+        return (line[0], line[1], line[2]), line[3:]
+
+
+class Sample(NamedTuple):
+    """What the law has at a sample.
+
+    Attributes:
+        desired: the reference.
+        feedforward: torque of the desired motion [N m].
+        held: the same at the instant whose torque is held.
+        gamma, gamma_dot: as measured [rad], [rad/s].
+        observed: orientation at the measured angles, where the law needs it.
+        integral: sum of errors [rad s]; none without integral action.
+
+    """
+
+    desired: Reference
+    feedforward: Triple
+    held: Triple
+    gamma: Triple
+    gamma_dot: Triple
+    observed: Any
+    integral: Any
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the law answers at a sample.
+
+    Attributes:
+        torque: the command [N m]: feedforward + feedback, limited.
+        feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
+        feedback: torque due to the error [N m].
+        desired: the reference at this instant.
+        error, error_rate: desired - measured, of gamma [rad] and gamma_dot [rad/s].
+        integral: the new sum of errors [rad s].
+
+    """
+
+    torque: Vector3
+    feedforward: Vector3
+    feedback: Vector3
+    desired: Reference
+    error: Vector3
+    error_rate: Vector3
+    integral: Any
+
+    @property
+    def total(self) -> Vector3:
+        """The command before it is limited [N m]."""
+        return add(self.feedforward, self.feedback)
+
+    @property
+    def saturated(self) -> bool:
+        """Whether a torque was limited."""
+        return self.torque != self.total
+
+
+class ControlLaw(NamedTuple):
+    """The law of some settings, and its numbers; by joint where there are three.
+
+    Attributes:
+        settings: what it is.
+        torque: inverse dynamics of the model [N m], of quaternion, W and W_dot.
+        accelerate: W and W_dot of the model, of quaternion, gamma_dot and gamma_ddot.
+        kp, kd: gains of accelerations [1/s^2], [1/s].
+        inertia: M_kk at the start of the motion [kg m^2].
+        integral_rate: of the integral action [1/s].
+        limit: of commands [N m]; None for none.
+        period: time from one sample to the next [s].
+
+    """
+
+    settings: ControllerSettings
+    torque: Callable[[Any, Any, Any], Triple]
+    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]
+    kp: Triple
+    kd: Triple
+    inertia: Triple
+    integral_rate: Scalar
+    limit: Scalar | None
+    period: float
+
+    def answer(self, at: Sample) -> Command:
+        """Return the torques at a sample."""
+        mode, feedback, summed = self.settings.mode, ZERO, ZERO
+        feedforward = at.held if self.settings.feeds else ZERO
+        error = axpy(1.0, at.desired.gamma, -1.0, at.gamma)
+        rates = axpy(1.0, at.desired.gamma_dot, -1.0, at.gamma_dot)
+        if mode == "gravity_pd":
+            feedforward = self.torque(at.observed, ZERO, ZERO)
+        if mode == "computed_torque":
+            needed, summed = self._compute_torque(at, error, rates)
+            feedback = axpy(1.0, needed, -1.0, at.feedforward)
+        elif mode != "feedforward":
+            summed = error
+            feedback = _by_joint(self.inertia, self._feed_back(at.integral, error, rates))
+        torque = total = add(feedforward, feedback)
+        weight: Scalar = 1.0
+        if self.limit is not None:
+            torque = bound(total, self.limit)
+            weight = 1.0 - is_above(dot(axpy(1.0, total, -1.0, torque), error))
+        integral = at.integral and axpy(1.0, at.integral, weight * self.period, summed)
+        return Command(torque, feedforward, feedback, at.desired, error, rates, integral)
+
+    def _compute_torque(self, at: Sample, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
+        """Torque of computed_torque, and the error to integrate."""
+        asked = add(at.desired.gamma_ddot, self._feed_back(at.integral, error, rates))
+        body_rate, body_acceleration = self.accelerate(at.observed, at.gamma_dot, asked)
+        if self.settings.space == "so3":
+            between = relative_quaternion(at.observed, at.desired.quaternion)
+            turn = rotation_rows(between)
+            rate, forward = (
+                (dot(turn[0], vector), dot(turn[1], vector), dot(turn[2], vector))
+                for vector in (at.desired.body_rate, at.desired.body_acceleration)
+            )
+            moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
+            error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
+            body_acceleration = add(moving, self._feed_back(at.integral, error, rates))
+        return self.torque(at.observed, body_rate, body_acceleration), error
+
+    def _feed_back(self, integral: Any, error: Triple, rates: Triple) -> Triple:
+        """Acceleration kp e + kd e_dot, with integral action."""
+        leaning = axpy(1.0, error, self.integral_rate, integral) if integral else error
+        return add(_by_joint(self.kp, leaning), _by_joint(self.kd, rates))
+
+
+def _by_joint(factors: Triple, values: Triple) -> Triple:
+    return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
+
+
+def feedback_gains(
+    inertia: Array, value: Callable[[str], Any], direct: bool
+) -> tuple[Array, Array]:
+    """Return gains kp [1/s^2] and kd [1/s] of accelerations, shape (3, n).
+
+    Args:
+        inertia: M_kk, shape (3, 1).
+        value: of a field of `ControllerSettings`, for n loops or for all of them.
+        direct: whether stiffness and damping are given.
+
+    """
+    if direct:
+        kp, kd = (np.reshape(value(name), (3, -1)) / inertia for name in ("stiffness", "damping"))
+        return kp, kd
+    ones, bandwidth = np.ones_like(inertia), value("bandwidth")
+    return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)
+
+
+def command_limit(limit: Any, model: Scene) -> Array:
+    """Return the limit of commands [N m]: the settings', 0 for none, or less by the actuators."""
+    own = model.actuators.torque_limit if model.actuators is not None else None
+    return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own or np.inf)
+
+
+def feed_forward(
+    settings: ControllerSettings,
+    inverse: InverseDynamics,
+    motion: ReferenceMotion,
+    desired: Reference,
+    instant: float,
+) -> tuple[Vector3, Vector3]:
+    """Return the torques of a desired motion [N m]: now, and at the instant [s] that is held."""
+    if not settings.feeds:
+        return ZERO, ZERO
+    now = inverse.reference_torque(desired)
+    if settings.feedforward_at == "start":
+        return now, now
+    return now, inverse.reference_torque(motion.at(instant))
+
+
+def rotation_vector(quaternion: Quadruple) -> Triple:
+    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
+    sign = 2.0 * is_above(quaternion[3]) - 1.0
+    x, y, z, w = (sign * part for part in quaternion)
+    sine = sqrt(x * x + y * y + z * z + 1e-300)
+    factor = 2.0 * atan2(sine, w) / sine
+    return factor * x, factor * y, factor * z
+
+
+def bound(values: Triple, limit: Scalar) -> Triple:
+    """Clamp three numbers to the interval from -limit to limit."""
+    first, second, third = (
+        min(max(value, -limit), limit)
+        if isinstance(value, float)
+        else value - positive(value - limit) + positive(-limit - value)
+        for value in values
+    )
+    return first, second, third
+
+
+def is_above(value: Scalar) -> Scalar:
+    """Return 1 where a number is positive, else 0."""
+    return value.apply("step") if hasattr(value, "apply") else float(value > 0.0)
