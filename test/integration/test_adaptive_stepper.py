@@ -48,22 +48,6 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     assert pairs.get("dopri5", 0) + pairs.get("dop853", 0) < 60
 
 
-def test_auto_turns_to_the_implicit_method_and_tells_when_and_why():
-    scene = replace(
-        EXAMPLE2,
-        friction=viscous(300.0).friction,
-        initial=Initial(gamma=(0.8, 0.8, 0.8), gamma_dot=(0.5, 0.2, -0.3)),
-    )
-    simulation = Simulation(scene, tolerance=1e-9)
-    run(simulation, 0.1, 0.01)
-    assert simulation.method == "rodas4"
-    first = simulation.changes[-1]
-    assert first.reason.startswith("stiff: step times fastest decay is ")
-    assert 0.0 < first.time < 0.1
-    times = [change.time for change in simulation.changes]
-    assert times == sorted(times)
-
-
 def test_auto_returns_to_an_explicit_method_when_accuracy_asks_for_short_steps():
     """A torque that starts anew every 200 microseconds makes steps shorter than the decay."""
     simulation = Simulation(viscous(30.0, 5.0), tolerance=1e-9)

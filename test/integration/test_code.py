@@ -1,44 +1,191 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machine code before it is needed: made once, found by others, one maker at a time."""
+"""Compiled code and its cache: made once by one maker, shared, repaired, done without."""
 
 from __future__ import annotations
 
 import fcntl
+import os
+import subprocess
+import sys
+import warnings
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from loaded_scenes import IGNORE, REST, start_of
 
-from sst_ros.integration import codegen, compiled_method
+from sst_ros.integration import codegen
+from sst_ros.integration.compiled_method import code_is_there, make_code
 from sst_ros.scene.scene import Inertia, Initial, load
+from sst_ros.simulation.simulate_gauss import GaussMotion
+from sst_ros.simulation.simulation import Simulation
 
-pytestmark = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
-EXAMPLE1 = load("example1")
+MILLISECOND = 1_000_000
+SOURCE = """\
+from sst_ros.scene.scene import load
+from sst_ros.simulation.simulation import Simulation
+simulation = Simulation(load("example1"), "rk4", compiled=True)
+print(simulation.step((1.0, 2.0, 3.0), 1_000_000).quaternion, simulation.compiled)
+"""
+needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
 
 
-def test_code_is_made_once_and_found(tmp_path, monkeypatch):
-    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path / "cache"))
-    assert not compiled_method.code_is_there(EXAMPLE1, "rk4")
-    assert list(compiled_method.make_code(EXAMPLE1, "rk4")) == ["rk4"]
-    assert compiled_method.code_is_there(EXAMPLE1, "rk4")
-    assert not compiled_method.code_is_there(EXAMPLE1, "auto")
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb[ic]")}
-    assert list(compiled_method.make_code(EXAMPLE1, "rk4")) == ["rk4"]
-    assert files == {path: path.stat().st_mtime_ns for path in files}
+EXAMPLE1, EXAMPLE2 = load("example1"), replace(load("example2_heavy"), **IGNORE)
+
+
+def heavier(scene):
+    return replace(scene, star=replace(scene.star, inertia=Inertia(xx=0.03, yy=0.04, zz=0.05)))
+
+
+def files_of(folder):
+    """Files of code, and when they were written."""
+    kinds = (".py", ".nbi", ".nbc")
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix in kinds}
+
+
+@needs_numba
+def test_code_is_made_once_found_and_shared_by_what_differs_in_numbers(tmp_path, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    assert not code_is_there(EXAMPLE1, "rk4")
+    assert list(make_code(EXAMPLE1, "rk4")) == ["rk4"]
+    assert code_is_there(EXAMPLE1, "rk4")
+    assert not code_is_there(EXAMPLE1, "auto")
+    files = files_of(tmp_path)
+    assert files and list(make_code(EXAMPLE1, "rk4")) == ["rk4"]
     # Neither where a run starts nor the numbers of its scene are part of its code.
-    heavier = replace(EXAMPLE1.star, inertia=Inertia(xx=0.03, yy=0.04, zz=0.05))
-    for other in ({"initial": Initial(gamma=(0.7, 0.8, 0.9))}, {"star": heavier}):
-        assert compiled_method.code_is_there(replace(EXAMPLE1, **other), "rk4")
-    assert not compiled_method.code_is_there(load("friction"), "rk4")
+    others = [replace(EXAMPLE1, initial=Initial(gamma=(0.7, 0.8, 0.9))), heavier(EXAMPLE1)]
+    ends = set()
+    for scene in (EXAMPLE1, *others):
+        assert code_is_there(scene, "rk4")
+        fast, plain = (Simulation(scene, "rk4", compiled=compiled) for compiled in (True, False))
+        found, expected = (one.step((3.0, -2.0, 1.0), MILLISECOND) for one in (fast, plain))
+        assert fast.compiled and found == expected
+        ends.add(found.body_rate)
+    assert len(ends) == 3
+    assert files_of(tmp_path) == files
+    assert not code_is_there(load("friction"), "rk4")
 
 
+@needs_numba
 def test_one_process_makes_code_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
     with (tmp_path / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert list(compiled_method.make_code(EXAMPLE1, "rk4")) == []
-    assert not compiled_method.code_is_there(EXAMPLE1, "rk4")
+        assert list(make_code(EXAMPLE1, "rk4")) == []
+    assert not code_is_there(EXAMPLE1, "rk4")
 
 
-def test_without_numba_there_is_no_code(monkeypatch):
+@needs_numba
+@pytest.mark.slow
+def test_collocation_of_another_inertia_needs_no_compilation(tmp_path, monkeypatch):
+    monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    made = None
+    for scene in (EXAMPLE2, heavier(EXAMPLE2)):
+        fast, plain = (
+            GaussMotion(scene, scene.torque, start_of(EXAMPLE2), 0.1, 1e-9, compiled=compiled)
+            for compiled in (True, False)
+        )
+        np.testing.assert_allclose(fast.run(), plain.run(), rtol=0, atol=1e-13)
+        made = made or files_of(tmp_path)
+    assert len(made) >= 3 and files_of(tmp_path) == made
+
+
+def started(cache, **more):
+    environment = {**os.environ, "SST_ROS_CACHE": str(cache), **more}
+    return subprocess.Popen(
+        [sys.executable, "-c", SOURCE],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process):
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, err
+    return out.strip(), err
+
+
+@pytest.fixture(scope="module")
+def truth():
+    simulation = Simulation(load("example1"), "rk4")
+    return str(simulation.step((1.0, 2.0, 3.0), MILLISECOND).quaternion)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory, truth):
+    """A cache that two processes have filled at once."""
+    folder = tmp_path_factory.mktemp("cache")
+    processes = [started(folder), started(folder)]
+    for process in processes:
+        assert ended(process)[0] == f"{truth} True"
+    return folder
+
+
+@needs_numba
+@pytest.mark.slow
+def test_two_processes_that_start_at_once_share_one_cache(cache):
+    assert len(list(cache.glob("sst_*.py"))) == 2  # what all methods call, and a method
+    assert {path.suffix for path in cache.iterdir()} == {".py", ""}
+    assert list((cache / "__pycache__").glob("*.nbc"))
+
+
+@needs_numba
+@pytest.mark.slow
+def test_a_second_process_compiles_nothing(cache, truth):
+    before = files_of(cache)
+    assert ended(started(cache))[0] == f"{truth} True"
+    assert files_of(cache) == before
+
+
+def cut_off(cache, pattern, left):
+    files = [*cache.glob(pattern), *(cache / "__pycache__").glob(pattern)]
+    assert files
+    for path in files:
+        os.truncate(path, left)
+    return files
+
+
+@needs_numba
+@pytest.mark.slow
+@pytest.mark.parametrize("left", [40, 0])
+def test_cut_off_files_are_repaired(left, cache, truth):
+    """Source, index and machine code; at the end all can be loaded again."""
+    files = [path for kind in ("sst_*.py", "*.nbi", "*.nbc") for path in cut_off(cache, kind, left)]
+    assert ended(started(cache))[0] == f"{truth} True"
+    assert all(path.stat().st_size > 40 for path in files)
+
+
+@needs_numba
+@pytest.mark.slow
+def test_a_folder_that_cannot_be_written_means_compiling_anew(tmp_path, truth):
+    """A file stands where the folder should be: that stops root too."""
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    assert ended(started(blocked / "cache"))[0] == f"{truth} True"
+
+
+def test_without_numba_plain_python_runs_and_says_so(monkeypatch, truth):
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
-    assert not compiled_method.code_is_there(EXAMPLE1, "rk4")
+    assert not code_is_there(EXAMPLE1, "rk4")
+    with pytest.warns(RuntimeWarning, match="running plain Python, slower, the same digits"):
+        simulation = Simulation(load("example1"), "rk4", compiled=True)
+    assert not simulation.compiled
+    assert str(simulation.step((1.0, 2.0, 3.0), MILLISECOND).quaternion) == truth
+
+
+def test_a_numba_that_cannot_be_imported_is_none(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert codegen.numba_version() is None
+    with pytest.warns(RuntimeWarning, match="no numba"):
+        assert not Simulation(load("example1"), compiled=True).compiled
+
+
+def test_who_does_not_ask_for_numba_is_not_warned(monkeypatch):
+    monkeypatch.setenv("SST_ROS_NUMBA", "0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulation = Simulation(load("example1"))
+        simulation.step(REST, MILLISECOND)
+    assert not simulation.compiled
