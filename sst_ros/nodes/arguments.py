@@ -41,11 +41,6 @@ COMMANDS: dict[str, tuple[str, type[Section]]] = {
 """Class of `nodes.COMMAND` that does the work of each node sst_COMMAND, and its parameters."""
 
 
-def wants_help(words: Sequence[str]) -> bool:
-    """Whether the words (without the program's name) ask for help."""
-    return "-h" in words or "--help" in words
-
-
 def help_text(command: str) -> str:
     """Return the parameters of a node with defaults, units and bounds."""
     return _parser(command).format_help().rstrip()

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import threading
 from array import array
-from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -23,8 +22,7 @@ from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
-from sst_ros.nodes.topics import ActionGoal
-from sst_ros.nodes.torque_commands import TorqueCommands
+from sst_ros.nodes.topics import ActionGoal, TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -61,13 +59,19 @@ _SPIN_S = 0.01
 
 
 class InverseDynamicsController:
-    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`."""
+    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`.
+
+    Attributes:
+        follower: follows the motion.
+        parameters: those of the node.
+
+    """
 
     def __init__(self) -> None:
         self.node = Node("sst_inverse_dynamics")
         self.done = threading.Event()
-        given = self._parameters = parameters.declare(self.node, ControllerNodeParameters)
-        self._follower = TrajectoryFollower(scene.load(given.scene), given)
+        given = self.parameters = parameters.declare(self.node, ControllerNodeParameters)
+        self.follower = TrajectoryFollower(scene.load(given.scene), given)
         self._commands = TorqueCommands(self.node, given)
         own = topics.CONTROLLER
         self._reference = own["reference"].publisher(self.node)
@@ -79,9 +83,7 @@ class InverseDynamicsController:
         own["phase"].subscription(self.node, self._hear, simulator=given.simulator)
         own["joint_states"].subscription(self.node, self._answer)
         own["joint_trajectory"].subscription(self.node, self._replace)
-        self._goals = FollowJointTrajectoryServer(
-            self.node, self._follower, given, self._take, self._refuse
-        )
+        self._goals = FollowJointTrajectoryServer(self)
         every(self.node, 0.5, self._watch)
         every(self.node, 1.0, self._report)
 
@@ -103,7 +105,7 @@ class InverseDynamicsController:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._goals.interrupt("the simulator was reset")
             self._print()
-            self._follower.restart()
+            self.follower.restart()
             self._began = False
 
     def _answer(self, state: JointState) -> None:
@@ -114,25 +116,25 @@ class InverseDynamicsController:
             return
         stamp_ns = self._commands.answer_to(state)
         if stamp_ns == 0:
-            command = None if self._began else self._follower.preview(self._seen)
+            command = None if self._began else self.follower.preview(self._seen)
             if command is not None:
                 self._commands.send(command.torque)
             return
-        command = self._follower.answer(stamp_ns, self._seen)
+        command = self.follower.answer(stamp_ns, self._seen)
         if command is None:
             return
         self._began = True
         self._commands.send(command.torque)
         self._publish(state, command)
         self._goals.sample(state, self._seen, command)
-        if self._follower.stage is Stage.ENDED:
+        if self.follower.stage is Stage.ENDED:
             self.done.set()
 
     def _has_subscribers(self) -> bool:
         """Whether the subscribers are there that the parameters ask for."""
         if self._began or not self._commands.has_subscribers():
             return self._began
-        recorded = (self._reference, self._error) if self._parameters.wait_for_recorder else ()
+        recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in recorded)
 
     def _measure(self, state: JointState) -> Measurement:
@@ -169,16 +171,16 @@ class InverseDynamicsController:
 
     def _replace(self, trajectory: JointTrajectory) -> None:
         """Follow a trajectory of the topic, and no goal any more."""
-        if self._take(trajectory):
+        if self.take(trajectory):
             self._goals.interrupt("replaced by a trajectory of ~/joint_trajectory")
 
-    def _take(self, trajectory: JointTrajectory) -> bool:
+    def take(self, trajectory: JointTrajectory) -> bool:
         """Follow a trajectory, or log why not; return whether it is followed."""
         try:
-            tracking = self._follower.tracking()
-            self._follower.take(trajectory, self._seen)
+            tracking = self.follower.tracking()
+            self.follower.take(trajectory, self._seen)
         except SstError as error:
-            self._refuse(error)
+            self.refuse(error)
             return False
         finally:
             self._commands.restart_timeout()  # no message could be received during the check
@@ -187,9 +189,9 @@ class InverseDynamicsController:
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
         return True
 
-    def _refuse(self, error: SstError) -> None:
+    def refuse(self, error: SstError) -> None:
         """Count, log and publish a refusal."""
-        self._follower.refuse(error)
+        self.follower.refuse(error)
         self.node.get_logger().error(f"trajectory refused: {error}")
         self._report()
 
@@ -201,12 +203,12 @@ class InverseDynamicsController:
 
     def _report(self) -> None:
         """Publish the diagnostics."""
-        follower = self._follower
+        follower = self.follower
         rms, largest = follower.errors
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         counts = follower.samples, follower.irregular, follower.limited
         refusals = follower.refused, follower.last_refusal
-        row = (stage, self._parameters.mode, *counts, rms, largest, *refusals)
+        row = (stage, self.parameters.mode, *counts, rms, largest, *refusals)
         values: dict[str, object] = dict(zip(KEYS, row, strict=True))
         doubts = [
             words
@@ -223,7 +225,7 @@ class InverseDynamicsController:
 
     def _print(self) -> None:
         """Print the tracking errors of the last motion."""
-        if (tracking := self._follower.tracking()) is not None:
+        if (tracking := self.follower.tracking()) is not None:
             print(tracking_table(tracking), flush=True)
 
 
@@ -235,33 +237,16 @@ class _ActiveGoal(ActionGoal):
 
 
 class FollowJointTrajectoryServer:
-    """Serves the action: goals for a `TrajectoryFollower`, one at a time.
+    """Serves the action: goals for the follower of a controller, one at a time."""
 
-    Args:
-        node: the node.
-        follower: follows the trajectories.
-        settings: default tolerances.
-        take: checks and takes a trajectory; returns whether it is followed.
-        refuse: logs why a goal is refused.
-
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        follower: TrajectoryFollower,
-        settings: ControllerNodeParameters,
-        take: Callable[[JointTrajectory], bool],
-        refuse: Callable[[SstError], None],
-    ) -> None:
-        self._node, self._follower, self._settings = node, follower, settings
-        self._take, self._refuse = take, refuse
+    def __init__(self, controller: InverseDynamicsController) -> None:
+        self._controller, self._follower = controller, controller.follower
         self._active: _ActiveGoal | None = None
         self._accepted: TrajectoryGoal | None = None
         if FollowJointTrajectory is None:
             return
         self._server: Any = ActionServer(
-            node,
+            controller.node,
             FollowJointTrajectory,
             topics.CONTROLLER["follow_joint_trajectory"].name,
             lambda _: FollowJointTrajectory.Result(),
@@ -269,7 +254,7 @@ class FollowJointTrajectoryServer:
             handle_accepted_callback=self._begin,
             cancel_callback=self._cancel,
         )
-        every(node, _FEEDBACK_PERIOD_S, self._report)
+        every(controller.node, _FEEDBACK_PERIOD_S, self._report)
 
     def sample(self, state: JointState, measured: Measurement, command: Command) -> None:
         """Test the tolerances of the active goal at a sample of the run that was answered."""
@@ -293,7 +278,7 @@ class FollowJointTrajectoryServer:
 
     def close(self) -> None:
         """Abort the active goal and deliver its result."""
-        executor = self._node.executor
+        executor = self._controller.node.executor
         if self._active is None or executor is None:
             return
         self.interrupt("the controller ends")
@@ -303,11 +288,12 @@ class FollowJointTrajectoryServer:
 
     def _check(self, goal: Any) -> GoalResponse:
         try:
-            self._accepted = TrajectoryGoal(goal, self._settings)
+            self._accepted = TrajectoryGoal(goal, self._controller.parameters)
         except SstError as error:
-            self._refuse(error)
+            self._controller.refuse(error)
             return GoalResponse.REJECT
-        return GoalResponse.ACCEPT if self._take(goal.trajectory) else GoalResponse.REJECT
+        taken = self._controller.take(goal.trajectory)
+        return GoalResponse.ACCEPT if taken else GoalResponse.REJECT
 
     def _begin(self, handle: Any) -> None:
         self.interrupt("preempted by a new goal")
@@ -328,7 +314,7 @@ class FollowJointTrajectoryServer:
     def _end(self, code: ErrorCode, message: str) -> None:
         active, self._active = self._active, None
         assert active is not None
-        self._node.get_logger().info(f"follow_joint_trajectory: {message}")
+        self._controller.node.get_logger().info(f"follow_joint_trajectory: {message}")
         result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
         active.end(result, success=code is ErrorCode.SUCCESSFUL)
 

@@ -71,7 +71,7 @@ def run(words: Sequence[str]) -> int:
     """
     signals.handle()
     command, *given = words
-    if arguments.wants_help(given):
+    if {"-h", "--help"} & set(given):
         print(arguments.help_text(command))
         return 0
     configure_middleware()

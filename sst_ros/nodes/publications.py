@@ -274,15 +274,8 @@ class SimulatorTopics:
         self._clock = PublishedClock(node) if given.publish_clock else None
         history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
-        self._joints, self._orientation, self._euler, self._torques = (
-            topic.publisher(node, depth)
-            for topic in (
-                own["joint_states"],
-                own["orientation"],
-                own["euler_zyz"],
-                own["applied_torques"],
-            )
-        )
+        names = ("joint_states", "orientation", "euler_zyz", "applied_torques")
+        *self._shown, self._torques = (own[name].publisher(node, depth) for name in names)
         self._read: list[Publisher[Any]] = []
         self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
@@ -368,7 +361,7 @@ class SimulatorTopics:
             joints, torque = (*joints[:9], *_AT_REST), ZERO
         self._count_subscribers(0)
         for publisher, message in self._messages(self._idles):
-            at = stamp(stamp_ns if publisher is self._joints else 0)
+            at = stamp(stamp_ns if publisher is self._shown[0] else 0)
             publisher.publish(message(at, (quaternion, joints, torque)))
 
     def publish_phase(self, phase: str) -> None:
@@ -389,14 +382,13 @@ class SimulatorTopics:
         now = time.monotonic_ns()
         if now - self._counted_ns >= age_ns:
             self._counted_ns = now
-            every = (self._joints, self._orientation, self._euler, self._torques)
+            every = (*self._shown, self._torques)
             self._read = [topic for topic in every if topic.get_subscription_count()]
             self._states = self._messages(self._samples)
 
     def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], Message]]:
         """Messages of a state whose topics have subscribers."""
-        publishers = (self._joints, self._orientation, self._euler)
-        pairs = zip(publishers, (of.joint_states, of.orientation, of.euler_zyz), strict=True)
+        pairs = zip(self._shown, (of.joint_states, of.orientation, of.euler_zyz), strict=True)
         return [pair for pair in pairs if pair[0] in self._read]
 
     def _find_publishers(self, names: tuple[str, ...]) -> list[Publisher[Any]]:

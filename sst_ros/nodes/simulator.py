@@ -187,10 +187,10 @@ class Simulator:
         own = self.node.get_fully_qualified_name()
         commands = [topics.SIMULATOR[name].at(own) for name in ("commands", "commands_stamped")]
         publishers = sum(map(self.node.count_publishers, commands))
-        level, text, news = self._diagnostics.status(publishers, [*self._warnings(commands)])
+        values = self._diagnostics.values(publishers)
+        level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
-        values = self._diagnostics.values(publishers)
         message = topics.diagnostics(self.node, "run", _LEVELS[level], text, values)
         self._topics.diagnostics.publish(message)
         scheduling.tidy()

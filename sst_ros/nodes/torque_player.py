@@ -17,7 +17,7 @@ from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
-from sst_ros.nodes.torque_commands import TorqueCommands
+from sst_ros.nodes.topics import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.simulation.torque_profile import TorqueTable

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sst_ros.dynamics.limits import limits_of
 from sst_ros.host import scheduling
@@ -17,6 +17,8 @@ from sst_ros.simulation.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
 _ROWS = 16
+_COUNTS = ("commands_dropped", "commands_clamped", "command_timeouts", "ticks_missed")
+"""Keys of what is warned of when it has grown."""
 
 GAUGES = {
     "error_estimate": "estimated error of the orientation [rad]",
@@ -93,13 +95,13 @@ class RunDiagnostics:
         self.gauges: dict[str, object] = {}
         self.scheduling, self.cpu_dma_latency = "", scheduling.NO_LIMIT
         self._before = (0, 0.0)
-        self._noted = (0, 0, 0, 0)
+        self._noted: tuple[int, ...] = (0, 0, 0, 0)
         self._warned: list[str] = []
         self._rows: list[TableRow] = []
         self._last: TableRow | None = None
         self._count, self._stride = 0, 1
 
-    def values(self, publishers: int) -> dict[str, object]:
+    def values(self, publishers: int) -> dict[str, Any]:
         """Return the value of each key that has one."""
         count, commands = self._loop.counters, self._input
         ticks, wall, factor = count.ticks, count.wall_s, 0.0
@@ -147,34 +149,41 @@ class RunDiagnostics:
             self._keep_row(ticks * self._period_s, ticks * self._period_s / wall if wall else 0.0)
         return values
 
-    def status(self, publishers: int, warnings: list[str]) -> tuple[int, str, list[str]]:
-        """Return the level, the status in a few words, and what is new to warn of."""
-        commands, loop = self._input, self._loop
-        now = (commands.dropped, commands.clamped, commands.timeouts, self._pacer.missed)
+    def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
+        """Return the level, the status in a few words, and what is new to warn of.
+
+        Args:
+            values: as `values` has just read them. What the thread of the run counts meanwhile is
+                told the next time: words and values of one message never contradict each other.
+            warnings: of the graph.
+
+        """
+        running, fault = values["phase"] == Phase.RUNNING.value, values["fault"]
+        now = tuple(values[key] for key in _COUNTS)
         dropped, clamped, timeouts, missed = (
             after - before for after, before in zip(now, self._noted, strict=True)
         )
         self._noted = now
         news = []
         if dropped:
-            news.append(f"command dropped: {commands.last_refusal} ({commands.dropped} in all)")
+            news.append(f"command dropped: {self._input.last_refusal} ({now[0]} in all)")
         if clamped:
-            news.append(f"commands clamped to the scene's torque limit ({commands.clamped} in all)")
+            news.append(f"commands clamped to the scene's torque limit ({now[1]} in all)")
         if timeouts:
-            news.append(f"no command within command_timeout: not held ({commands.timeouts} in all)")
-        if publishers > 1:
+            news.append(f"no command within command_timeout: not held ({now[2]} in all)")
+        if (publishers := values["command_publishers"]) > 1:
             news.append(f"{publishers} publishers of commands: the last message wins")
         news += [warning for warning in warnings if warning not in self._warned]
         self._warned = warnings
         doubts = [*news, *(warning for warning in warnings if warning not in news)]
         if missed:
             doubts.append(f"{missed} ticks missed")
-        if commands.stale and loop.phase is Phase.RUNNING:
+        if self._input.stale and running:
             doubts.append("the command is too old")
-        if loop.fault:
-            return ERROR, loop.fault, news
-        text = loop.phase.value
-        if loop.phase is Phase.RUNNING and not commands.begun:
+        if fault:
+            return ERROR, fault, news
+        text = values["phase"]
+        if running and values["command_age_s"] == "none":
             text += ", no command yet: zero torque"
         return (WARN, f"{text}; {'; '.join(doubts)}", news) if doubts else (OK, text, news)
 

@@ -14,6 +14,7 @@ from sst_ros import load_scene
 from sst_ros.errors import RunStopped
 from sst_ros.integration import codegen
 from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
+from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
@@ -525,6 +526,19 @@ def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(waits, phase):
             assert loop.ask(request).success
         assert loop.ask(partial(loop.pause, False)) == Reply(True, phase.value)
         assert loop.phase is phase
+
+
+def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
+    """The run goes on while they are read: what is not in the values is told the next time."""
+    bench = Bench(wait_for_command=True)
+    pacer = Pacer(1_000_000, 0.0, SteadyTime())
+    diagnostics = RunDiagnostics(bench.loop, bench.input, pacer, 1e-3)
+    before = diagnostics.values(1)
+    bench.loop.phase, bench.input.timeouts, bench.input.begun = Phase.RUNNING, 1, True
+    assert diagnostics.status(before, []) == (OK, "waiting", [])
+    level, text, news = diagnostics.status(diagnostics.values(1), [])
+    assert level == WARN and text.startswith("running; no command within command_timeout")
+    assert len(news) == 1
 
 
 def test_simulation_interfaces_are_the_same_machine():
