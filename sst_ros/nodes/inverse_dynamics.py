@@ -79,7 +79,7 @@ class InverseDynamicsController:
         self._diagnostics = own["diagnostics"].publisher(self.node)
         self._seen: Measurement | None = None
         self._places: tuple[list[str], list[int]] = ([], [])
-        self._began = self._finished = False
+        self._began = self._finished = self._heard = False
         own["phase"].subscription(self.node, self._hear, simulator=given.simulator)
         own["joint_states"].subscription(self.node, self._answer)
         own["joint_trajectory"].subscription(self.node, self._replace)
@@ -96,12 +96,17 @@ class InverseDynamicsController:
         self._print()
 
     def _hear(self, phase: String) -> None:
-        """End with the simulator; begin anew when it does."""
+        """End with the simulator; begin anew when it does.
+
+        The first phase that is heard is no news: discovery may find this topic after joint_states,
+        and the simulator's "waiting" then comes after the first samples of the run.
+        """
+        news, self._heard = self._heard, True
         if phase.data.startswith("fault") and self._began:
             raise SstError(f"the simulator stopped: {phase.data}")
         if phase.data == "finished" and self._began:
             self._finished = True
-        if phase.data == "waiting" and self._began:
+        if phase.data == "waiting" and self._began and news:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._goals.interrupt("the simulator was reset")
             self._print()

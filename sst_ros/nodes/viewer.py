@@ -125,7 +125,7 @@ class Viewer:
             self.scene = yaml_document.read(Scene, message.data, self._parameters.simulator)
 
     def _take_phase(self, message: String) -> None:
-        if message.data == "waiting":
+        if message.data == "waiting" and self._phase:  # the first that is heard is no news
             self._restart()
         self._phase = message.data
 

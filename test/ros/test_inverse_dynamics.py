@@ -7,12 +7,14 @@ import signal
 import numpy as np
 import pytest
 from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros.conftest import COMMANDS, NAMES
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros import demo
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.recording import recording
 from sst_ros.report import tracking
 from sst_ros.scene import scene, yaml_document
@@ -213,6 +215,33 @@ def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_p
     controller = nodes.run("inverse_dynamics", scene=model, stamped="true")
     status, out, err = nodes.ended(controller, 60)
     assert status == 1 and "the simulator stopped: fault: " in err and "error, largest" in out
+
+
+def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
+    """A busy machine may find the topic of the phase after the first samples of the run."""
+    path = written(tmp_path)
+    motion = reference_motion(scene.load(str(path)))
+    observer.listen(Float64MultiArray, COMMANDS)
+    reference = observer.listen(JointState, f"{NODE}/reference")
+    nodes.run("inverse_dynamics", scene=path, mode="pd")
+    states = observer.publisher(JointState, "/joint_states")
+    observer.publish_until(states, idle(2_000_000), lambda: reference, "an answer")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    phases = observer.node.create_publisher(String, "/sst_simulator/phase", latched)
+
+    def say(phase, last_ns):
+        """Tell a phase, then ten samples that are answered; return the last reference."""
+        phases.publish(String(data=phase))
+        observer.until(phases.get_subscription_count, "the controller")
+        assert phases.wait_for_all_acked()
+        for stamp in range(last_ns - 18_000_000, last_ns + 1, 2_000_000):
+            states.publish(idle(stamp))
+            observer.until(lambda stamp=stamp: observer.stamp(reference[-1]) == stamp, "answer")
+        return list(reference[-1].position)
+
+    assert say("waiting", 22_000_000) == list(motion.at(0.02).gamma)
+    assert say("running", 42_000_000) == list(motion.at(0.04).gamma)
+    assert say("waiting", 62_000_000) != list(motion.at(0.06).gamma)
 
 
 def test_what_is_not_finite_ends_it_with_zero_torque(nodes, observer, tmp_path):

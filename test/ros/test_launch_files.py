@@ -112,22 +112,33 @@ def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
     assert str(tmp_path / "bag") in again.text or "'bag'" in again.text
 
 
-def test_the_run_of_the_readme_ends(launch):
-    run = launch("simulate.launch.py", "scene:=example2", "play:=true")
-    assert run.ended() == 0, run.text
+def without(package):
+    return pytest.mark.skipif(installed(package), reason=f"of an installation without {package}")
 
 
-def test_without_an_end_the_launch_ends_with_the_profile(launch):
-    run = launch("simulate.launch.py", "play:=true", "duration:=0.0", "sync:=lockstep")
-    assert run.ended() == 0, run.text
-    assert "the profile of 1 s is played" in run.text
+NEEDS = r"this needs the ROS package\(s\) .*"
 
 
-def test_a_scene_without_a_profile_ends_the_launch_in_an_error(launch):
-    run = launch("simulate.launch.py", "scene:=swing", "play:=true")
-    assert run.ended() == 1
-    assert "must have torque and duration" in run.text
-    assert "torque_player failed with exit status 1" in run.text
+@pytest.mark.parametrize(
+    ("name", "words", "status", "said"),
+    [
+        ("simulate", "scene:=example2 play:=true", 0, "finished"),  # that of the README
+        ("simulate", "play:=true duration:=0.0 sync:=lockstep", 0, "the profile of 1 s is played"),
+        ("simulate", "scene:=swing play:=true", 1, "must have torque and duration"),
+        ("simulate", "scene:=swing play:=true", 1, "torque_player failed with exit status 1"),
+        pytest.param("view", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
+        pytest.param("simulate", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
+        pytest.param("ros2_control", "", 1, f"{NEEDS}controller_manager",
+                     marks=without("controller_manager")),
+        ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; known: scene"),
+    ],
+)  # fmt: skip
+def test_how_a_launch_ends(launch, name, words, status, said):
+    run = launch(f"{name}.launch.py", *words.split())
+    assert run.ended() == status, run.text
+    assert re.search(said, run.text), run.text
+    refused = said.startswith(NEEDS) or "no such argument" in said
+    assert ("process started" in run.text) != refused
 
 
 def test_a_part_that_dies_ends_the_launch_in_an_error(launch):
@@ -238,31 +249,7 @@ def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch
 def test_no_launch_file_is_left_out():
     text = Path(__file__).read_text(encoding="utf-8")
     found = {path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py")}
-    assert found and all(f'"{name}"' in text for name in found)
-
-
-@pytest.mark.skipif(installed("rviz2"), reason="for a ROS installation without RViz")
-@pytest.mark.parametrize("name", ["view.launch.py", "simulate.launch.py"])
-def test_rviz_without_its_packages_starts_nothing(launch, name):
-    run = launch(name, "rviz:=true")
-    assert run.ended() == 1
-    assert re.search(r"needs the ROS package\(s\) .*rviz2", run.text)
-    assert "process started" not in run.text
-
-
-@pytest.mark.skipif(installed("controller_manager"), reason="of a ROS installation without it")
-def test_ros2_control_without_its_packages_starts_nothing(launch):
-    run = launch("ros2_control.launch.py")
-    assert run.ended() == 1
-    assert re.search(r"needs the ROS package\(s\) .*controller_manager", run.text)
-    assert "process started" not in run.text
-
-
-def test_an_unknown_argument_is_refused(launch):
-    run = launch("simulate.launch.py", "scen:=swing")
-    assert run.ended() == 1
-    assert "scen:=swing: no such argument; known: scene" in run.text
-    assert "process started" not in run.text
+    assert found and all(f'"{name.partition(".")[0]}' in text for name in found)
 
 
 @needs_rosbag2
