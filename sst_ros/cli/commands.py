@@ -97,7 +97,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--method", "integrator; default: auto", default="auto"),
         Arg("--tolerance", "allowed error [rad]; default: 1e-9", type=float, default=1e-9),
         Arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
-        _path("--out", "trajectory, .parquet or .csv", metavar="FILE"),
+        _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
         _flag("--force", "overwrite earlier results"),
         description="Simulate a scene under its own torques. Exit status 1 if the motion ended "

@@ -20,6 +20,7 @@ from sst_ros.extras import require
 from sst_ros.host import child_process
 from sst_ros.host.cache_folder import cache_folder, configured_folder
 from sst_ros.host.output import require_free
+from sst_ros.host.table_file import SUFFIXES
 from sst_ros.integration import codegen, compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
@@ -31,7 +32,6 @@ from sst_ros.simulation.simulation import INTEGRATORS, Simulation
 from sst_ros.view.source import Replay, simulator
 
 PICTURES = (".png", ".pdf", ".svg")
-TABLES = (".parquet", ".csv")
 MOST_SAMPLES = 10_000_000
 ROUNDING = 1e-6
 """Relative rounding of inertias that a person has typed."""
@@ -133,10 +133,11 @@ def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
     out, picture = options.out, None
     if out is not None:
-        if out.suffix not in TABLES:
-            refuse(options, "--out", str(out), f"must end in {' or '.join(TABLES)}")
+        if out.suffix not in SUFFIXES:
+            refuse(options, "--out", str(out), f"must end in {' or '.join(SUFFIXES)}")
         free_out(options, out)
-        require("pyarrow" if out.suffix == ".parquet" else "pandas")
+        if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(out.suffix):
+            require(library)
     if options.samples is not None and not 1 <= options.samples <= MOST_SAMPLES:
         allowed = f"must be a whole number from 1 to {MOST_SAMPLES}"
         refuse(options, "--samples", options.samples, allowed)
