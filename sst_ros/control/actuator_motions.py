@@ -13,7 +13,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,9 +36,6 @@ from sst_ros.mechanism.generic_math import axpy, multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.motions import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
-
-if TYPE_CHECKING:
-    from sst_ros.simulation.trajectory import Trajectory
 
 Path = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 """Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
@@ -254,22 +251,30 @@ def through_points(
     )
 
 
-def through_samples(geometry: Geometry, motion: Trajectory) -> ReferenceMotion:
-    """Return a motion from its first sample on, quintic between samples; its ends may move.
+def through_samples(
+    geometry: Geometry, start: Quaternion, times: Array, positions: Array, velocities: Array
+) -> ReferenceMotion:
+    """Return the motion through dense samples, quintic between them; it may begin and end moving.
+
+    Args:
+        geometry: base triangle and star.
+        start: quaternion (x, y, z, w) of {E} in {B} at the first sample.
+        times: of the samples, rising [s], shape (n,); the motion begins with the first.
+        positions: gamma [rad], shape (n, 3).
+        velocities: gamma_dot [rad/s], shape (n, 3).
 
     Raises:
-        AssemblyError: the recording is of another manipulator.
+        AssemblyError: the samples are of another manipulator.
         SingularConfiguration: the motion meets a parallel singularity.
 
     """
-    times = motion.t - motion.t[0]
-    gamma = np.unwrap(motion.gamma, axis=0)
+    times = times - times[0]
+    gamma = np.unwrap(positions, axis=0)
     free = np.full_like(gamma, np.nan)
     # Samples lie much denser than the motion turns: several make one piece.
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    spline = Quintic(times, gamma, motion.gamma_dot, free)
-    x, y, z, w = motion.quaternion[0].tolist()
-    return ActuatorMotion(geometry, cast("Path", spline.at), pieces, (x, y, z, w))
+    spline = Quintic(times, gamma, velocities, free)
+    return ActuatorMotion(geometry, cast("Path", spline.at), pieces, start)
 
 
 def follow_assembly(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 from scipy.spatial.transform import Rotation
 
@@ -33,18 +33,15 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
 
-if TYPE_CHECKING:
-    from sst_ros.simulation.trajectory import Trajectory
-
 
 def reference_motion(
-    scene: Scene, read_motion: Callable[[str], Trajectory] | None = None
+    scene: Scene, read_motion: Callable[[str], Any] | None = None
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
     Args:
         scene: has a `motion`.
-        read_motion: reads a bag by its path, as `recording.recording.read_motion` does.
+        read_motion: reads a bag as a `Trajectory`, as `recording.recording.read_motion` does.
 
     Raises:
         InputError: the scene has no motion, or one that cannot be made; see `through_points`.
@@ -60,7 +57,9 @@ def reference_motion(
         if read_motion is None:
             allowed = "a recorded motion cannot be read here"
             raise InputError(scene.name, [Problem("motion.recorded", motion.recorded.bag, allowed)])
-        return through_samples(geometry, read_motion(motion.recorded.bag))
+        found = read_motion(motion.recorded.bag)
+        x, y, z, w = found.quaternion[0].tolist()
+        return through_samples(geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot)
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
     start = (x, y, z, w)

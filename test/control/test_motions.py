@@ -40,7 +40,6 @@ from sst_ros.scene.motions import (
 )
 from sst_ros.scene.scene import Initial, Scene, load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.simulation.trajectory import Trajectory
 
 START = (0.75, 0.7, 0.75)
 POINTS = ((0.4, (0.8, 0.75, 0.8)), (0.9, (0.9, 0.55, 0.7)), (1.6, (0.6, 0.8, 0.65)))
@@ -250,15 +249,12 @@ def test_a_recorded_motion_is_what_was_recorded():
     simulation, period = Simulation(scene, tolerance=1e-13), 2_000_000
     torque = (0.5, -0.4, 0.3)
     states = [simulation.state, *(simulation.step(torque, period) for _ in range(100))]
-    samples = Trajectory(
-        scene,
-        [state.time_ns * 1e-9 for state in states],
-        [state.quaternion for state in states],
-        [state.body_rate for state in states],
-        [state.torque for state in states],
-        joints=[np.ravel(state.joints) for state in states],
+    times = np.array([state.time_ns * 1e-9 for state in states])
+    joints = [state.joints for state in states]
+    gamma, gamma_dot = (
+        np.array([getattr(one, k) for one in joints]) for k in ("gamma", "gamma_dot")
     )
-    motion = through_samples(Geometry.of(scene), samples)
+    motion = through_samples(Geometry.of(scene), states[0].quaternion, times, gamma, gamma_dot)
     again, worst = Simulation(scene, tolerance=1e-13), []
     for _ in range(100):
         middle = again.step(torque, period // 2)
