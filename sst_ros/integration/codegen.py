@@ -81,6 +81,17 @@ def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
         drive: numbers in the drive.
         more: further arguments, which `rhs` has as well.
 
+    Of RK4, three of its lines a stage and the last ones:
+
+        def step(t, h, y0, y1, ..., d0, d1, d2, p):
+            k0_0, k0_1, ... = rhs(t, y0, y1, ..., d0, d1, d2, p)
+            s0 = y0 + h * (0.5 * k0_0)
+            s1 = y1 + h * (0.5 * k0_1)
+            k1_0, k1_1, ... = rhs(t + 0.5 * h, s0, s1, ..., d0, d1, d2, p)
+            n0 = y0 + h * (0.16666666666666666 * k0_0 + 0.3333333333333333 * k1_0 + ...)
+            e0 = 0.0
+            return (n0, n1, ..., e0, e1, ...,)
+
     """
     y, d = _names("y", size), [*_names("d", drive), *more]
     lines = [f"def step({', '.join(['t', 'h', *y, *d])}):"]

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of one scene by one method, on plain floats or compiled."""
+"""The steps of one scene by one method, on plain floats or compiled.
+
+Code is made once for each method and each structure of a scene - its terms, and which numbers are 0
+or 1 - which takes seconds, and kept in `cache_folder()`; to load it takes tenths of a second.
+"""
 
 from __future__ import annotations
 
@@ -247,7 +251,7 @@ class CompiledMethod:
         return self._listed(new)
 
 
-def has_code(
+def has_step_code(
     system: ODE, method: Method, functions: Sequence[str] = ("step_pair", "step_many")
 ) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
@@ -354,7 +358,7 @@ def code_is_there(scene: Scene, integrator: str) -> bool:
     if codegen.numba_version() is None:
         return False
     system = ode_with_work(Dynamics.of(scene))
-    return all(has_code(system, method) for method in _methods(integrator))
+    return all(has_step_code(system, method) for method in _methods(integrator))
 
 
 def make_code(scene: Scene, integrator: str) -> Iterator[str]:
@@ -370,7 +374,7 @@ def make_code(scene: Scene, integrator: str) -> Iterator[str]:
         except BlockingIOError:
             return
         for method in _methods(integrator):
-            if not has_code(system, method):
+            if not has_step_code(system, method):
                 size, drive = len(system.state), (0.0,) * len(system.drive)
                 y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
                 machine = CompiledMethod(system, method, compiled=True)

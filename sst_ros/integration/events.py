@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop.
 
-The force of an elastic stop has a kink where contact begins and ends, so steps end there.
+The force of an elastic stop has a kink where contact begins and ends, so steps end there. Batches
+and collocation look at distances that are traced, without an inverse tangent.
 """
 
 from __future__ import annotations

@@ -98,7 +98,8 @@ class Collocation:
         ode: what is integrated.
         nodes: of a step; the order is twice as many.
         limits: `limit_distances` of the first seven numbers, monitored at all nodes, or none.
-        compiled: by numba; otherwise, or where there is no numba, as plain Python.
+        compiled: by numba; otherwise, or where there is no numba, as plain Python. None compiles
+            nothing, and takes machine code that is there already.
 
     Raises:
         InputError: nodes is less than 1.
@@ -111,15 +112,18 @@ class Collocation:
         nodes: int = NODES,
         *,
         limits: Program | None = None,
-        compiled: bool = True,
+        compiled: bool | None = True,
     ) -> None:
         _refuse(nodes=nodes)
-        self._compiled = compiled and codegen.numba_version() is not None
-        self._ode = ode
-        slots = slots_of(ode, limits) if self._compiled else None
+        slots = None if compiled is False else slots_of(ode, limits)
+        texts = source(ode, nodes, limits, slots)
+        if compiled is None:
+            compiled = codegen.has_code(texts, {}, ("integrate",), rounding=False)
+        self._ode, self._compiled = ode, compiled and codegen.numba_version() is not None
+        if slots is not None and not self._compiled:
+            slots, texts = None, source(ode, nodes, limits, None)
         self._at = layout(ode, nodes, limits, slots)
         self._numbers = slots.values if slots else []
-        texts = source(ode, nodes, limits, slots)
         module = codegen.load(texts, {}, numba=self._compiled, rounding=False)
         self._integrate = _machine_code(module.integrate) if self._compiled else module.integrate
 
@@ -154,14 +158,6 @@ class Collocation:
         motion.set_step(h)
         motion.begin(t, y, d)
         return motion
-
-
-def has_code(ode: ODE, nodes: int = NODES, limits: Program | None = None) -> bool:
-    """Return whether the machine code of a `Collocation` is there to be loaded."""
-    slots = slots_of(ode, limits)
-    texts = source(ode, nodes, limits, slots)
-    known = codegen.numba_version() is not None
-    return known and codegen.has_code(texts, {}, ("integrate",), rounding=False)
 
 
 @lru_cache(maxsize=16)

@@ -9,7 +9,7 @@ tends to 2^order - 1 times the error of the run as steps shrink, and costs half 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from sst_ros.integration.adaptive_stepper import Step
@@ -60,9 +60,7 @@ class ErrorGrowth(NamedTuple):
         Twice the asymptotic value: at loose tolerances the terms of higher order hide a part of it.
         """
         y, z = at.y, at.z
-        same = math.dist(y[:4], z[:4])
-        opposite = math.dist(y[:4], [-x for x in z[:4]])  # q and -q are the same rotation
-        apart = (2.0 * min(same, opposite), math.dist(y[4:7], z[4:7]))
+        apart = orientation_distance(y, z), math.dist(y[4:7], z[4:7])
         rounding = _ROUNDING * math.sqrt(steps + 1.0)
         share = max(2.0 / (2.0**at.order - 1.0), self.lost / self.total if self.lost else 0.0)
         scale = (1.0, max(1.0, math.hypot(*y[4:7])))
@@ -70,6 +68,11 @@ class ErrorGrowth(NamedTuple):
             max(d * share, min(d, rounding * s)) for d, s in zip(apart, scale, strict=True)
         )
         return first, second
+
+
+def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
+    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
 
 
 def coulomb_joints(scene: Scene) -> Iterator[tuple[int, float]]:
@@ -114,11 +117,7 @@ class HalvedSteps:
         except (ArithmeticError, ValueError):
             self._y = [math.nan] * len(self._y)
 
-    def errors(self, y: list[float]) -> tuple[float, float]:
-        """Estimated errors of the orientation [rad] and the body rate [rad/s] of the run, at y."""
-        one, other = y[:4], self._y[:4]
-        apart = 2.0 * min(math.dist(one, other), math.dist(one, [-x for x in other]))
-        rates = math.dist(y[4:7], self._y[4:7])
+    def error(self, y: list[float]) -> float:
+        """Estimated error of the orientation of the run at y [rad]."""
         floor = _FLOOR * math.sqrt(self.steps + 1.0)
-        scale = max(1.0, math.hypot(*y[4:7]))
-        return max(_MARGIN * apart, floor), max(_MARGIN * rates, floor * scale)
+        return max(_MARGIN * orientation_distance(y, self._y), floor)

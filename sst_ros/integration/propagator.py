@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Propagation of a scene's state through periods: steps, limits, contact at elastic stops."""
+"""Propagation of a scene's state through periods: steps, limits, contact at elastic stops.
+
+The ticks of a recorded run are propagated again by `TickPropagator`, all in one call.
+"""
 
 from __future__ import annotations
 

@@ -198,16 +198,22 @@ def _checked_period(period: float | None, profile: Any, span: int) -> int | None
     return found
 
 
+def _ascending(values: ArrayLike) -> Array | None:
+    """Return finite, ascending numbers as an array; None where they are none."""
+    try:
+        numbers: Array = np.atleast_1d(np.array(values, dtype=float))
+    except (TypeError, ValueError):
+        return None
+    fits = numbers.ndim == 1 and np.all(np.isfinite(numbers)) and np.all(np.diff(numbers) > 0)
+    return numbers if fits else None
+
+
 def _breaks(breaks: ArrayLike, span: int) -> Array:
     """Return the times of jumps inside the motion [s]."""
-    try:
-        times: Array = np.atleast_1d(np.array(breaks, dtype=float))
-        fits = times.ndim == 1 and bool(np.all(np.isfinite(times)) and np.all(np.diff(times) > 0))
-    except (TypeError, ValueError):
-        fits = False
-    if fits:
-        return times[(times > 0.0) & (times < span / NANOSECONDS)]
-    raise InputError("simulate", [Problem("breaks", breaks, "must be ascending times [s]")])
+    times = _ascending(breaks)
+    if times is None:
+        raise InputError("simulate", [Problem("breaks", breaks, "must be ascending times [s]")])
+    return times[(times > 0.0) & (times < span / NANOSECONDS)]
 
 
 def _longest(max_step: float | None) -> float:
@@ -222,12 +228,8 @@ def _times(t_eval: ArrayLike | None, span: int) -> np.ndarray | None:
     """Return the times of the samples [ns]."""
     if t_eval is None:
         return None
-    try:
-        times: Array = np.atleast_1d(np.asarray(t_eval, dtype=float))
-        fits = times.ndim == 1 and len(times) and np.all(np.isfinite(times))
-    except (TypeError, ValueError):
-        fits = False
-    if fits:
+    times = _ascending(t_eval)
+    if times is not None and len(times):
         rounded = np.rint(times * NANOSECONDS).astype(np.int64)
         if rounded[0] >= 0 and rounded[-1] <= span and np.all(np.diff(rounded) > 0):
             return rounded

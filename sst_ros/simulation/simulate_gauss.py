@@ -7,7 +7,7 @@ import math
 import threading
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from sst_ros.dynamics.expression import Program, number_constants, trace
 from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event, limit_distances
-from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, has_code, tables
+from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, tables
+from sst_ros.integration.global_error import orientation_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
 from sst_ros.simulation.simulation import start_of
@@ -37,14 +38,6 @@ _MOST_ITERATIONS = 10
 
 class NotSmooth(ArithmeticError):
     """Collocation does not reach the tolerance with steps worth taking."""
-
-
-class Ending(NamedTuple):
-    """Where a limit ends a motion: step in which, time in it [s], and the limit."""
-
-    step: int
-    time: float
-    limit: Limit
 
 
 class GaussMotion:
@@ -120,14 +113,14 @@ class GaussMotion:
         return self.run()
 
     @cached_property
-    def ending(self) -> Ending | None:
-        """Where the first limit is met; None where none is."""
+    def ending(self) -> tuple[float, Limit] | None:
+        """Time at which the first limit is met [s], and the limit; None where none is."""
         if not self._limits or self._motion.least_distances.min() > NEAR:
             return None
         for k in range(self.count):
             met = first_event(self._limits, lambda x: self._joints(k, x), self.h)  # noqa: B023
             if met is not None:
-                return Ending(k, *met)
+                return float(self.grid[k]) + met[0], met[1]
         return None
 
     def at(self, times: Array) -> Array:
@@ -207,8 +200,7 @@ class GaussMotion:
         """Double the steps until two ends are the same to `fine`; no end where they never are."""
         count, before, distance = 1, [math.nan] * 7, math.inf
         while count <= self._finest:
-            motion = self._prepared(count, _MOST_ITERATIONS)
-            end = motion.end if math.isfinite(_change(motion)) else [math.nan] * 7
+            end = self._end(count, _MOST_ITERATIONS)
             apart = _apart(before, end)
             if apart < fine:
                 return count, end
@@ -218,23 +210,22 @@ class GaussMotion:
         return count, []
 
     def _error(self, count: int, iterations: int, reference: Sequence[float]) -> float:
+        return _apart(self._end(count, iterations), reference)
+
+    def _end(self, count: int, iterations: int) -> list[float]:
+        """State at the end by so many steps and iterations, nan where it is not finite."""
         motion = self._prepared(count, iterations)
-        return _apart(motion.end, reference) if math.isfinite(_change(motion)) else math.inf
-
-
-def _change(motion: PreparedMotion) -> float:
-    try:
-        return motion.run()
-    except (ArithmeticError, ValueError):
-        return math.inf
+        try:
+            change = motion.run()
+        except (ArithmeticError, ValueError):
+            change = math.inf
+        return motion.end if math.isfinite(change) else [math.nan] * 7
 
 
 def _apart(one: Sequence[float], other: Sequence[float]) -> float:
     """Angle between two orientations, or the distance of the body rates where it is larger."""
-    first, second = one[:4], other[:4]
-    near = min(math.dist(first, second), math.dist(first, [-x for x in second]))
     speed = max(1.0, math.hypot(*other[4:7]))
-    distance = max(2.0 * near, math.dist(one[4:7], other[4:7]) / speed)
+    distance = max(orientation_distance(one, other), math.dist(one[4:7], other[4:7]) / speed)
     return distance if math.isfinite(distance) else math.inf
 
 
@@ -250,10 +241,7 @@ def _collocation(
             lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
-    ode = ODE(dynamics, sine)
-    if compiled is None:
-        compiled = has_code(ode, limits=program)
-    return Collocation(ode, limits=program, compiled=compiled)
+    return Collocation(ODE(dynamics, sine), limits=program, compiled=compiled)
 
 
 _FINEST_PER_SECOND, _FINEST = 1024, 4096
@@ -288,12 +276,10 @@ class CollocatedMotion:
             scene, torque, start, duration, tolerance, compiled=asked or None, finest=finest
         )
         self._scene, self._lag = scene, lag
-        self._end, self._ending = duration, motion.ending
-        status, message = 0, "reached the end"
-        if self._ending is not None:
-            self._end = float(motion.grid[self._ending.step]) + self._ending.time
-            status = 1
-            message = f"stopped at t = {self._end:.12f} s: {self._ending.limit.reason}"
+        self._end, status, message = duration, 0, "reached the end"
+        if motion.ending is not None:
+            self._end, limit = motion.ending
+            status, message = 1, f"stopped at t = {self._end:.12f} s: {limit.reason}"
         chosen = "" if asked else " (auto: a smooth motion under a profile)"
         self._of_the_run: dict[str, Any] = {
             "status": status,
@@ -308,7 +294,7 @@ class CollocatedMotion:
             "dense": motion.at,
         }
         self._whole = None
-        if self._ending is None:
+        if not status:
             self._whole = self._trajectory(motion.grid, motion.run())
 
     def trajectory(self, times: np.ndarray | None) -> Trajectory:
@@ -318,7 +304,7 @@ class CollocatedMotion:
             y.flags.writeable = False
             return self._whole.with_states(y)
         t = self._motion.grid if times is None else times / NANOSECONDS
-        if self._ending is not None:
+        if self._whole is None:
             t = np.append(t[t < self._end], self._end)
         return self._trajectory(t, self._motion.at(t))
 

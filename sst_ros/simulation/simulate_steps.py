@@ -14,7 +14,7 @@ from sst_ros.host.output import Bar
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget, Step
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod, Point, has_code
+from sst_ros.integration.compiled_method import CompiledMethod, Point, has_step_code
 from sst_ros.integration.global_error import HalvedSteps
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.propagator import LimitReached, Propagator
@@ -217,7 +217,7 @@ class SteppedMotion:
 
         Under a function only the derivative is compiled, which takes a second.
         """
-        there = callable(self._torque) or has_code(
+        there = callable(self._torque) or has_step_code(
             method.system, method.method, ("step_pair", "step_fixed")
         )
         if there or self._spent + self._budget.spent > _WORTH_COMPILING:
@@ -266,7 +266,7 @@ class SteppedMotion:
             status=status,
             message=message,
             method=", then ".join([self._method, *changes]),
-            error_estimate=self._check.errors(at.y)[0],
+            error_estimate=self._check.error(at.y),
             energy_residual=stored - at.y[-1],
             evaluations=self._budget.spent,
             step=self._time / max(self._check.steps, 1),
