@@ -33,7 +33,7 @@ from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.topic_tables import JOINTS
-from sst_ros.report.states import by_columns, initial
+from sst_ros.report.states import initial, joint_columns
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring
@@ -119,7 +119,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
         if not rows.start:
             state = np.vstack([y, state])
         y = state[-1]
-        angles = by_columns(motion.dynamics.joints_program, state)
+        angles = joint_columns(motion.dynamics.model, state)
         effort = np.zeros((len(state), 9))
         effort[:, :3] = held * (number > 0)[:, None]
         numbers = {"joints": np.hstack([angles, effort]), "quaternion": state[:, :4]}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from sst_ros.plot.style import (
     ORANGE,
     PURPLE,
     VERMILION,
+    Looks,
     free_figure,
     legend,
     note,
@@ -32,9 +33,12 @@ if TYPE_CHECKING:
 
 
 MARKERS = {
-    "rk4": (BLUE, "o"), "dopri5": (VERMILION, "s"), "dop853": (GREEN, "^"), "rodas4": (PURPLE, "D"),
+    "rk4": (BLUE, "o"),
+    "dopri5": (VERMILION, "s"),
+    "dop853": (GREEN, "^"),
+    "rodas4": (PURPLE, "D"),
     "gauss": (ORANGE, "v"),
-}  # fmt: skip
+}
 """Colour and marker of each method; steps are solid and full, tolerances dashed and hollow."""
 
 FIXED = "fixed steps"
@@ -69,18 +73,36 @@ def draw_work_precision(
     quantities = ("largest_orientation_rad", "largest_gamma_dot_rad_per_s")
     labels = ("largest error of the orientation [rad]", "largest error of γ̇ [rad/s]")
     for axes, quantity, floor, label in zip(panels, quantities, floors, labels, strict=True):
-        _panel(axes, rows, quantity, floor)
+        _draw_grid(axes, rows, quantity, floor)
         axes.set_ylabel(label)
         axes.set_xlabel(f"wall time for {seconds:g} s of motion [ms]")
+    ring = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
     for target, place in best.items():
         panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
-        panels[0].plot(*place, "o", markersize=14, markerfacecolor="none", markeredgecolor=INK,
-                       markeredgewidth=1.4, zorder=5)  # fmt: skip
-    figure.legend(handles=_legend(rows, best), loc="center",
-                  bbox_to_anchor=(0.5, 0.095), ncol=9, fontsize=8, frameon=False)  # fmt: skip
+        panels[0].plot(*place, "o", markeredgecolor=INK, **ring)
+    below: Looks = {"loc": "center", "bbox_to_anchor": (0.5, 0.095), "ncol": 9}
+    figure.legend(handles=[*_handles(rows, best)], fontsize=8, frameon=False, **below)
     figure.suptitle(title, fontsize=12)
     note(figure, footnote, 185)
     return figure
+
+
+def _entry(label: str, marker: str, color: str = INK, **looks: Any) -> Line2D:
+    """Return an entry of a legend."""
+    return Line2D([], [], label=label, marker=marker, color=color, **looks)
+
+
+def _handles(rows: DataFrame, targets: Collection[float]) -> Iterator[Line2D]:
+    for name, (colour, marker) in MARKERS.items():
+        if name in set(rows.method):
+            yield _entry(name, marker, colour, linewidth=1.5)
+    yield _entry("fixed steps (full)", "o")
+    yield _entry("tolerance (hollow)", "o", markerfacecolor="white", linestyle="--")
+    if (rows.failure != "").any():
+        yield _entry("failed", "x", linestyle="none")
+    if targets:
+        name = f"fastest for {', '.join(f'{target:.0e}' for target in targets)} rad"
+        yield _entry(name, "o", linestyle=":", markersize=11, markerfacecolor="none")
 
 
 @styled
@@ -95,89 +117,64 @@ def draw_summary(rows: DataFrame, footnote: str) -> Figure:
     names = list(dict.fromkeys(rows.scene))
     figure = free_figure(9.0, 1.7 + 0.36 * len(names))
     axes = figure.subplots()
-    high = 1.0 / (1.7 + 0.36 * len(names))
-    figure.subplots_adjust(left=0.17, right=0.98, top=1.0 - 0.45 * high, bottom=1.05 * high)
-    targets = sorted(set(rows.target), reverse=True)
+    inch = 1.0 / figure.get_figheight()
+    figure.subplots_adjust(left=0.17, right=0.98, top=1.0 - 0.45 * inch, bottom=1.05 * inch)
+    sizes = {t: 5.5 + 3.0 * k for k, t in enumerate(sorted(set(rows.target), reverse=True))}
+    hollow: Looks = {"markerfacecolor": "none", "linestyle": "none"}
     for row in rows.itertuples():
         colour, marker = MARKERS[row.method]
-        size = 5.5 + 3.0 * targets.index(row.target)
-        axes.plot(100.0 * row.share, names.index(row.scene), marker, color=colour, markersize=size,
-                  markerfacecolor="none", markeredgewidth=1.5)  # fmt: skip
+        place = 100.0 * row.share, names.index(row.scene)
+        looks: Looks = {"color": colour, "markersize": sizes[row.target], "markeredgewidth": 1.5}
+        axes.plot(*place, marker, **looks, **hollow)
     axes.axvline(100.0, color=INK, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("wall time of the integration per time of the motion [%]")
-    figure.suptitle(
-        "Fastest setting for an error of the orientation", fontsize=11, x=0.02, ha="left"
-    )
-    handles = [Line2D([], [], color=colour, marker=marker, linestyle="none", label=name,
-                      markerfacecolor="none") for name, (colour, marker) in MARKERS.items()
-               if name in set(rows.method)]  # fmt: skip
-    handles += [Line2D([], [], color=INK, marker="o", linestyle="none", markerfacecolor="none",
-                       markersize=5.5 + 3.0 * k, label=f"{target:.0e} rad")
-                for k, target in enumerate(targets)]  # fmt: skip
-    axes.legend(handles=handles, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0),
-                ncol=5, frameon=False, borderaxespad=0.1)  # fmt: skip
+    title = "Fastest setting for an error of the orientation"
+    figure.suptitle(title, fontsize=11, x=0.02, ha="left")
+    used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
+    handles = [_entry(name, mark, colour, **hollow) for name, (colour, mark) in used.items()]
+    for target, size in sizes.items():
+        handles.append(_entry(f"{target:.0e} rad", "o", markersize=size, **hollow))
+    legend(axes, handles=handles, ncol=5)
     note(figure, footnote, 150)
     return figure
 
 
-def _panel(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
+def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
-        fixed = kind == FIXED
-        axes.plot(1e3 * group.wall_min_s, group[quantity], color=colour, marker=marker,
-                  markersize=6.5, linestyle="-" if fixed else "--", linewidth=1.5,
-                  markerfacecolor=colour if fixed else "white", markeredgecolor=colour,
-                  zorder=3)  # fmt: skip
+        face, line = (colour, "-") if kind == FIXED else ("white", "--")
+        looks: Looks = {"marker": marker, "linestyle": line, "markerfacecolor": face, "zorder": 3}
+        x, y = 1e3 * group.wall_min_s, group[quantity]
+        axes.plot(x, y, color=colour, markersize=6.5, linewidth=1.5, **looks)
     errors: Any = drawn[quantity]
     high = 10.0 ** math.ceil(math.log10(errors.max() if len(errors) else 1.0) + 0.01)
     low = 10.0 ** math.floor(math.log10(errors.min() if len(errors) else high * 1e-3) - 0.7)
     top = high * (high / low) ** 0.1
+    across: Looks = {"transform": axes.get_yaxis_transform(), "va": "center"}
     failed = rows[rows.failure != ""]
-    if len(failed):
-        _failures(axes, failed, high, top)
+    if len(failed):  # in a band above everything, at their wall time
+        axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
+        middle = math.sqrt(high * top)
+        axes.text(0.99, middle, f"failed: {len(failed)}", ha="right", fontsize=8.5, **across)
+        for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
+            colour, marker = MARKERS[name]
+            x = wall if wall > 0.0 else np.nan
+            hollow: Looks = {"markerfacecolor": "none", "markersize": 6.5}
+            axes.plot(x, middle, marker, color=colour, zorder=3, **hollow)
+            axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
     if floor > low:
         axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
-        axes.text(0.02, math.sqrt(low * floor), "100 × the reference's own error: none plotted",
-                  transform=axes.get_yaxis_transform(), fontsize=7.5, va="center")  # fmt: skip
+        text = "100 × the reference's own error: none plotted"
+        axes.text(0.02, math.sqrt(low * floor), text, fontsize=7.5, **across)
     axes.set_ylim(low, top)
     axes.yaxis.set_major_locator(LogLocator(numticks=12))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _failures(axes: Axes, failed: DataFrame, high: float, top: float) -> None:
-    """Show failures in a band above everything, at their wall time."""
-    axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
-    middle = math.sqrt(high * top)
-    axes.text(0.99, middle, f"failed: {len(failed)}", transform=axes.get_yaxis_transform(),
-              ha="right", va="center", fontsize=8.5)  # fmt: skip
-    for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
-        colour, marker = MARKERS[name]
-        x = wall if wall > 0.0 else np.nan
-        axes.plot(x, middle, marker, color=colour, markerfacecolor="none", markersize=6.5, zorder=3)
-        axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
-
-
-def _legend(rows: DataFrame, targets: Collection[float]) -> list[Line2D]:
-    handles = [
-        Line2D([], [], color=colour, marker=marker, label=name, linewidth=1.5)
-        for name, (colour, marker) in MARKERS.items() if name in set(rows.method)
-    ]  # fmt: skip
-    handles.append(Line2D([], [], color=INK, marker="o", label="fixed steps (full)"))
-    handles.append(Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="--",
-                          label="tolerance (hollow)"))  # fmt: skip
-    if (rows.failure != "").any():
-        handles.append(Line2D([], [], color=INK, marker="x", linestyle="none", label="failed"))
-    if targets:
-        name = f"fastest for {', '.join(f'{target:.0e}' for target in targets)} rad"
-        handles.append(Line2D([], [], color=INK, marker="o", linestyle=":", markersize=11,
-                              markerfacecolor="none", label=name))  # fmt: skip
-    return handles
 
 
 @styled
@@ -192,37 +189,33 @@ def draw_stability(steps: DataFrame, runs: DataFrame, title: str, footnote: str)
 
     """
     figure = free_figure(11.0, 5.2 + 0.36 * len(runs))
-    high = 1.0 / figure.get_figheight()
-    middle = (0.36 * len(runs) + 1.6) * high
-    above = figure.add_gridspec(1, 2, left=0.075, right=0.985, top=1.0 - 0.75 * high,
-                                bottom=middle, wspace=0.2)  # fmt: skip
-    left, right = figure.add_subplot(above[0, 0]), figure.add_subplot(above[0, 1])
+    inch = 1.0 / figure.get_figheight()
+    middle = (0.36 * len(runs) + 1.6) * inch
+    edges = {"left": 0.075, "right": 0.985, "top": 1.0 - 0.75 * inch, "bottom": middle}
+    panels: Any = figure.add_gridspec(1, 2, wspace=0.2, **edges).subplots()
+    left, right = panels
     for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
         values = np.where(steps[name] > 0.0, steps[name], np.nan)
         left.plot(steps.t_s, values, line, color=colour, linewidth=1.8, label=name)
     left.set_ylabel("fastest rate of the eigenvalues [1/s]")
-    free = []
-    for name in METHODS:
-        if np.isfinite(steps[name]).any():
-            values = np.where(np.isfinite(steps[name]), steps[name], np.nan)
-            right.plot(steps.t_s, values, color=MARKERS[name][0], linewidth=1.8, label=name)
-        else:
-            free.append(name)
+    free = [name for name in METHODS if not np.isfinite(steps[name]).any()]
+    for name in (name for name in METHODS if name not in free):
+        values = np.where(np.isfinite(steps[name]), steps[name], np.nan)
+        right.plot(steps.t_s, values, color=MARKERS[name][0], linewidth=1.8, label=name)
     right.plot([], [], " ", label=f"{', '.join(free)}: every step")
     right.set_ylabel("longest stable step [s]")
     for axes in (left, right):
         axes.set_yscale("log")
         axes.set_xlabel("time t [s]")
         legend(axes)
-    below = figure.add_gridspec(1, 1, left=0.11, right=0.985, top=middle - 0.85 * high,
-                                bottom=0.85 * high)  # fmt: skip
-    _ends(figure.add_subplot(below[0, 0]), runs)
+    edges = {"left": 0.11, "right": 0.985, "top": middle - 0.85 * inch, "bottom": 0.85 * inch}
+    _draw_ends(figure.add_subplot(figure.add_gridspec(1, 1, **edges)[0, 0]), runs)
     figure.suptitle(title, fontsize=12)
     note(figure, footnote, 185)
     return figure
 
 
-def _ends(axes: Axes, runs: DataFrame) -> None:
+def _draw_ends(axes: Axes, runs: DataFrame) -> None:
     """Draw error and estimate of each run, with how it ended beside them."""
     axes.set_xscale("log")
     axes.set_xlim(1e-17, 1e3)

@@ -148,10 +148,10 @@ def lines(
     span([axes], seconds)
 
 
-def legend(axes: Axes) -> None:
+def legend(axes: Axes, **given: Any) -> None:
     """Put the legend above the panel, where no curve can be."""
     place: Looks = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-    axes.legend(**place, ncol=4, fontsize=8, frameon=False)
+    axes.legend(**{**place, "ncol": 4, "fontsize": 8, "frameon": False, **given})
 
 
 def mark_ends(axes: Axes, *path: Array) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from sst_ros.plot.methods import draw_summary, draw_work_precision
 from sst_ros.report.reference_solution import EXTENDED
-from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.results import markdown, provenance, records, render, table, write
 from sst_ros.report.scene_summary import cost_table
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
@@ -28,37 +28,6 @@ if TYPE_CHECKING:
 TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is in titles."""
 
-AT_REST = "It rests: it has no torques of its own, a controller drives it along its motion."
-
-INTRODUCTION = """\
-# Accuracy and computing time
-
-Written by `python -m sst_ros report accuracy --all`; all figures are from the machine and the date
-below the tables. [Control rate and accuracy](control_rate.md) has the error of held torques.
-
-Every method solves the scene under its own torques, as continuous functions of time, and is
-compared with a reference solution at twenty or more instants: DOP853 with fixed steps in extended
-precision. The reference's own error is twice the difference of two step sizes; an error is plotted
-only if it is 100 times larger than that. Times are of the integration alone, the shortest of
-several runs, without compilation. Fixed steps use no error estimate; those of Gauss collocation are
-of a motion that was prepared. Tolerances include the coarse solution that `Simulation` integrates
-for its estimate of the global error, three steps for each, and one loop in Python around them; for
-Gauss collocation the search for its steps. Elastic stops have kinks: fixed steps step over them,
-collocation does not take them, and tolerances are given to `Simulation`, which locates each; it is
-the reference there too. Errors are the largest over the run.
-
-A setting is named as the fastest for a target only if every finer setting of the same method that
-was tried, and at least one, reaches the target too. The advice is what `simulate` takes with the
-method "auto", as in `sst-ros scene show`; behind it stands the error that a run with it had.
-"""
-
-TERMS_INTRODUCTION = """\
-Operations of the right-hand side are those of the scene, less those of the scene without the term;
-times are of an evaluation in steps of RK4, with the step around it, the shortest of 200 turns that
-both take. A term that folds into constants adds no operation. A compiler may need less time with a
-term than without it.
-"""
-
 
 def report(
     names: Sequence[str], out: Path, *, kind: str = EXTENDED, compiled: bool = True
@@ -74,18 +43,16 @@ def report(
     studies: list[WorkPrecision] = []
     terms: list[dict[str, Any]] = []
     for each in [scene.load(name) for name in names]:
-        studies.append(work_precision(each, kind=kind, compiled=compiled, shown=True))
+        study = work_precision(each, kind=kind, compiled=compiled, shown=True)
+        studies.append(study)
         terms += cost_table(each, compiled=compiled)
-        print(text(studies[-1]), flush=True)
-        moves = not studies[-1].rests
-        figures = {f"accuracy_{each.name}": figure(studies[-1])} if moves else {}
+        print(text(study), flush=True)
+        figures = {} if study.rests else {f"accuracy_{each.name}": figure(study)}
         if len(studies) == len(names):
             figures["accuracy"] = draw_summary(summary(studies), provenance(compiled=compiled))
-        write(
-            out, "accuracy", csv=frame(studies),
-            document={"studies": list(documents(studies)), "terms": terms},
-            page=page(studies, terms), figures=figures,
-        )  # fmt: skip
+        document = {"studies": [*documents(studies)], "terms": terms}
+        whole, said = frame(studies), page(studies, terms)
+        write(out, "accuracy", csv=whole, document=document, page=said, figures=figures)
     return studies
 
 
@@ -115,14 +82,23 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
 
 def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
     """Return the fastest setting of each scene for each target: method, setting, time."""
-    rows = []
-    for study in studies:
-        for target in TARGETS:
-            best = study.best(target) if target >= study.floor else None
-            if best is not None:
-                rows.append({"scene": study.scene, "target": target, "method": best.method,
-                             "setting": setting(best), "wall_s": best.wall_min_s,
-                             "share": best.wall_min_s / study.seconds})  # fmt: skip
+    found = [
+        (study, target, best)
+        for study in studies
+        for target in TARGETS
+        if (best := study.best(target) if target >= study.floor else None) is not None
+    ]
+    rows = [
+        {
+            "scene": study.scene,
+            "target": target,
+            "method": best.method,
+            "setting": setting(best),
+            "wall_s": best.wall_min_s,
+            "share": best.wall_min_s / study.seconds,
+        }
+        for study, target, best in found
+    ]
     return table(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
 
 
@@ -130,15 +106,12 @@ def fastest(study: WorkPrecision, target: float = TARGET) -> str:
     """Return the fastest setting for a target as a sentence."""
     best = study.best(target)
     if study.rests:
-        return AT_REST
+        return "It rests: it has no torques of its own, a controller drives it along its motion."
     if best is None:
-        errors = study.rows[ERROR].astype(float).dropna()
-        reached = (
-            "every one failed" if errors.empty else f"the least error is {errors.min():.0e} rad"
-        )
-        return (
-            f"No setting that was tried reaches {target:.0e} rad with every finer one; {reached}."
-        )
+        least = study.rows[ERROR].astype(float).min()
+        reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
+        tried = f"No setting that was tried reaches {target:.0e} rad with every finer one"
+        return f"{tried}; {reached}."
     return f"{target:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best.wall_min_s)}."
 
 
@@ -153,40 +126,35 @@ def _time(wall_s: float) -> str:
     return f"{1e3 * wall_s:.2g} ms" if wall_s < 0.0995 else f"{1e3 * wall_s:.0f} ms"
 
 
+HEADS = {
+    "wall_min_s": "min [s]",
+    "wall_median_s": "median [s]",
+    "final_orientation_rad": "end [rad]",
+    ERROR: "largest [rad]",
+    "largest_gamma_rad": "gamma [rad]",
+    "largest_gamma_dot_rad_per_s": "rate [rad/s]",
+    "energy_residual_J": "energy [J]",
+    "closure_residual": "closure",
+}
+"""Columns of the grid that the terminal shows, and their heads there."""
+
+
 def text(study: WorkPrecision) -> str:
     """Format a study for the terminal."""
-    lines = [
-        f"Accuracy of {study.scene} over {study.seconds:g} s"
-        + (f" ({study.ends})" if study.ends else ""),
-        *facts(study),
-        "",
-        *_grid(study),
-        "",
-    ]
-    below = int((study.rows.below_floor == True).sum())  # noqa: E712
-    if below:
-        lines.append(f"* {below} rows lie below {study.floor:.0e} rad, 100 times the reference's "
-                     "own error, and are not plotted.")  # fmt: skip
-    lines += [f"WARNING: {warning}." for warning in study.warnings]
-    lines += [fastest(study), provenance(compiled=study.compiled)]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
-
-
-def _grid(study: WorkPrecision) -> list[str]:
-    heads = {
-        "wall_min_s": "min [s]", "wall_median_s": "median [s]",
-        "final_orientation_rad": "end [rad]", ERROR: "largest [rad]",
-        "largest_gamma_rad": "gamma [rad]", "largest_gamma_dot_rad_per_s": "rate [rad/s]",
-        "energy_residual_J": "energy [J]", "closure_residual": "closure",
-    }  # fmt: skip
     shown = study.rows.assign(setting=[setting(row) for _, row in study.rows.iterrows()])
-    below = ["*" if row is True else "" for row in study.rows.below_floor]
-    failure = [f"FAILED: {reason[:60]}" if reason else "" for reason in study.rows.failure]
-    shown = shown[["setting", "evaluations", *heads]].rename(columns=heads)
-    lines: str = shown.assign(**{"": below, "failure": failure}).to_string(
-        index=False, na_rep="-", float_format=lambda x: f"{x:.1e}"
+    shown = shown[["setting", "evaluations", *HEADS]].rename(columns=HEADS)
+    below = [row is True for row in study.rows.below_floor]
+    shown[""] = ["*" if row else "" for row in below]
+    shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
+    return render(
+        "accuracy.txt",
+        study=study,
+        facts=facts(study),
+        grid=shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}"),
+        below=sum(below),
+        fastest=fastest(study),
+        provenance=provenance(compiled=study.compiled),
     )
-    return lines.splitlines()
 
 
 def facts(study: WorkPrecision) -> Iterator[str]:
@@ -207,14 +175,14 @@ def facts(study: WorkPrecision) -> Iterator[str]:
 
 def figure(study: WorkPrecision) -> Figure:
     """Draw the study."""
-    best = {target: study.best(target) for target in TARGETS if target >= study.floor}
+    found = {target: study.best(target) for target in TARGETS if target >= study.floor}
     return draw_work_precision(
         study.rows,
         floors=(study.floor, ABOVE_REFERENCE * study.reference.own.gamma_dot),
         seconds=study.seconds,
         best={
             target: (1e3 * row.wall_min_s, max(row[ERROR], study.floor))
-            for target, row in best.items()
+            for target, row in found.items()
             if row is not None
         },
         title=f"{study.scene}: error against wall time\n{fastest(study)}",
@@ -233,25 +201,13 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
         }
         run = "at rest" if each.rests else f"{each.seconds:g} s"
         rows.append({"scene": each.scene, "run": run, **cells})
-    lines = [INTRODUCTION, "## Which method and step", "",
-             "![time of the fastest setting, by scene](accuracy.png)", "",
-             markdown(table(rows))]  # fmt: skip
-    if terms:
-        shown = [{**row, "ns": f"{row['ns']:.0f}"} for row in terms]
-        lines += ["", "## What the terms of a scene cost", "", TERMS_INTRODUCTION,
-                  markdown(table(shown))]  # fmt: skip
-    for each in studies:
-        lines += ["", f"## {each.scene}", "", f"**{fastest(each)}**", ""]
-        if not each.rests:
-            picture = f"accuracy_{each.scene}.png"
-            lines += [f"![error against wall time, {each.scene}]({picture})", ""]
-        if each.ends:
-            lines.append(f"- Compared over {each.seconds:g} s; the run ends there: {each.ends}.")
-        lines += [f"- {fact}" for fact in facts(each)]
-        failed = int((each.rows.failure != "").sum())
-        if failed:
-            lines.append(f"- {failed} of {len(each.rows)} settings failed; they are in the CSV "
-                         "and in the figure.")  # fmt: skip
-        lines += [f"- Warning: {warning}." for warning in each.warnings]
-        lines.append(f"- {provenance(compiled=each.compiled)}")
-    return "\n".join(lines) + "\n"
+    costs = table({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
+    return render(
+        "accuracy.md",
+        studies=studies,
+        summary=markdown(table(rows)),
+        terms=markdown(costs) if terms else "",
+        fastest=fastest,
+        facts=facts,
+        provenance=provenance,
+    )

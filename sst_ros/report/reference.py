@@ -225,8 +225,8 @@ class _Reference:
 
     def _note(self, rows: Integers, reached: Array) -> None:
         """Write down how far samples are from the solution, and the coarse solution, (n, 2, m)."""
-        recording, dynamics = self._recording, self._motion.dynamics
-        fine, coarse = (states.outputs(dynamics, reached[:, i]) for i in range(2))
+        recording, model = self._recording, self._motion.dynamics.model
+        fine, coarse = (states.outputs(model, reached[:, i]) for i in range(2))
         sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
         for deviation, one in ((self._error, sampled), (self._own, coarse)):
             found = _deviation(one, fine)

@@ -124,12 +124,7 @@ class InitialValueProblem:
 
     def joints(self, solution: Array | NDArray[np.longdouble]) -> Array:
         """Nine angles [rad] and nine rates [rad/s] of states, shape (n, 18)."""
-        result = np.full((len(solution), 18), np.nan)
-        for row, y in enumerate(solution[:, :7].astype(float).tolist()):
-            if all(map(math.isfinite, y)):
-                with contextlib.suppress(ArithmeticError, ValueError):
-                    result[row] = self.dynamics.joints(*y)
-        return result
+        return states.joint_columns(self.dynamics.model, solution[:, :7].astype(float))
 
     def residuals(self, y: Array) -> tuple[float, float]:
         """Energy residual [J] and the largest abs(r_k . t_k) at a final state, shape (n,)."""
@@ -155,8 +150,8 @@ class InitialValueProblem:
                 result[k + 1] = y
         return result
 
-    def simulated(self, method: str, tolerance: float, substeps: int = 1) -> Array:
-        """States at the instants from `Simulation` with `substeps` control periods an interval.
+    def simulated(self, method: str, tolerance: float) -> Array:
+        """States at the instants from `Simulation`.
 
         Raises:
             RunStopped: a limit is met.
@@ -165,16 +160,12 @@ class InitialValueProblem:
         simulation = Simulation(
             self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
         )
-        rows = [np.array(self.start)]
-        padding = (math.nan,) * (len(self.start) - 7)
-        for k in range(self.count):
-            for part in range(substeps):
-                begin, end = (self.interval_ns * (part + n) // substeps for n in (0, 1))
-                simulation.step(self.torque, end - begin)
-            assert simulation.time_ns == (k + 1) * self.interval_ns
-            state = simulation.state
-            rows.append(np.array([*state.quaternion, *state.body_rate, *padding]))
-        return np.array(rows)
+        result = np.full((self.count + 1, len(self.start)), np.nan)
+        result[0] = self.start
+        for row in result[1:]:
+            state = simulation.step(self.torque, self.interval_ns)
+            row[:7] = *state.quaternion, *state.body_rate
+        return result
 
     def _horizon(self) -> tuple[int, int, str]:
         whole = self.scene.duration or WHOLE_RUN_S

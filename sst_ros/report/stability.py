@@ -16,7 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,7 +29,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.methods import draw_stability
-from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.results import markdown, provenance, records, render, table, write
 from sst_ros.report.step_advice import (
     LONGEST_S,
     TOLERANCE,
@@ -40,6 +40,7 @@ from sst_ros.report.step_advice import (
 )
 from sst_ros.scene.loads import Initial, JointFriction
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import Section
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
@@ -134,13 +135,12 @@ def report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
 
     """
     found = examine(scene, only, shown=True)
-    print(page(found))
+    said = page(found)
+    print(said)
     steps, runs = records(found.steps.replace(math.inf, None)), records(_run_table(found))
-    write(
-        out, "stability", csv=_run_table(found),
-        document={"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs},
-        page=page(found), figures={"stability": figure(found)},
-    )  # fmt: skip
+    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs}
+    figures = {"stability": figure(found)}
+    write(out, "stability", csv=_run_table(found), document=document, page=said, figures=figures)
     return found.passed
 
 
@@ -175,10 +175,9 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
         torque = instants.torque[k].tolist()
         lags = scene.lags
         values = eigenvalues(scene, (*state, *torque) if lags else state, torque)
-        row = {"t_s": t, "decay": max(0.0, float(-values.real.min())),
-               "oscillation": float(np.abs(values.imag).max())}  # fmt: skip
+        decay, oscillation = max(0.0, -values.real.min()), np.abs(values.imag).max()
         limits = {name: largest_stable_step(method, values) for name, method in METHODS.items()}
-        rows.append(row | limits)
+        rows.append({"t_s": t, "decay": float(decay), "oscillation": float(oscillation), **limits})
     return table(rows)
 
 
@@ -206,45 +205,52 @@ def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRu
     return StressRun(name, what, passed, result, run.method, error, run.error_estimate, wall)
 
 
+Part = TypeVar("Part", bound=Section)
+
+
+def _scale(part: Part, factor: float, *names: str) -> Part:
+    """Multiply numbers of a section, or the three of each, by a factor; None stays."""
+    values = {name: getattr(part, name) for name in names}
+    changes: dict[str, Any] = {
+        name: tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
+        for name, value in values.items()
+        if value is not None
+    }
+    return dataclasses.replace(part, **changes)
+
+
 def _stronger(scene: Scene, _: Trajectory) -> Scene | str:
     if scene.torque is None:
         return "the scene has no torques of its own"
-    first, second, third = (10.0 * value for value in scene.torque.amplitude)
-    torque = dataclasses.replace(scene.torque, amplitude=(first, second, third))
-    return dataclasses.replace(scene, torque=torque)
+    return dataclasses.replace(scene, torque=_scale(scene.torque, 10.0, "amplitude"))
 
 
 def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
-    rates = np.array(scene.initial.gamma_dot)
-    if not rates.any():  # it starts at rest: ten times the rates that it reaches
-        rates = np.abs(motion.gamma_dot).max(axis=0)
-    if not rates.any():
+    initial = scene.initial
+    if not any(initial.gamma_dot):  # it starts at rest: ten times the rates that it reaches
+        first, second, third = np.abs(motion.gamma_dot).max(axis=0).tolist()
+        initial = dataclasses.replace(initial, gamma_dot=(first, second, third))
+    if not any(initial.gamma_dot):
         return "nothing moves"
-    first, second, third = (10.0 * rates).tolist()
-    initial = dataclasses.replace(scene.initial, gamma_dot=(first, second, third))
-    return dataclasses.replace(scene, initial=initial)
+    return dataclasses.replace(scene, initial=_scale(initial, 10.0, "gamma_dot"))
 
 
 def _stiffer(scene: Scene, _: Trajectory) -> Scene | str:
-    stroke = scene.stroke
-    if not scene.springs and stroke.stiffness is None:
+    if not scene.springs and scene.stroke.stiffness is None:
         return "the scene has no springs and no elastic stops"
-    springs = tuple(
-        dataclasses.replace(spring, stiffness=100.0 * spring.stiffness) for spring in scene.springs
-    )
-    if stroke.stiffness is not None:
-        stroke = dataclasses.replace(stroke, stiffness=100.0 * stroke.stiffness)
+    springs = tuple(_scale(spring, 100.0, "stiffness") for spring in scene.springs)
+    stroke = _scale(scene.stroke, 100.0, "stiffness")
     return dataclasses.replace(scene, springs=springs, stroke=stroke)
 
 
 def _rougher(scene: Scene, _: Trajectory) -> Scene | str:
     if scene.friction is None:
         return "the scene has no friction"
-    joints = {}
-    for field in dataclasses.fields(JointFriction):
-        if one := getattr(scene.friction, field.name):
-            numbers = {key: 100.0 * getattr(one, key) for key in ("viscous", "coulomb", "static")}
-            joints[field.name] = dataclasses.replace(one, **numbers)
+    joints = {
+        field.name: _scale(one, 100.0, "viscous", "coulomb", "static")
+        for field in dataclasses.fields(JointFriction)
+        if (one := getattr(scene.friction, field.name))
+    }
     return dataclasses.replace(scene, friction=JointFriction(**joints))
 
 
@@ -358,10 +364,8 @@ def step_lines(found: StabilityReport) -> Iterator[str]:
     for name in METHODS:
         at = int(steps[name].argmin())
         least = steps[name][at]
-        yield (
-            f"{name}: every step is stable" if math.isinf(least)
-            else f"{name}: unstable in steps above {least:.2g} s, at {steps.t_s[at]:.3g} s"
-        )  # fmt: skip
+        limit = f"unstable in steps above {least:.2g} s, at {steps.t_s[at]:.3g} s"
+        yield f"{name}: {'every step is stable' if math.isinf(least) else limit}"
     yield "gauss: every step is stable; it is as long as its iteration converges"
     yield f"Advice: {found.advice}"
 
@@ -371,31 +375,30 @@ def page(found: StabilityReport) -> str:
     verdicts = {True: "yes", False: "**FAILED**", None: "-"}
     rows = [
         {
-            "row": run.name, "changed": run.change, "passed": verdicts[run.passed],
+            "row": run.name,
+            "changed": run.change,
+            "passed": verdicts[run.passed],
             "end": run.result,
             "error [rad]": "-" if math.isnan(run.error) else f"{run.error:.1e}",
             "estimate [rad]": "-" if math.isnan(run.estimate) else f"{run.estimate:.1e}",
             "time [s]": f"{run.wall_s:.2f}",
         }
         for run in found.runs
-    ]  # fmt: skip
-    failed = sum(run.passed is False for run in found.runs)
-    return "\n".join([
-        f"# Stability of {found.scene}", "", "![steps and runs](stability.png)", "",
-        *(f"- {line}." for line in step_lines(found)), "",
-        f"{len(rows)} runs, {failed} failed. A run passes if it ends as the finer one does, and if "
-        f"its error is at most {FACTOR:g} times its estimate, or {ROUNDING:g} rad; where no step "
-        "resolves it, if that is said.", "",
-        markdown(table(rows)), "", provenance(), "",
-    ])  # fmt: skip
+    ]
+    return render(
+        "stability.md",
+        found=found,
+        lines=step_lines(found),
+        failed=sum(run.passed is False for run in found.runs),
+        factor=FACTOR,
+        rounding=ROUNDING,
+        runs=markdown(table(rows)),
+        provenance=provenance(),
+    )
 
 
 def figure(found: StabilityReport) -> Figure:
     """Draw the report."""
     runs = [run for run in found.runs if run.passed is not None]
-    return draw_stability(
-        found.steps,
-        table((run._asdict() for run in runs), StressRun._fields),
-        f"Stability of {found.scene}",
-        provenance(),
-    )
+    rows = table((run._asdict() for run in runs), StressRun._fields)
+    return draw_stability(found.steps, rows, f"Stability of {found.scene}", provenance())

@@ -9,14 +9,12 @@ beside them are no part of the paper and are left out on both sides.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.initial_state import body_acceleration, initial_state
-from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -26,8 +24,6 @@ from sst_ros.recording.signals import Integers
 from sst_ros.scene.scene import Scene
 
 Places: TypeAlias = "slice | list[int] | Integers"
-
-_TOGETHER = 8192
 
 SAME_START = 1e-9
 """Largest difference [rad], [rad/s] between a first sample and the start that its scene asks for,
@@ -80,35 +76,26 @@ def begins(recording: Recording) -> bool:
     return bool(np.max(off) < SAME_START)
 
 
-def outputs(dynamics: Dynamics, states: Array) -> tuple[Array, Array, Array]:
-    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states.
+def joint_columns(model: kernel.Model, states: Array) -> Array:
+    """Nine angles [rad] and nine rates [rad/s], as in `kernel.Joints`, of states, shape (n, 18).
 
     Rows of nan stay nan.
     """
-    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    joints = by_columns(dynamics.joints_program, states[:, :7])
-    return quaternion, joints[:, :3], joints[:, 9:12]
-
-
-def by_columns(program: Program, inputs: Array) -> Array:
-    """Run a program for many inputs at once, shape (n, inputs); returns shape (n, outputs)."""
-    names: dict[str, Any] = {name: getattr(np, name) for name in ("sqrt", "tanh", "exp", "sin")}
-    names |= {"cos": np.cos, "atan2": np.arctan2, "max": np.maximum}
-    exec(program.source("function"), names)
-    result = np.empty((len(inputs), len(program.outputs)))
     with np.errstate(all="ignore"):
-        for start in range(0, len(inputs), _TOGETHER):
-            part = slice(start, start + _TOGETHER)
-            for column, values in enumerate(names["function"](*inputs[part].T.copy())):
-                result[part, column] = values
-    return result
+        found = kernel.joints(model, tuple(states[:, :7].T))
+    return np.stack([column for triple in found for column in triple], axis=1)
+
+
+def outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
+    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states."""
+    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
+    joints = joint_columns(model, states)
+    return quaternion, joints[:, :3], joints[:, 9:12]
 
 
 STATES = 20
 
-PAPER = (
-    "name", "description", "base", "star", "actuated_links", "intermediate_links", "initial",
-)  # fmt: skip
+PAPER = ("name", "description", "base", "star", "actuated_links", "intermediate_links", "initial")
 """Sections of a scene that the paper has."""
 
 

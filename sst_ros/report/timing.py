@@ -25,8 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program, trace
-from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.host.output import slices
 from sst_ros.integration import codegen
 from sst_ros.integration.propagator import TickPropagator, TickSequence
@@ -290,30 +288,19 @@ def energy_residual(recording: Recording, missing: list[str]) -> Array | None:
         until = recording.seconds[count - 1]
         missing.append(f"energy after {until:g} s: there is no numba to balance it")
     stored, work = np.full((2, len(recording.time_ns)), np.nan)
-    geometry, energies = Geometry.of(recording.scene), _energy(recording)
+    geometry, model = Geometry.of(recording.scene), kernel.model_of(recording.scene)
     motion = TickPropagator(recording.scene, None, compiled=many)
     for part in slices(count, CHUNK, "energy", shown=False):
         rows = slice(part.start, min(part.stop + 1, count))
         state = states.of_samples(geometry, recording, rows)
-        stored[rows] = states.by_columns(energies, state)[:, 0]
+        columns = tuple(state.T)
+        kinetic = kernel.kinetic_energy(model, columns)
+        stored[rows] = kinetic + kernel.potential_energy(model, columns)
         work[rows.start : rows.stop - 1] = _work(motion, ticks, state, recording.time_ns[rows])
     change = np.zeros(len(stored))
     change[1:] = np.diff(stored) - work[:-1]
     change[~np.isfinite(change)] = 0.0
     return np.asarray(np.where(np.isfinite(stored), np.cumsum(change), np.nan))
-
-
-def _energy(recording: Recording) -> Program:
-    """Kinetic and potential energy [J] of a state."""
-    dynamics = Dynamics.of(recording.scene)
-
-    def stored(*state: Any) -> tuple[Any]:
-        return (
-            kernel.kinetic_energy(dynamics.model, state)
-            + kernel.potential_energy(dynamics.model, state),
-        )
-
-    return trace(stored, dynamics.state)
 
 
 def _work(motion: TickPropagator, every: TickSequence, state: Array, time: Integers) -> Array:
