@@ -110,6 +110,12 @@ def torque_entry(torques: list, start_ns: int, received_ns: int, sample: int) ->
     return Entry(APPLIED, received_ns, content, sample)
 
 
+def command_entry(received_ns: int, torque: Any) -> Entry:
+    layout = make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
+    content = make("std_msgs/Float64MultiArray", layout=layout, data=np.array(torque))
+    return Entry(COMMANDS, received_ns, content)
+
+
 def diagnostics_entry(received_ns: int, **values: object) -> Entry:
     pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(v)) for key, v in values.items()]
     status = make(
@@ -154,12 +160,7 @@ def simulated(scene, seconds: float) -> list[Entry]:
             held, samples = [], samples + 1
         if fault:
             break
-    command = make(
-        "std_msgs/Float64MultiArray",
-        layout=make("std_msgs/MultiArrayLayout", dim=[], data_offset=0),
-        data=np.zeros(3),
-    )
-    entries.append(Entry(COMMANDS, START_NS, command))
+    entries.append(command_entry(START_NS, np.zeros(3)))
     entries.append(
         diagnostics_entry(
             START_NS + done * TICK_NS + 60_000,

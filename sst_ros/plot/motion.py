@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.interpolate import CubicHermiteSpline
 
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
@@ -35,8 +36,9 @@ from sst_ros.plot.style import (
     three,
     widen,
 )
-from sst_ros.recording.signals import Integers, Signals
+from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene
+from sst_ros.state import NANOSECONDS
 
 NUMBERS = {
     "example1": {"position_of_E": 8, "psi": 9},
@@ -201,27 +203,20 @@ def work(run: Signals) -> Array:
     """Work of each actuator from the first sample to each [J], shape (n, 3).
 
     A torque that is held over a tick does work by the angle of that tick. Angles at the ends of
-    ticks between samples are those of the cubic through angles and rates of both; where samples
-    or ticks are lost the work is nan from there on.
+    ticks between samples are those of the cubic through angles and rates of both; where ticks are
+    lost the work is nan from there on.
     """
     time, gamma, rate = run.time_ns("samples"), run.legs("gamma"), run.legs("gamma_dot")
     start, torque = run.time_ns("ticks"), run.legs("tau", "ticks")
     end = start + run.take("length", table="ticks")[:, 0].astype(np.int64)
-    steps = torque * (_angles(time, gamma, rate, end) - _angles(time, gamma, rate, start))
+    known = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
+    if np.count_nonzero(known) < 2:
+        return np.full(gamma.shape, np.nan)
+    angles = CubicHermiteSpline(time[known] / NANOSECONDS, gamma[known], rate[known])
+    steps = torque * (angles(end / NANOSECONDS) - angles(start / NANOSECONDS))
     steps[1:][start[1:] != end[:-1]] = np.nan
     steps[start < time[0]] = 0.0
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     done = np.searchsorted(end, time, side="right")
     whole = (time == time[0]) | np.isin(time, end)
     return np.asarray(np.where(whole[:, None], total[done], np.nan))
-
-
-def _angles(time: Integers, gamma: Array, rate: Array, at: Integers) -> Array:
-    """Interpolate angles at times [ns] of the run, shape (m, 3), by the cubic of Hermite."""
-    after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
-    before = after - 1
-    h = ((time[after] - time[before]) / 1e9)[:, None]
-    s = ((at - time[before]) / (time[after] - time[before]))[:, None]
-    value = (1 + 2 * s) * (1 - s) ** 2 * gamma[before] + s**2 * (3 - 2 * s) * gamma[after]
-    slope = s * (1 - s) ** 2 * rate[before] - s**2 * (1 - s) * rate[after]
-    return np.asarray(value + h * slope)

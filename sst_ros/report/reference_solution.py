@@ -97,10 +97,11 @@ class InitialValueProblem:
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
+        self.interval_ns: int
+        self.count: int
+        self.ends: str
         horizon = self._horizon() if like is None else (like.interval_ns, like.count, like.ends)
-        self.interval_ns: int = horizon[0]
-        self.count: int = horizon[1]
-        self.ends: str = horizon[2]
+        self.interval_ns, self.count, self.ends = horizon
 
     @property
     def interval(self) -> float:
@@ -112,15 +113,20 @@ class InitialValueProblem:
         """Time span [s]."""
         return self.count * self.interval_ns / NANOSECONDS
 
+    @property
+    def times(self) -> Array:
+        """Instants of comparison [s], shape (count + 1,)."""
+        return self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
+
     def errors(
         self, solution: Array | NDArray[np.longdouble], reference: NDArray[np.longdouble]
     ) -> tuple[StateError, StateError]:
         """Distances of states (count + 1, n) at the end, and the largest; nan where unknown."""
         angle = angle_between(solution[:, :4], reference[:, :4])
         joints = np.abs(self.joints(solution) - self.joints(reference))
-        gamma, rate = joints[:, :3].max(axis=1), joints[:, 9:12].max(axis=1)
-        whole = tuple(float(values.max()) for values in (angle, gamma, rate))
-        return StateError(float(angle[-1]), float(gamma[-1]), float(rate[-1])), StateError(*whole)
+        legs = joints[:, :3].max(axis=1), joints[:, 9:12].max(axis=1)
+        found = np.stack([angle.astype(float), *legs])
+        return StateError(*found[:, -1].tolist()), StateError(*found.max(axis=1).tolist())
 
     def joints(self, solution: Array | NDArray[np.longdouble]) -> Array:
         """Nine angles [rad] and nine rates [rad/s] of states, shape (n, 18)."""

@@ -23,8 +23,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
+from sst_ros.extras import require
 from sst_ros.host.output import slices
 from sst_ros.integration import codegen
 from sst_ros.integration.propagator import TickPropagator, TickSequence
@@ -36,9 +38,9 @@ from sst_ros.report.reference import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 from sst_ros.state import NANOSECONDS
 
 REPORTED = (
-    "ticks_missed", "ticks", "step_mean_us", "error_estimate", "hold_error_start",
-    "hold_error_middle",
-)  # fmt: skip
+    *("ticks_missed", "ticks", "step_mean_us"),
+    *("error_estimate", "hold_error_start", "hold_error_middle"),
+)
 """Numbers of the diagnostics that are shown over the run."""
 
 STATISTICS: dict[str, Callable[[Array], Any]] = {
@@ -103,12 +105,18 @@ def measure(recording: Recording) -> Timing:
     if not recording.diagnostics:
         missing.append("no diagnostics: missed ticks and samples published are not known")
     return Timing(
-        received, period / 1e3,
-        np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
-        gaps / NANOSECONDS, pace_s, pace, (late - late.min()) / 1e3, _reported(recording),
-        pair_commands(recording, missing), energy_residual(recording, missing),
-        tuple(missing),
-    )  # fmt: skip
+        period_us=received,
+        nominal_us=period / 1e3,
+        lost_s=np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
+        gaps_s=gaps / NANOSECONDS,
+        pace_s=pace_s,
+        pace=pace,
+        late_us=(late - late.min()) / 1e3,
+        reported=_reported(recording),
+        latency=pair_commands(recording, missing),
+        energy=energy_residual(recording, missing),
+        missing=tuple(missing),
+    )
 
 
 def numbers(timing: Timing) -> dict[str, Any]:
@@ -186,7 +194,8 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
         missing.append("no commands are recorded: their latency is not known")
         return Latency(*np.empty((3, 0)))
     limit = recording.scene.torque_limit
-    asked, applied = _digest(commands.torque, limit), _digest(ticks.torque, limit)
+    most = np.inf if limit is None else limit
+    asked, applied = (np.clip(each.torque, -most, most) for each in (commands, ticks))
     new, changed = _changes(asked), _changes(applied)
     step_ns = _received(recording, ticks.end_ns[changed])
     # The recorder may have received a command a little later than the simulator.
@@ -226,42 +235,30 @@ def _received(recording: Recording, time_ns: Integers) -> Integers:
     return np.asarray(first + np.interp(time_ns, recording.time_ns, since).astype(np.int64))
 
 
-def _changes(digest: Integers) -> Integers:
+def _changes(torque: Array) -> NDArray[np.intp]:
     """Rows that are not the same as the row before, and the first."""
-    return np.flatnonzero(np.diff(digest, prepend=~digest[:1]))
-
-
-def _digest(torque: Array, limit: float | None) -> Integers:
-    """One number for three: equal for equal torques within the limit, hardly ever for others."""
-    digest = np.zeros(len(torque), dtype=np.uint64)
-    for column in torque.T:
-        held = column if limit is None else np.clip(column, -limit, limit)
-        digest ^= (held + 0.0).view(np.uint64)  # -0.0 becomes 0.0
-        digest *= np.uint64(0x9E3779B97F4A7C15)
-        digest ^= digest >> np.uint64(29)
-    return digest.view(np.int64)
+    return np.flatnonzero(np.append(True, (torque[1:] != torque[:-1]).any(axis=1)))
 
 
 def _pairs(
-    asked: Integers, earliest_ns: Integers, applied: Integers, applied_ns: Integers
-) -> tuple[Integers, Integers]:
+    asked: Array, earliest_ns: Integers, applied: Array, applied_ns: Integers
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Find for each command the first tick of its values from `earliest_ns` on."""
-    _, kinds = np.unique(np.concatenate([asked, applied]), return_inverse=True)
-    asked_kind, applied_kind = kinds[: len(asked)], kinds[len(asked) :]
-    order = np.lexsort((applied_ns, applied_kind))
-    # One ascending number of kind and time, so that one search finds the tick of the kind.
-    start = min(int(earliest_ns.min()), int(applied_ns.min()))
-    span = max(int(earliest_ns.max()), int(applied_ns.max())) + 1 - start
-    keys = 2.0 * applied_kind[order] + (applied_ns[order] - start) / span
-    sought = 2.0 * asked_kind + (earliest_ns - start) / span
-    at = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
-    found = order[at]
-    good = (keys[at] >= sought) & (applied_kind[found] == asked_kind)
-    command, tick = np.flatnonzero(good), found[good]
+    pandas, legs = require("pandas"), ["1", "2", "3"]
+    commands, ticks = (
+        pandas.DataFrame(torque + 0.0, columns=legs).assign(ns=ns, row=np.arange(len(ns)))
+        for torque, ns in ((asked, earliest_ns), (applied, applied_ns))
+    )
+    found = pandas.merge_asof(
+        commands.sort_values("ns", kind="stable"),
+        ticks.sort_values("ns", kind="stable"),
+        on="ns",
+        by=legs,
+        direction="forward",
+    ).dropna(subset="row_y")
     # Commands are in order of reception: the last of those that share a tick is the one it took.
-    last = len(tick) - 1 - np.unique(tick[::-1], return_index=True)[1]
-    last.sort()
-    return command[last], tick[last]
+    found = found.sort_values("row_x").drop_duplicates("row_y", keep="last")
+    return found["row_x"].to_numpy(), found["row_y"].to_numpy(dtype=int)
 
 
 def energy_residual(recording: Recording, missing: list[str]) -> Array | None:

@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +39,6 @@ from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import GAUSS, simulate
 from sst_ros.simulation.simulate_gauss import GaussMotion, NotSmooth
-from sst_ros.simulation.simulation import NANOSECONDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -72,12 +72,15 @@ SLOWER = 5.0
 _REPEAT_S, _REPEATS = 0.15, 15
 
 ERROR = "largest_orientation_rad"
+ERRORS = [
+    f"{when}_{quantity}"
+    for when in ("final", "largest")
+    for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
+]
 COLUMNS = (
-    "scene", "method", "kind", "setting", "evaluations", "wall_min_s", "wall_median_s",
-    "final_orientation_rad", "final_gamma_rad", "final_gamma_dot_rad_per_s", ERROR,
-    "largest_gamma_rad", "largest_gamma_dot_rad_per_s", "energy_residual_J", "closure_residual",
-    "below_floor", "failure",
-)  # fmt: skip
+    *("scene", "method", "kind", "setting", "evaluations", "wall_min_s", "wall_median_s"),
+    *(*ERRORS, "energy_residual_J", "closure_residual", "below_floor", "failure"),
+)
 """Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
 `evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
 for a failure, and `failure` for a success."""
@@ -187,25 +190,30 @@ def work_precision(
         for row, end in refined(grid[part.start], problem, truth, longest_s):
             rows.append({"scene": scene.name, **row})
             ends.append(end)
-    instants = (k * target.interval for k in range(len(truth.states)))
-    torques = (target.torque(t) if callable(target.torque) else target.torque for t in instants)
-    along = zip(truth.states.astype(float), torques, strict=True)
+    zero = np.zeros((len(target.times), 3))
+    torques = zero if scene.torque is None else scene.torque.values(target.times)
+    along = zip(truth.states.astype(float), torques.tolist(), strict=True)
     difference, _ = states.compare_with_paper(scene, along)
     return WorkPrecision(
-        scene.name, target.seconds, target.ends, compiled, truth, table(rows, COLUMNS),
-        step_advice(scene),
-        _measured(problem, truth), difference,
-        tuple(_warnings(problem, truth, rows, ends, difference)),
-    )  # fmt: skip
+        scene=scene.name,
+        seconds=target.seconds,
+        ends=target.ends,
+        compiled=compiled,
+        reference=truth,
+        rows=table(rows, COLUMNS),
+        advice=step_advice(scene),
+        measured=_measured(problem, truth),
+        formulation=difference,
+        warnings=tuple(_warnings(problem, truth, rows, ends, difference)),
+    )
 
 
 def _measured(problem: InitialValueProblem, truth: ReferenceSolution) -> tuple[float, float] | None:
     """Error and wall time of `simulate` with the method "auto"; None where it stops before."""
-    times = problem.interval_ns * np.arange(problem.count + 1) / NANOSECONDS
     began = time.perf_counter()
-    motion = simulate(problem.scene, duration=problem.seconds, t_eval=times)
+    motion = simulate(problem.scene, duration=problem.seconds, t_eval=problem.times)
     wall = time.perf_counter() - began
-    if len(motion) < len(times):
+    if len(motion) <= problem.count:
         return None
     states = np.hstack([motion.quaternion, motion.body_rate])
     return problem.errors(states, truth.states)[1].orientation, wall
@@ -287,9 +295,7 @@ def _fixed(problem: InitialValueProblem, method: Method, compiled: bool) -> Iter
         def solve(steps: int = steps, count: int = count) -> tuple[Array, int]:
             return problem.fixed_steps(machine, steps), len(method.a) * count
 
-        def timed(count: int = count, h: float = h) -> None:
-            machine.step_fixed(0.0, h, count, list(problem.start), problem.drive)
-
+        timed = partial(machine.step_fixed, 0.0, h, count, list(problem.start), problem.drive)
         yield SolverSetting(method.name, FIXED, h, solve, timed)
 
 
@@ -298,29 +304,29 @@ def _adaptive(
 ) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
         stepper = AdaptiveStepper(problem.system, method.name, tolerance, compiled=compiled)
-
-        def run(
-            stepper: AdaptiveStepper = stepper,
-            fresh: StepperCheckpoint = stepper.checkpoint(),  # noqa: B008
-        ) -> Array:
-            stepper.restore(fresh)
-            rows = [list(problem.start)]
-            at = Point(list(problem.start), list(problem.start), (), method.order)
-            for k in range(problem.count):
-                begin, end = k * problem.interval, (k + 1) * problem.interval
-                for step in stepper.accepted_steps(begin, end, at, problem.drive):
-                    at = step.end
-                rows.append(at.y)
-            return np.array(rows)
+        run = partial(_run_adaptively, problem, stepper, stepper.checkpoint(), method.order)
 
         def solve(
             stepper: AdaptiveStepper = stepper, run: Callable[[], Array] = run
         ) -> tuple[Array, int]:
             before = stepper.budget.spent
-            states = run()
-            return states, stepper.budget.spent - before
+            return run(), stepper.budget.spent - before
 
         yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
+
+
+def _run_adaptively(
+    problem: InitialValueProblem, stepper: AdaptiveStepper, fresh: StepperCheckpoint, order: int
+) -> Array:
+    stepper.restore(fresh)
+    rows = [list(problem.start)]
+    at = Point(list(problem.start), list(problem.start), (), order)
+    for k in range(problem.count):
+        begin, end = k * problem.interval, (k + 1) * problem.interval
+        for step in stepper.accepted_steps(begin, end, at, problem.drive):
+            at = step.end
+        rows.append(at.y)
+    return np.array(rows)
 
 
 def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iterator[SolverSetting]:
@@ -330,20 +336,15 @@ def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iter
     for its steps, which solves the motion several times.
     """
     torque = problem.scene.torque or (0.0, 0.0, 0.0)
-    start = problem.start[:-1]
-    times = problem.interval_ns * np.arange(problem.count + 1) / NANOSECONDS
+    given = problem.scene, torque, problem.start[:-1], problem.seconds
     longest = math.inf
     for tolerance in (1e-2, 1e-3, *_TOLERANCES):
-
-        def prepare(tolerance: float = tolerance) -> GaussMotion:
-            return GaussMotion(
-                problem.scene, torque, start, problem.seconds, tolerance, compiled=compiled
-            )
+        prepare = partial(GaussMotion, *given, tolerance, compiled=compiled)
 
         def solve(prepare: Callable[[], GaussMotion] = prepare) -> tuple[Array, int]:
             motion = prepare()
-            states = np.full((len(times), len(problem.start)), np.nan)
-            states[:, :-1] = motion.at(times)
+            states = np.full((problem.count + 1, len(problem.start)), np.nan)
+            states[:, :-1] = motion.at(problem.times)
             return states, motion.evaluations
 
         if kind == TOLERANCE:
@@ -358,11 +359,12 @@ def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iter
 
 def _simulated(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
+        run = partial(problem.simulated, method.name, tolerance)
 
-        def solve(tolerance: float = tolerance) -> tuple[Array, None]:
-            return problem.simulated(method.name, tolerance), None
+        def solve(run: Callable[[], Array] = run) -> tuple[Array, None]:
+            return run(), None
 
-        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, solve)
+        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 
 
 def refined(
@@ -397,17 +399,15 @@ def _result(
             failure = str(error).splitlines()[0] if str(error) else "not finite"
     if not failure and not np.isfinite(states[:, :7]).all():
         failure = "not finite"
-    row = {
-        "method": setting.method, "kind": setting.kind, "setting": setting.setting,
-        "evaluations": evaluations, "wall_min_s": wall[0], "wall_median_s": wall[1],
-    }  # fmt: skip
+    row = {"method": setting.method, "kind": setting.kind, "setting": setting.setting}
+    row |= {"evaluations": evaluations, "wall_min_s": wall[0], "wall_median_s": wall[1]}
     if not failure:
         final, largest = problem.errors(states, truth.states)
         if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
             failure = f"off by {largest.orientation:.1g} rad"
         else:
             errors = (*asdict(final).values(), *asdict(largest).values())
-            row |= dict(zip(COLUMNS[7:13], errors, strict=True))
+            row |= dict(zip(ERRORS, errors, strict=True))
             energy, row["closure_residual"] = problem.residuals(states[-1])
             row["energy_residual_J"] = energy if math.isfinite(energy) else None
             row["below_floor"] = largest.orientation < ABOVE_REFERENCE * truth.own.orientation

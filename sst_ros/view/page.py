@@ -47,41 +47,13 @@ _DIAGNOSTICS = {
 }
 """Diagnostics that are shown: label, unit, format."""
 
-_templates = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-_templates.globals["style"] = (
-    "font-size:13px;line-height:1.5;padding:2px 10px;font-variant-numeric:tabular-nums;"
-    "overflow-wrap:anywhere"
+_templates = jinja2.Environment(
+    loader=jinja2.PackageLoader("sst_ros.view"),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
 )
-_HEAD = _templates.from_string("""
-<div style="{{ style }}"><div style="font-size:15px"><b>{{ scene.name }}</b></div>
-<div style="color:#555">{{ scene.description }}</div>
-<div style="font-size:15px"><b id="sst-phase" style="color:{{ colour }}">{{ phase }}</b>
-&nbsp; t = <span id="sst-time">{{ time }}</span></div></div>
-""")
-_JOINTS = _templates.from_string("""
-<div style="{{ style }}"><table style="width:100%;border-collapse:collapse"><tr><th></th>
-{% for colour in colours %}
-<th style="color:{{ colour }};text-align:right;width:24%">leg {{ loop.index }}</th>
-{% endfor %}
-</tr>
-{% for name, unit, values in rows %}
-<tr><td>{{ name }} <span style="color:#777">{{ unit }}</span></td>
-{% for value in values %}
-<td style="text-align:right" data-joint="{{ name }}{{ loop.index }}">{{ "%.2f" % value }}</td>
-{% endfor %}
-</tr>
-{% endfor %}
-</table></div>
-""")
-_STATUS = _templates.from_string("""
-<div style="{{ style }}"><table style="width:100%">
-<tr><td colspan="2" style="color:{{ colour }}">{{ message }}</td></tr>
-{% for label, value in rows %}
-<tr><td>{{ label }}</td><td style="text-align:right">{{ value }}</td></tr>
-{% endfor %}
-</table></div>
-""")
-_CONTROLLER = _templates.from_string("<small>&nbsp; commands come from {{ name }}</small>")
+_PANEL: Any = _templates.get_template("panel.html").module
 
 
 class Page:
@@ -233,24 +205,21 @@ class _Panel:
         )
         # No minus before a zero.
         shown = [(name, unit, [float(x) + 0.0 for x in values]) for name, unit, values in rows]
-        self._joints.content = _JOINTS.render(colours=_COLOURS, rows=shown)
+        self._joints.content = str(_PANEL.joints(_COLOURS, shown))
         values = [
             (label, f"{_format(status.values[key], form)} {unit}")
             for key, (label, unit, form) in _DIAGNOSTICS.items()
             if status.values.get(key)
         ]
         colour = _LEVELS[status.level]
-        self._status.content = _STATUS.render(colour=colour, message=status.message, rows=values)
+        self._status.content = str(_PANEL.status(colour, status.message, values))
 
     def _show_head(self, state: ViewState | None, status: RunStatus) -> None:
         """Show name, description, phase and time."""
         phase = status.phase or "no simulator"
-        self._head.content = _HEAD.render(
-            scene=self._scene,
-            phase=phase,
-            colour=_LEVELS[2 if phase.startswith("fault") else status.level],
-            time="–" if state is None or state.time is None else f"{state.time:.2f} s",
-        )
+        colour = _LEVELS[2 if phase.startswith("fault") else status.level]
+        time = "–" if state is None or state.time is None else f"{state.time:.2f} s"
+        self._head.content = str(_PANEL.head(self._scene, phase, colour, time))
 
     def draw(self) -> None:
         """Draw the plots."""
@@ -326,7 +295,7 @@ class _RunControls:
         for handle in (*self._sliders, self._zero):
             if handle.disabled != bool(controller):
                 handle.disabled = bool(controller)
-        note = _CONTROLLER.render(name=controller) if controller else ""
+        note = str(_PANEL.commanded(controller)) if controller else ""
         if note != self._note.content:
             self._note.content = note
 

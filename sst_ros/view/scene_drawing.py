@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
-from viser import ViserServer
+from viser import ArrowsHandle, ViserServer
 
 from sst_ros.description.tree import (
     BASE,
@@ -64,27 +64,14 @@ class SceneDrawing:
             np.stack([colours[:-1], colours[1:]], axis=1),
             thickness=0.016 * size,
         )
-        radius = scene.star.radius
-        server.scene.add_arrows(
-            f"{_ROOT}/{STAR}/s",
-            np.array([[[0.0, 0.0, radius], [0.0, 0.0, 1.28 * radius]]]),
-            _linear(STAR_COLOUR),
-            shaft_radius=0.010 * size,
-            head_radius=0.028 * size,
-            head_length=0.075 * size,
-        )
+        outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
+        self._add_arrow(f"{STAR}/s", outward, STAR_COLOUR, (0.010, 0.028, 0.075))
         self._torques = [
-            server.scene.add_arrows(
-                f"{_ROOT}/torque_{k + 1}",
-                np.zeros((1, 2, 3)),
-                _linear(colour),
-                shaft_radius=0.014 * size,
-                head_radius=0.040 * size,
-                head_length=0.090 * size,
-                visible=False,
-            )
-            for k, colour in enumerate(LEG_COLOURS)
+            self._add_arrow(f"torque_{k}", np.zeros((2, 3)), colour, (0.014, 0.040, 0.090))
+            for k, colour in enumerate(LEG_COLOURS, 1)
         ]
+        for arrow in self._torques:
+            arrow.visible = False
         self._largest_torque = 1.0
 
     def remove(self) -> None:
@@ -127,6 +114,23 @@ class SceneDrawing:
                 arrow.points = (ends if torque > 0.0 else ends[::-1]).astype(np.float32)[None]
             if visible != arrow.visible:
                 arrow.visible = visible
+
+    def _add_arrow(
+        self, name: str, ends: Array, colour: ArrayLike, sizes: tuple[float, float, float]
+    ) -> ArrowsHandle:
+        """Add an arrow between two points; sizes of shaft and head are parts of the largest link's.
+
+        viser takes linear colours for arrows, and sRGB for all else.
+        """
+        shaft, head, length = (self._size * size for size in sizes)
+        return self._server.scene.add_arrows(
+            f"{_ROOT}/{name}",
+            ends[None],
+            np.asarray(colour, dtype=float) ** 2.2,
+            shaft_radius=shaft,
+            head_radius=head,
+            head_length=length,
+        )
 
     def _add_labels(self) -> None:
         """Name the vertices P_k of the base triangle, on its outer side, and E."""
@@ -201,8 +205,3 @@ def _z_along(z: Array) -> Array:
 
 def _angles(state: ViewState) -> dict[str, float]:
     return dict(zip(JOINTS, (*state.gamma, *state.mu, *state.beta), strict=True))
-
-
-def _linear(colours: ArrayLike) -> Array:
-    """Convert sRGB to linear colours, which viser takes for arrows only."""
-    return np.asarray(np.asarray(colours, dtype=float) ** 2.2)

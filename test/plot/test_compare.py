@@ -29,10 +29,8 @@ def shifted(bags, entries, by_ns, turn=0.0, keep=lambda sample: True):
             content = dataclasses.replace(content, position=position)
         if entry.topic == bags.ORIENTATION:
             q, c, s = content.quaternion, math.cos(turn / 2), math.sin(turn / 2)
-            about_z = bags.make(
-                "geometry_msgs/Quaternion", x=c * q.x - s * q.y, y=c * q.y + s * q.x,
-                z=c * q.z + s * q.w, w=c * q.w - s * q.z,
-            )  # fmt: skip
+            x, y, z, w = c * q.x - s * q.y, c * q.y + s * q.x, c * q.z + s * q.w, c * q.w - s * q.z
+            about_z = bags.make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
             content = dataclasses.replace(content, quaternion=about_z)
         if keep(entry.sample):
             result.append(dataclasses.replace(entry, content=content))

@@ -61,9 +61,7 @@ except OSError as error:
 
 @pytest.mark.parametrize("form", ["pdf", "png", "svg"])
 def test_a_picture_on_a_full_disk(form, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, tmp_path / f"picture.{form}"],
-        capture_output=True, text=True, timeout=100,
-    )  # fmt: skip
+    command = [sys.executable, "-c", PROGRAM, tmp_path / f"picture.{form}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.stdout == f"{errno.EFBIG}\n", done.stderr
     assert done.stderr == ""

@@ -80,32 +80,30 @@ def test_a_browser_that_has_the_url_is_served(server):
     assert handshake(server, query=f"?token={token}")
 
 
+def refuse(server, **given):
+    with pytest.raises(InvalidStatus) as refused:
+        handshake(server, **given)
+    assert refused.value.response.status_code == 403
+
+
 @pytest.mark.parametrize(
     "origin",
     ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1.evil.example"],
 )
 def test_a_page_of_another_origin_is_refused_even_with_the_token(server, origin):
-    _, token = parts(server)
-    with pytest.raises(InvalidStatus) as refused:
-        handshake(server, origin=origin, query=f"?token={token}")
-    assert refused.value.response.status_code == 403
+    refuse(server, origin=origin, query=f"?token={parts(server)[1]}")
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:18280", "127.0.0.1.evil.example"])
 def test_a_name_that_was_rebound_to_this_machine_is_refused(server, host):
-    _, token = parts(server)
-    with pytest.raises(InvalidStatus) as refused:
-        handshake(server, host=host, origin=f"http://{host}", query=f"?token={token}")
-    assert refused.value.response.status_code == 403
-    assert get(server, f"/?token={token}", Host=host)[0] == 403
+    query = f"?token={parts(server)[1]}"
+    refuse(server, host=host, origin=f"http://{host}", query=query)
+    assert get(server, f"/{query}", Host=host)[0] == 403
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=guessed", "?token=%C3%A4"])
 def test_nobody_enters_without_the_token(server, query):
-    own, _ = parts(server)
-    with pytest.raises(InvalidStatus) as refused:
-        handshake(server, origin=f"http://{own}", query=query)
-    assert refused.value.response.status_code == 403
+    refuse(server, origin=f"http://{parts(server)[0]}", query=query)
     status, _, body = get(server, f"/{query}")
     assert status == 403 and b"token" in body
 

@@ -1,0 +1,437 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a recorded run: numbers, verdict, tables, pictures; and lies in the recording."""
+
+import base64
+import dataclasses
+import importlib
+import json
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from sst_ros import __main__ as cli
+from sst_ros.errors import InputError
+from sst_ros.integration.propagator import TickPropagator
+from sst_ros.recording import recording
+from sst_ros.report import overview, reference, timing
+from sst_ros.report.run import evaluate, report, summary_table, summary_text
+from sst_ros.scene import scene
+
+ROOT = str(Path(__file__).parents[2])
+LATENCY_NS = 400_000
+SENT_NS = 50_000
+PROFILE = scene.load("example2").torque.at
+
+
+@pytest.fixture(scope="module")
+def lively(bags, example2):
+    """Receptions with a known jitter, and the command of every tick 0.4 ms before its step."""
+    entries = []
+    for entry in example2:
+        late = 30_000 if entry.sample > 0 and entry.sample % 10 == 0 else 0
+        entries.append(dataclasses.replace(entry, received_ns=entry.received_ns + late))
+    # The step of a tick begins when it ends, which is told SENT_NS later.
+    entries += commands(bags, 1, bags.TICK_NS + SENT_NS - LATENCY_NS)
+    return sorted(entries, key=lambda entry: entry.received_ns)
+
+
+def commands(bags, period, received_ns):
+    """A command every `period` ticks with the torque of the tick, received so much after it."""
+    for tick in range(0, 300, period):
+        received = bags.START_NS + tick * bags.TICK_NS + received_ns
+        yield bags.command_entry(received, PROFILE(tick * bags.TICK_NS / 1e9))
+
+
+def more_effort(by):
+    """Change the efforts of a message, or of the first tick in it."""
+
+    def change(message):
+        if hasattr(message, "effort"):
+            return dataclasses.replace(message, effort=message.effort + by)
+        first, *rest = message.points
+        first = dataclasses.replace(first, effort=first.effort + by)
+        return dataclasses.replace(message, points=[first, *rest])
+
+    return change
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, bags, example2):
+    """Report of a whole run: summary and folder."""
+    folder = tmp_path_factory.mktemp("report")
+    return report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
+
+
+def _numbers(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, (int, float)) else []
+
+
+def test_the_summary_is_written_whole_and_finite(whole):
+    summary, out = whole
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    text = (out / "summary.json").read_text(encoding="utf-8")
+    assert json.loads(text, parse_constant=refuse) == summary
+    assert len(_numbers(summary)) > 30 and all(map(math.isfinite, _numbers(summary)))
+    counts = {"ticks": 300, "ticks_missed": 0, "samples_published": 151, "samples_recorded": 151}
+    periods = {"sample_period_s": 0.002, "tick_period_s": 0.001, "step_mean_us": 160.5}
+    none = {"samples_lost": 0, "stamp_gaps": 0, "effort_difference_max_N_m": 0.0, "fault": ""}
+    texts = {"scene": "example2", "phase": "finished", "notes": [], "topics_missing": []}
+    expected = counts | periods | none | texts | {"samples_recorded_percent": 100.0}
+    assert {key: summary[key] for key in expected} == expected
+    assert summary["integration_error_gamma_rad"] < 1e-11
+    assert 0.0 < summary["integration_reference_error_gamma_rad"] < 1e-11
+    assert 1e-6 < summary["ideal_difference_gamma_rad"] < 1e-2
+    assert summary["formulation_difference_relative"] < 1e-12
+
+
+def test_the_table_says_it_all_in_line(whole):
+    summary, _ = whole
+    text = summary_table(summary)
+    for word in ("ticks done", "ticks missed", "real-time factor", "samples lost", "(a)", "(b)"):
+        assert word in text
+    assert f"{summary['integration_error_gamma_rad']:.2e}" in text
+    assert f"{summary['ideal_difference_gamma_dot_rad_per_s']:.2e}" in text
+    assert "NumPy" in text.split("\n\n")[-1]
+    assert all(len(line) < 140 and line == line.rstrip() for line in text.splitlines())
+
+
+def test_the_pictures_are_pictures(whole):
+    summary, out = whole
+    figures = ("10_path_of_E", "11_position_of_E", "12_theta", "13_phi", "14_psi")
+    names = [*(f"fig{name}.png" for name in figures), "torques.png", "error.png"]
+    assert summary["pictures"] == names
+    for name in names:
+        assert (out / name).stat().st_size > 10_000
+        pixels = image.imread(out / name)
+        assert pixels.shape[0] > 500 and pixels.shape[1] > 800
+        coloured = np.ptp(pixels[:, :, :3], axis=2) > 0.2
+        assert coloured.sum() > 500, f"{name} shows no curve"
+
+
+def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
+    out = tmp_path / "out"
+    kept = bags.without(lively, bags.DIAGNOSTICS, bags.EULER)
+    summary = report(bags.write(tmp_path / "bag", kept), out)
+    assert summary["page"] == ["page.png", "page.html"]
+    pixels = image.imread(out / "page.png")
+    assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 5000
+    text = (out / "page.html").read_text(encoding="utf-8")
+    pictures = re.findall(r"src='data:image/png;base64,([^']+)'", text)
+    assert len(pictures) == 1 + len(summary["pictures"])
+    assert base64.b64decode(pictures[0]) == (out / "page.png").read_bytes()
+    assert "http" not in re.sub(r"base64,[^']+", "", text)
+    assert "command to its step, mean" in text
+    assert "What the recording does not contain" in text
+    assert "Not known: no diagnostics" in summary_table(summary)
+
+
+def test_the_page_shows_text_as_text(whole, monkeypatch):
+    """The name of a scene is a stranger's: it must be no HTML."""
+    from sst_ros.report.results import render
+
+    summary = whole[0] | {"scene": "<script>", "unknown": ["<b>"]}
+    page = render("run.html", s=summary, table="<i>", overview="", pictures=[], made="")
+    assert "&lt;script&gt;" in page and not re.search("<script>|<b>|<i>", page)
+
+
+def test_loss_is_counted_and_survived(read, bags, example2):
+    lost = {20, 21, 60, 150}  # the last one can only be missed by what was published
+    kept = [e for e in bags.without(example2, bags.COMMANDS) if e.sample not in lost]
+    summary = evaluate(read(kept)).summary
+    assert summary["samples_published"] == 151 and summary["samples_recorded"] == 147
+    assert (summary["samples_lost"], summary["stamp_gaps"]) == (4, 2)
+    assert summary["samples_missing_between_stamps"] == 3
+    assert summary["samples_recorded_percent"] == pytest.approx(100.0 * 147 / 151)
+    assert summary["restarts_at_s"] == [0.044, 0.122]
+    assert summary["integration_error_gamma_rad"] < 1e-11
+    assert any("began again 2 times" in note for note in summary["notes"])
+    assert "Note: torques are missing" in summary_table(summary)
+
+
+def test_what_is_not_recorded_is_unknown(read, bags, example2):
+    found = evaluate(read(bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)))
+    summary = found.summary
+    assert summary["ticks"] is summary["real_time_factor"] is summary["phase"] is None
+    assert summary["samples_lost"] == 0
+    assert summary["topics_missing"] == ["euler_zyz", "diagnostics", "commands"]
+    assert any("no diagnostics" in note for note in summary["notes"])
+    assert any("euler_zyz is not recorded" in note for note in summary["notes"])
+    line = next(line for line in summary_table(summary).splitlines() if "ticks done" in line)
+    assert line.split()[-1] == "-"
+    assert summary["command_latency_mean_us"] is None and summary["commands_followed"] == 0
+    assert any("no commands are recorded" in words for words in summary["unknown"])
+    assert any("no diagnostics" in words for words in summary["unknown"])
+
+
+def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
+    start = scene.Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
+    near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
+    summary = report(bags.write(tmp_path / "bag", bags.simulated(near, 0.3)), tmp_path / "out")
+    assert summary["phase"] == "fault" and summary["fault"].startswith("stopped at t = 0.0")
+    assert summary["ticks"] == 5 and summary["samples_recorded"] == 4  # at 0, 2, 4 and 5 ms
+    assert summary["sample_period_s"] == 0.002 and summary["stamp_gaps"] == 0
+    assert summary["integration_error_gamma_rad"] < 1e-11
+    assert any("ended by a fault" in note for note in summary["notes"])
+    assert summary["fault"] in summary_table(summary)
+    assert "path_of_E.png" in summary["pictures"]  # no figure number outside the examples
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path, written, example2):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match=r"out = .*must be a folder that can be written"):
+        report(written(example2), tmp_path / "file")
+
+
+def test_a_good_run_is_ok_in_few_lines(read, bags, example2):
+    plain = bags.without(example2, bags.COMMANDS)
+    summary = evaluate(read([*plain, *commands(bags, 1, 600_000)])).summary
+    said = text_of(summary)
+    lines = said.splitlines()
+    assert (summary["verdict"], summary["reasons"]) == ("OK", [])
+    assert lines[0] == "OK: example2" and 12 <= len(lines) <= 18
+    assert lines[-1].startswith("Files: out: page.png")
+    assert any(line.split()[:2] == ["peak", "torques"] for line in lines)
+    assert "negative" not in said and "minimum -" not in said
+
+
+def text_of(summary):
+    return summary_text(summary | {"page": ["page.png"], "pictures": []}, "out")
+
+
+def test_a_slow_controller_is_warned_of(read, bags, example2):
+    plain = bags.without(example2, bags.COMMANDS)
+    summary = evaluate(read([*plain, *commands(bags, 40, 600_000)])).summary
+    first = text_of(summary).splitlines()[0]
+    assert first.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
+    assert summary["command_age_mean_s"] == pytest.approx(0.0187, abs=0.002)
+
+
+def test_a_negative_delay_has_its_meaning(read, bags, example2):
+    plain = bags.without(example2, bags.COMMANDS)
+    summary = evaluate(read([*plain, *commands(bags, 1, 1_900_000)])).summary
+    assert summary["command_latency_min_us"] < 0.0
+    said = text_of(summary)
+    assert "the recorder received a command after the step that applied it" in said
+
+
+def test_losses_and_errors_are_reasons(read, bags, example2):
+    change = more_effort(1e-9 * np.eye(9)[1])
+    entries = bags.edited(bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change)
+    summary = evaluate(read([e for e in entries if e.sample not in {20, 21, 60}])).summary
+    said = "; ".join(summary["reasons"])
+    assert summary["verdict"] == "WARNING" and "3 samples lost" in said
+    assert "2 gaps between applied torques" in said and "efforts differ" in said
+
+
+def test_tracking_figures_are_there_where_there_is_a_reference(read, bags, example2):
+    start = np.array(scene.load("example2").initial.gamma)
+    run = read(bags.tracked(example2, lambda _: (start, np.zeros(3))))
+    lines = [line.strip() for line in text_of(evaluate(run).summary).splitlines()]
+    assert any(line.startswith("tracking error, RMS") for line in lines)
+    assert any(line.startswith("settling time") for line in lines)
+
+
+def test_the_command_prints_verdict_and_files_and_all_when_asked(
+    tmp_path, bags, example2, capsys, undrawn
+):
+    bag = bags.record(tmp_path / "bag", example2)
+    assert cli.main(["report", "run", str(bag)]) == 0
+    short = capsys.readouterr().out
+    assert short.startswith("OK: example2\n") and len(short.splitlines()) < 20
+    assert short.splitlines()[-1].startswith(f"Files: {tmp_path / 'bag_report'}")
+    assert cli.main(["report", "run", str(bag), "--force", "--verbose"]) == 0
+    assert "Largest over the run" in capsys.readouterr().out
+
+
+def test_periods_and_latency_are_what_they_were_made(read, lively):
+    found = timing.measure(read(lively))
+    numbers = timing.numbers(found)
+    assert found.nominal_us == 2000.0 and len(found.period_us) == 150
+    assert numbers["period_min_us"] == 1970.0 and numbers["period_max_us"] == 2030.0
+    assert numbers["period_mean_us"] == pytest.approx(2000.0, abs=0.5)
+    assert numbers["period_p99_9_us"] == pytest.approx(2030.0)
+    assert numbers["commands_followed"] == 300
+    assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
+    assert numbers["command_latency_max_us"] == pytest.approx(430.0, abs=1e-2)  # a late sample's
+    assert numbers["command_latency_mean_us"] == pytest.approx(403.0, abs=0.1)
+    assert numbers["command_stamp_to_tick_mean_us"] is None
+    assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
+    assert numbers["energy_residual_max_J"] < 1e-12
+    assert not len(found.lost_s) and not len(found.gaps_s) and numbers["unknown"] == []
+
+
+def test_lost_samples_and_dropped_ticks_have_their_times(read, lively):
+    found = timing.measure(read([entry for entry in lively if entry.sample not in (20, 21, 60)]))
+    assert found.lost_s == pytest.approx([0.040, 0.042, 0.120])
+    assert found.gaps_s == pytest.approx([0.038, 0.118])
+    assert len(found.period_us) == 145
+    assert timing.numbers(found)["energy_residual_max_J"] < 1e-12
+
+
+def test_a_dropped_tick_shows(read, bags, example2):
+    """A tick that the simulator left out: the motion goes on as if it had been, and is caught."""
+
+    def shortened(message):
+        return dataclasses.replace(message, points=message.points[:1])
+
+    run = read(bags.edited(example2, bags.APPLIED, 75, shortened))
+    assert timing.measure(run).gaps_s == pytest.approx([0.149])
+    assert reference.integration(run).restarts_ns == (150_000_000,)
+
+
+def test_an_altered_torque_shows_when_it_was(read, bags, example2):
+    """One torque that is not what was applied: error and energy jump at its tick."""
+    run = read(bags.edited(example2, bags.APPLIED, 75, more_effort(1e-3 * np.eye(3)[0])))
+    error = reference.integration(run).error.gamma_dot
+    assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
+    assert error[:75].max() < 1e-11 and error[75:].min() > 1e-8
+    energy = np.abs(timing.measure(run).energy)
+    assert np.flatnonzero(energy > 1e-9)[0] == 75
+
+
+def test_an_altered_effort_of_joint_states_shows_when_it_was(read, bags, example2):
+    run = read(bags.edited(example2, bags.JOINTS, 75, more_effort(1e-9 * np.eye(9)[1])))
+    off = run.effort_difference
+    assert np.isnan(off[0]) and np.flatnonzero(off > 0.0).tolist() == [75]
+    summary = evaluate(run).summary
+    assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
+    assert summary["effort_difference_largest_at_s"] == 0.15
+    assert "(at 0.15 s)" in summary_table(summary)
+
+
+def test_stamps_of_another_clock_do_not_matter(read, lively):
+    entries = [dataclasses.replace(e, received_ns=e.received_ns - 10**15) for e in lively]
+    numbers = timing.numbers(timing.measure(read(entries)))
+    assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
+    assert numbers["period_max_us"] == 2030.0
+
+
+def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bags, example2):
+    """The torque of every other tick answers the sample of two milliseconds before it."""
+    entries = list(example2)
+    for tick in range(2, 300, 2):
+        command = bags.make(
+            "sensor_msgs/JointState",
+            header=bags.header(bags.START_NS + (tick - 2) * bags.TICK_NS),
+            name=["gamma_2", "gamma_1", "gamma_3"],
+            position=np.empty(0),
+            velocity=np.empty(0),
+            effort=np.array(PROFILE(tick * bags.TICK_NS / 1e9))[[1, 0, 2]],
+        )
+        received = bags.START_NS + tick * bags.TICK_NS
+        entries.append(bags.Entry(bags.STAMPED, received, command))
+    numbers = timing.numbers(timing.measure(read(entries)))
+    assert numbers["commands_followed"] == 149
+    for word in ("min", "mean", "max"):
+        assert numbers[f"command_stamp_to_tick_{word}_us"] == 2000.0
+    assert numbers["command_latency_mean_us"] == pytest.approx(1050.0, abs=1e-2)
+
+
+def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, example2):
+    entries = list(example2)
+    for k in (1, 2):
+        said = {"phase": "running", "ticks": 100 * k, "step_mean_us": 50.0}
+        said |= {"error_estimate": 10.0 ** -(12 - k), "hold_error_start": 1e-3 * k}
+        entries.append(bags.diagnostics_entry(bags.START_NS + k * 100_000_000, **said))
+    run = read(entries)
+    found = evaluate(run)
+    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
+    titles = {axes.get_title("left"): axes for axes in drawn.axes}
+    panel = titles["Error against computing time used, over the run"]
+    curves = {line.get_label(): line.get_xydata() for line in panel.lines}
+    error = curves["integration error"]
+    estimate = curves["its estimate by the simulator"]
+    assert len(error) > 100 and error[0, 0] == 0.0 and (np.diff(error[:, 0]) >= 0.0).all()
+    assert error[-1, 0] == pytest.approx(np.nanmax(estimate[:, 0]))
+    assert estimate[:2, 0] == pytest.approx([5.0, 10.0])  # 100 and 200 steps of 50 us, in ms
+    assert estimate[:2, 1] == pytest.approx([1e-11, 1e-10])
+    assert curves["hold error if torques are those of the start"][1, 1] == pytest.approx(2e-3)
+
+
+def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
+    """At 0.1 s the simulator falls behind by seven ticks, and says so from then on."""
+    entries = [
+        dataclasses.replace(e, received_ns=e.received_ns + 7 * bags.TICK_NS * (e.sample > 50))
+        for e in bags.without(example2, bags.DIAGNOSTICS)
+    ]
+    reports = {0.04: 0, 0.08: 0, 0.12: 7, 0.16: 7, 0.2: 7}
+    for seconds, missed in reports.items():
+        received = bags.START_NS + round(seconds * 1e9) + SENT_NS + missed * bags.TICK_NS
+        entries.append(bags.diagnostics_entry(received, phase="running", ticks_missed=missed))
+    run = read(entries)
+    found = timing.measure(run)
+    at, missed = found.reported[:, :2].T
+    assert at == pytest.approx(list(reports), abs=1e-9)
+    assert missed.tolist() == list(reports.values())
+    assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
+    assert not len(found.lost_s)
+    assert evaluate(run).summary["ticks_missed"] == 7
+
+
+@pytest.fixture(scope="module")
+def long_bag():
+    """Import benchmark/long_bag.py, which is not part of the package."""
+    pytest.importorskip("numba")
+    sys.path.insert(0, ROOT)
+    yield importlib.import_module("benchmark.long_bag")
+    sys.path.remove(ROOT)
+
+
+@pytest.fixture(scope="module")
+def long_run(long_bag, tmp_path_factory):
+    return recording.read(long_bag.write(tmp_path_factory.mktemp("long") / "bag", 20.0))
+
+
+def test_a_long_run_is_integrated_compiled(long_run, monkeypatch):
+    """The work that a report does for it, which is what its time and memory come from."""
+    calls = 0
+    follow = TickPropagator.follow
+
+    def counted(*given):
+        nonlocal calls
+        calls += 1
+        return follow(*given)
+
+    assert len(long_run.time_ns) == 10_001 and len(long_run.ticks.start_ns) == 20_000
+    monkeypatch.setattr(TickPropagator, "follow", counted)
+    integration, ideal = reference.integration(long_run), reference.ideal(long_run)
+    energy = timing.energy_residual(long_run, [])
+    assert calls == 3  # both references and the energy, in one call each
+    assert integration.compared == 10_001 and integration.error.gamma.max() < 1e-12
+    assert integration.own.gamma.max() < 1e-13 and ideal.error.gamma.max() < 1e-2
+    assert np.abs(energy).max() < 1e-11
+
+
+def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
+    compiled = reference.integration(long_run), timing.energy_residual(long_run, [])
+    monkeypatch.setenv("SST_ROS_NUMBA", "0")
+    monkeypatch.setattr(reference, "PLAIN_TICKS", 400)
+    monkeypatch.setattr(timing, "PLAIN_TICKS", 400)
+    missing = []
+    plain = reference.integration(long_run), timing.energy_residual(long_run, missing)
+    assert plain[0].compared == 201
+    assert plain[0].reasons == ("only the first 0.4 s are compared: there is no numba for more",)
+    assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201
+    assert plain[0].error.gamma[:201] == pytest.approx(compiled[0].error.gamma[:201], abs=1e-15)
+    assert plain[1][:201] == pytest.approx(compiled[1][:201], abs=1e-13)
+
+
+@pytest.mark.slow
+def test_a_minute_is_reported_whole(long_bag, tmp_path):
+    summary = report(long_bag.write(tmp_path / "bag", 60.0), tmp_path / "out")
+    assert summary["samples_recorded"] == summary["samples_compared"] == 30_001
+    assert summary["integration_error_gamma_rad"] < 1e-12
+    assert summary["commands_followed"] == 30_000
+    assert summary["command_latency_mean_us"] == pytest.approx(750.0)
