@@ -18,7 +18,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.host import child_process
 from sst_ros.report import tracking
-from sst_ros.report.run import report, summary_text
+from sst_ros.report.run import summary_text, write_run_report
 from sst_ros.scene import scene
 
 EXAMPLES = ("example1", "example2")
@@ -40,7 +40,7 @@ def demo(out: Path) -> int:
         bag = empty_bag(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
-        print(summary_text(report(bag, folder), str(folder)), flush=True)
+        print(summary_text(write_run_report(bag, folder), str(folder)), flush=True)
     return 0
 
 
@@ -59,7 +59,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
         bag = empty_bag(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
         follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
-        print(tracking.report(bag, out / mode), flush=True)
+        print(tracking.write_tracking_report(bag, out / mode), flush=True)
     return 0
 
 

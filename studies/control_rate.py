@@ -27,14 +27,14 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.methods import MARKERS
-from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, styled
+from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, with_style
 from sst_ros.recording import recording
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
     solve_reference,
 )
-from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.report.states import of_samples
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -189,7 +189,7 @@ def control_study(
     if recorded is not None:
         pairs = itertools.product(NODE_RATES, (START, MIDDLE))
         rows += [row_of(problem, reference, recorded(*pair), NODES) for pair in pairs]
-    return ControlStudy(scene.name, problem.seconds, reference, table(rows, COLUMNS))
+    return ControlStudy(scene.name, problem.seconds, reference, data_frame(rows, COLUMNS))
 
 
 def row_of(
@@ -258,7 +258,7 @@ def report(names: Sequence[str], out: Path, *, nodes: bool = False) -> bool:
         recorded = partial(record_run, name, out / "bags") if nodes else None
         studies.append(control_study(scenes.load(name), recorded=recorded, shown=True))
         print(section(studies[-1]), flush=True)
-        whole = table(row for study in studies for row in records(study.rows))
+        whole = data_frame(row for study in studies for row in records(study.rows))
         write(
             out, "control_rate", csv=whole,
             document={"rows": records(whole), "advice": {s.scene: advice(s) for s in studies}},
@@ -297,7 +297,7 @@ def grid(study: ControlStudy) -> DataFrame:
             "share of a core [%]": "{:.2g} to {:.2g}".format(
                 *(100 * group.core_share.agg(["min", "max"]))),
         })  # fmt: skip
-    return table(rows)
+    return data_frame(rows)
 
 
 def findings(study: ControlStudy) -> Iterator[str]:
@@ -318,7 +318,7 @@ HOLD_NAMES = {
 }
 
 
-@styled
+@with_style
 def figure(study: ControlStudy) -> Figure:
     """Draw the largest error over the control period and over the share of a core."""
     figure = free_figure(12.0, 6.6)

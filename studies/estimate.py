@@ -21,7 +21,7 @@ from sst_ros import SineTorque, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot.style import free_figure
-from sst_ros.report.results import markdown, provenance, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, write
 from sst_ros.scene.scene import Scene
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
@@ -184,8 +184,8 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
 
 def report(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
     """Write docs/estimate.md, its table and its picture."""
-    frame = table(rows)
-    summary = markdown(table(summarise(rows)))
+    frame = data_frame(rows)
+    summary = markdown(data_frame(summarise(rows)))
     figure = free_figure(8.0, 4.5)
     axes = figure.subplots()
     for name in CLASSES:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sst_ros.integration.codegen import numba_version
-from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.sweeps.job_list import run_jobs
 from studies import DOCS, parser, run
 from studies import extreme_runs as runs
@@ -64,7 +64,7 @@ def report(out: Path, workers: int | None = None, *, long: bool = False) -> bool
     cases = with_batches(cases, workers)
     steps = limits.largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
-    found = table(step._asdict() for step in steps)
+    found = data_frame(step._asdict() for step in steps)
     regions = limits.draw_regions(*limits.regions(), limits.scene_points(), provenance())
     write(
         out, "stability", csv=case_table(cases),
@@ -106,7 +106,7 @@ def _batched(group: tuple[int, ...]) -> list[tuple[str, bool]]:
 
 def case_table(cases: Sequence[CaseResult]) -> DataFrame:
     """Return a row for each case."""
-    return table(asdict(case) | {"passed": case.passed} for case in cases)
+    return data_frame(asdict(case) | {"passed": case.passed} for case in cases)
 
 
 def summary(cases: Sequence[CaseResult]) -> str:
@@ -144,7 +144,7 @@ def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
     parts += ["## Cases", ""]
     for group in dict.fromkeys(case.group for case in cases):
         own = [case for case in cases if case.group == group]
-        parts += [f"### {group}", "", markdown(table(map(_row, own))), ""]
+        parts += [f"### {group}", "", markdown(data_frame(map(_row, own))), ""]
     return "\n".join([*parts, provenance(), ""])
 
 

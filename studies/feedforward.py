@@ -37,7 +37,7 @@ from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking
 from sst_ros.errors import InputError, Problem
-from sst_ros.report.results import markdown, provenance, records, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
@@ -171,9 +171,9 @@ def feedforward_study(
     found = run_jobs(methodcaller("__call__"), jobs, f"{scene.name:<16}" if shown else "", workers)
     limits, count = len(plan.delays), len(holds) * len(plan.multiples)
     return FeedforwardStudy(
-        plan, motion.duration, left_out, table(found[limits : -count - 1], COLUMNS),
-        table(found[-count - 1 : -1]), found[-1],
-        table(found[:limits], ("delay", "theory", "ideal", "real")),
+        plan, motion.duration, left_out, data_frame(found[limits : -count - 1], COLUMNS),
+        data_frame(found[-count - 1 : -1]), found[-1],
+        data_frame(found[:limits], ("delay", "theory", "ideal", "real")),
     )  # fmt: skip
 
 
@@ -304,7 +304,7 @@ def rms_table(study: FeedforwardStudy) -> DataFrame:
                 row[mode] = "" if again else found
             benefit = study.benefit(error, bandwidth)
             rows.append({**row, "pd / feedforward_pd": f"{benefit:.3g}" if benefit else "-"})
-    return table(rows)
+    return data_frame(rows)
 
 
 def title(study: FeedforwardStudy) -> str:

@@ -33,9 +33,9 @@ from sst_ros.plot.style import (
     VERMILION,
     free_figure,
     note,
-    styled,
+    with_style,
 )
-from sst_ros.report.results import table
+from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -226,13 +226,13 @@ def step_table(steps: Sequence[LargestStep], family: str) -> DataFrame:
             f">= {1e3 * LONGEST_S:g}" if each.step >= LONGEST_S
             else f"{1e3 * each.step:.3g} ({each.step * each.rate:.2f})"
         )  # fmt: skip
-    return table(rows.values())
+    return data_frame(rows.values())
 
 
 TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: springs"}
 
 
-@styled
+@with_style
 def draw_largest_steps(steps: DataFrame, footnote: str) -> Figure:
     """Draw the largest stable step over the fastest rate, a panel for each family."""
     families = list(steps.family.unique())
@@ -272,7 +272,7 @@ def regions(
     return real, imaginary, found
 
 
-@styled
+@with_style
 def draw_regions(
     x: Array,
     y: Array,

@@ -14,14 +14,14 @@ from sst_ros.plot import compare, pictures
 from sst_ros.recording import signals
 from sst_ros.report import accuracy, stability
 from sst_ros.report.reference_solution import EXTENDED, MPMATH
-from sst_ros.report.run import report, summary_table, summary_text
+from sst_ros.report.run import summary_table, summary_text, write_run_report
 from sst_ros.scene.scene import load, names
 
 
 def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
     out = free_out(options, results_folder(options.bag, "report"))
-    summary = report(options.bag, out, damaged=options.damaged)
+    summary = write_run_report(options.bag, out, damaged=options.damaged)
     if options.verbose:
         print(summary_table(summary))
     print(summary_text(summary, str(out)), end="")
@@ -32,13 +32,13 @@ def report_accuracy(options: argparse.Namespace) -> None:
     out = free_out(options, "accuracy_out")
     kind = MPMATH if options.mpmath else EXTENDED
     scenes = [] if options.all else [*options.scenes, *options.scene]
-    accuracy.report(scenes or names(), out, kind=kind)
+    accuracy.write_accuracy_report(scenes or names(), out, kind=kind)
 
 
 def report_stability(options: argparse.Namespace) -> int:
     """Find the stable steps along a motion, and run the scene with other numbers."""
     out = free_out(options, "stability_out")
-    return 0 if stability.report(load(options.scene), out, options.only) else 1
+    return 0 if stability.write_stability_report(load(options.scene), out, options.only) else 1
 
 
 def draw_pictures(options: argparse.Namespace) -> int:
@@ -54,10 +54,10 @@ def draw_pictures(options: argparse.Namespace) -> int:
     out = free_out(options, results_folder(bags[0], "plots"))
     runs = [signals.read(bag) for bag in bags]
     if options.compare:
-        print(compare.table(runs))
-        paths, missing = compare.draw(runs, out, options.only)
+        print(compare.difference_text(runs))
+        paths, missing = compare.draw_comparison(runs, out, options.only)
     else:
-        paths, missing = pictures.draw(runs[0], out, options.only)
+        paths, missing = pictures.draw_run(runs[0], out, options.only)
     for path in paths:
         print(path)
     for name, why in missing.items():

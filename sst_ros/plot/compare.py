@@ -19,8 +19,8 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import workspace
-from sst_ros.plot.pictures import DEGREES, applied, draw_legs, known, save
-from sst_ros.plot.style import LINES, legend, positive, stack, styled, three
+from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
+from sst_ros.plot.style import LINES, leg_names, legend, positive, stack, with_style
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -46,11 +46,11 @@ def _overlay(
 
     def curve(run: Signals) -> tuple[Array, Array]:
         if quantity == "tau":
-            return applied(run)
+            return tick_torques(run)
         return run.seconds(), scale * run.legs(quantity)
 
     def make(runs: Drawn) -> Figure:
-        labels = [f"{name} [{unit}]" for name in three(letter)]
+        labels = [f"{name} [{unit}]" for name in leg_names(letter)]
         return draw_legs(labels, ((name, *curve(run), style) for run, name, style in runs))
 
     return make
@@ -98,8 +98,8 @@ PICTURES = {
 }
 
 
-@styled
-def draw(
+@with_style
+def draw_comparison(
     runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of several runs into `out`, as `pictures.draw` does of one.
@@ -140,10 +140,10 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     from pandas import DataFrame
 
     first, names = runs[0], labels(runs)
-    return DataFrame([_compared(first, run) for run in runs[1:]], index=names[1:])
+    return DataFrame([_compare(first, run) for run in runs[1:]], index=names[1:])
 
 
-def _compared(first: Signals, run: Signals) -> dict[str, float]:
+def _compare(first: Signals, run: Signals) -> dict[str, float]:
     here, there = _common(first, run)
     absent = {*first.missing, *run.missing}
     of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
@@ -181,7 +181,7 @@ def labels(runs: Sequence[Signals]) -> list[str]:
     return [f"{index}: {run.path}" for index, run in enumerate(runs, 1)]
 
 
-def table(runs: Sequence[Signals]) -> str:
+def difference_text(runs: Sequence[Signals]) -> str:
     """Write the differences as text."""
     found = differences(runs)
     shown = found.drop(columns=["samples", "of"])

@@ -26,6 +26,7 @@ from sst_ros.plot.style import (
     GREY,
     LINES,
     Looks,
+    leg_names,
     legend,
     lines,
     mark_ends,
@@ -33,7 +34,6 @@ from sst_ros.plot.style import (
     sides,
     span,
     stack,
-    three,
     widen,
 )
 from sst_ros.recording.signals import Signals
@@ -159,7 +159,7 @@ def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     if star != base:
         image = {"linewidth": 0.9, "linestyle": ":", "label": "its image on the sphere of E"}
         axes.plot(*(star * outline).T, color=GREY, **image)
-    for name, point in zip(three("P"), 1.14 * max(base, star) * geometry.v, strict=True):
+    for name, point in zip(leg_names("P"), 1.14 * max(base, star) * geometry.v, strict=True):
         axes.text(*point, name, ha="center", va="center")
     several = len(solutions) > 1
     for solution, style in zip(solutions, LINES, strict=False):

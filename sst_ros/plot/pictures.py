@@ -21,15 +21,15 @@ from sst_ros.plot.style import (
     VERMILION,
     envelope,
     few,
+    leg_names,
     legend,
     lines,
     mark_ends,
     save_figure,
-    scaled,
+    scale_down,
     span,
     stack,
-    styled,
-    three,
+    with_style,
 )
 from sst_ros.recording.signals import Integers, Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -77,7 +77,7 @@ def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], F
 
 def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
     """Return a panel of one quantity of the three legs."""
-    return label, three(letter), lambda run: scale * run.legs(quantity)
+    return label, leg_names(letter), lambda run: scale * run.legs(quantity)
 
 
 def draw_legs(
@@ -111,7 +111,7 @@ def _tracking(run: Signals, _: Scene) -> Figure:
     desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
     seconds = run.seconds()
     figure = draw_legs(
-        [f"{name} [deg]" for name in three("γ")],
+        [f"{name} [deg]" for name in leg_names("γ")],
         [
             ("desired", seconds, desired, {"color": GREY, "linewidth": 3.2}),
             ("measured", seconds, measured, {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}),
@@ -126,7 +126,7 @@ def _torques(run: Signals, _: Scene) -> Figure:
 
     Commands without a stamp are drawn where the recorder received them, by its clock.
     """
-    seconds, torque = applied(run)
+    seconds, torque = tick_torques(run)
     series = [("applied", seconds, torque, {"color": BLUE, "linewidth": 3.0})]
     table = next((name for name in ("commands_stamped", "commands") if name in run.tables), None)
     if table is not None:
@@ -135,12 +135,12 @@ def _torques(run: Signals, _: Scene) -> Figure:
         dots = {"color": VERMILION, "linestyle": "none", "marker": ".", "markersize": 1.5}
         if inside.any():
             series.append(("commanded", at[inside], values[inside], dots))
-    figure = draw_legs([f"{name} [N m]" for name in three("τ")], series)
+    figure = draw_legs([f"{name} [N m]" for name in leg_names("τ")], series)
     span(figure.axes, seconds)
     return figure
 
 
-def applied(run: Signals) -> tuple[Array, Array]:
+def tick_torques(run: Signals) -> tuple[Array, Array]:
     """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held."""
     start = run.time_ns("ticks")
     length = run.take("length", table="ticks")[:, 0].astype(np.int64)
@@ -165,7 +165,7 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     known = np.flatnonzero(np.isfinite(kinetic))[:1]
     raised = potential - (potential[known[0]] if len(known) else 0.0)
     gained = kinetic - (kinetic[known[0]] if len(known) else 0.0) + raised
-    residual, unit = scaled(gained - done)
+    residual, unit = scale_down(gained - done)
     shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
@@ -183,8 +183,8 @@ def _phase(run: Signals, _: Scene) -> Figure:
     for leg, axes in enumerate(figure.subplots(1, 3)):
         axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
         mark_ends(axes, angle[:, leg], rate[:, leg])
-        axes.set_xlabel(f"{three('γ')[leg]} [deg]")
-        axes.set_ylabel(f"{three('γ̇')[leg]} [rad/s]")
+        axes.set_xlabel(f"{leg_names('γ')[leg]} [deg]")
+        axes.set_ylabel(f"{leg_names('γ̇')[leg]} [rad/s]")
     figure.axes[-1].legend(loc="best", fontsize=8)
     return figure
 
@@ -251,8 +251,8 @@ PICTURES = {
 }
 
 
-@styled
-def draw(
+@with_style
+def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of a run into the folder `out`.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `styled` gives it the style. Long curves
-are drawn with few points: of every stretch the least and the largest value stay. No spike is lost,
-and a gap (nan) stays a gap; what is left out no picture could show.
+A function that draws takes data and returns a `Figure`; `with_style` gives it the style. Long
+curves are drawn with few points: of every stretch the least and the largest value stay. No spike is
+lost, and a gap (nan) stays a gap; what is left out no picture could show.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def with_style(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Give a function that makes a figure the style."""
 
     @functools.wraps(function)
@@ -78,7 +78,7 @@ def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     return within
 
 
-@styled
+@with_style
 def save_figure(figure: Figure, *paths: Path) -> None:
     """Write a figure into files; their suffixes name the formats.
 
@@ -99,7 +99,7 @@ def free_figure(width: float, height: float) -> Figure:
         return Figure(figsize=(width, height))
 
 
-def three(letter: str) -> tuple[str, str, str]:
+def leg_names(letter: str) -> tuple[str, str, str]:
     """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
     first, second, third = (f"{letter}{subscript}" for subscript in SUBSCRIPTS)
     return first, second, third
@@ -175,7 +175,7 @@ def note(figure: Figure, text: str, width: int) -> None:
     figure.text(0.01, 0.01, "\n".join(lines), fontsize=6.5, color="#555555", va="bottom")
 
 
-def scaled(values: Array) -> tuple[Array, str]:
+def scale_down(values: Array) -> tuple[Array, str]:
     """Return small values in a power of ten, and that power for the unit of the axis ("1e-14 ")."""
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     if not 0.0 < largest < 1e-3:

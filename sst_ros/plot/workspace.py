@@ -24,7 +24,7 @@ from sst_ros.mechanism import workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
-from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
+from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, with_style
 from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene
 
@@ -37,7 +37,7 @@ LABEL_INSET = math.radians(5.0)
 _ALARM = "#d1182b"
 
 
-@styled
+@with_style
 def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
     """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
 
@@ -72,7 +72,7 @@ class _Measure(NamedTuple):
 def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
     view = View(chart.geometry)
     poses = workspace.parallel_singularities(chart)
-    share = f"E reaches {100 * _reached(chart, faces):.0f} % of the triangle"
+    share = f"E reaches {100 * _reach(chart, faces):.0f} % of the triangle"
     worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
     least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
     figure.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
@@ -101,7 +101,7 @@ def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str
                 axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
-def _reached(chart: OrientationMap, faces: NDArray[np.intp]) -> float:
+def _reach(chart: OrientationMap, faces: NDArray[np.intp]) -> float:
     """Part of the triangle's area that E can be on."""
     a, b, c = (chart.s[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -154,7 +154,7 @@ def _panel(
         box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
         beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
         axes.annotate(text, place, (0, 8), color=INK, **beside)
-    frame(axes, view)
+    draw_triangle(axes, view)
 
 
 def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -> list[Any]:
@@ -168,7 +168,7 @@ def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -
     return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if condition else "%g°")]
 
 
-def frame(axes: Axes, view: View) -> None:
+def draw_triangle(axes: Axes, view: View) -> None:
     """Draw the base triangle with its corners and the sense of gamma along its arcs."""
     geometry = view.geometry
     reach = max(float(np.hypot(*view.flat(v))) for v in geometry.v)
@@ -240,7 +240,7 @@ def ground(scene: Scene) -> tuple[Figure, Axes, View]:
         drawn = axes.tricontour(inside, np.nan_to_num(margin), **looks)
         axes.clabel(drawn, fontsize=7, fmt="%g°")
         axes.plot([], [], color=GREY, linewidth=0.7, label="distance to the nearest limit")
-    frame(axes, view)
+    draw_triangle(axes, view)
     return figure, axes, view
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from sst_ros.plot.methods import draw_summary, draw_work_precision
 from sst_ros.report.reference_solution import EXTENDED
-from sst_ros.report.results import markdown, provenance, records, render, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, records, render, write
 from sst_ros.report.scene_summary import cost_table
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
@@ -29,7 +29,7 @@ TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is in titles."""
 
 
-def report(
+def write_accuracy_report(
     names: Sequence[str], out: Path, *, kind: str = EXTENDED, compiled: bool = True
 ) -> list[WorkPrecision]:
     """Study scenes one after another; print each, and write all finished results into `out`.
@@ -51,14 +51,14 @@ def report(
         if len(studies) == len(names):
             figures["accuracy"] = draw_summary(summary(studies), provenance(compiled=compiled))
         document = {"studies": [*documents(studies)], "terms": terms}
-        whole, said = frame(studies), page(studies, terms)
+        whole, said = join_grids(studies), page(studies, terms)
         write(out, "accuracy", csv=whole, document=document, page=said, figures=figures)
     return studies
 
 
-def frame(studies: Sequence[WorkPrecision]) -> DataFrame:
+def join_grids(studies: Sequence[WorkPrecision]) -> DataFrame:
     """Return the grids of all studies as one table."""
-    return table(row for study in studies for row in records(study.rows))
+    return data_frame(row for study in studies for row in records(study.rows))
 
 
 def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
@@ -99,7 +99,7 @@ def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
         }
         for study, target, best in found
     ]
-    return table(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
+    return data_frame(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
 
 
 def fastest(study: WorkPrecision, target: float = TARGET) -> str:
@@ -201,11 +201,11 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
         }
         run = "at rest" if each.rests else f"{each.seconds:g} s"
         rows.append({"scene": each.scene, "run": run, **cells})
-    costs = table({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
+    costs = data_frame({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
     return render(
         "accuracy.md",
         studies=studies,
-        summary=markdown(table(rows)),
+        summary=markdown(data_frame(rows)),
         terms=markdown(costs) if terms else "",
         fastest=fastest,
         facts=facts,

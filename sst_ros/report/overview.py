@@ -23,11 +23,11 @@ from sst_ros.plot.style import (
     Looks,
     few,
     positive,
-    scaled,
+    scale_down,
     span,
     stack,
-    styled,
     widen,
+    with_style,
 )
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
@@ -47,7 +47,7 @@ Series: TypeAlias = "Mapping[str, tuple[Array, Array] | None]"
 """Times or computing times and values by name; None for what was not recorded."""
 
 
-@styled
+@with_style
 def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
     figure, grid = stack(["largest difference"] * len(panels), 3.1)
@@ -98,7 +98,7 @@ def _curve(
     absent = reason or _missing(values)
     if values is None or absent:
         return Panel(title, Axes.set_axis_off, absent)
-    shown, unit = scaled(values)
+    shown, unit = scale_down(values)
 
     def draw(axes: Axes) -> None:
         axes.set_ylabel(label.replace("[", f"[{unit}"))
@@ -168,7 +168,7 @@ def _draw_losses(axes: Axes, losses: Series, end: float) -> None:
     axes.legend(fontsize=8, loc="upper left")
 
 
-@styled
+@with_style
 def draw_overview(
     run: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
 ) -> Figure:

@@ -144,7 +144,7 @@ class InitialValueProblem:
         closure = float(np.abs(np.sum(r * t, axis=1)).max())
         return float(after - before - y[-1]), closure
 
-    def fixed_steps(self, machine: CompiledMethod, steps: int) -> Array:
+    def run_steps(self, machine: CompiledMethod, steps: int) -> Array:
         """States at the instants with `steps` steps an interval; nan after the last finite one."""
         result = np.full((self.count + 1, len(self.start)), np.nan)
         y = list(self.start)
@@ -156,7 +156,7 @@ class InitialValueProblem:
                 result[k + 1] = y
         return result
 
-    def simulated(self, method: str, tolerance: float) -> Array:
+    def run_simulation(self, method: str, tolerance: float) -> Array:
         """States at the instants from `Simulation`.
 
         Raises:
@@ -217,7 +217,7 @@ def solve_reference(
     """
     if problem.kinked:
         rough, fine = (
-            problem.simulated("dop853", tolerance).astype(np.longdouble)
+            problem.run_simulation("dop853", tolerance).astype(np.longdouble)
             for tolerance in (1e-13, 1e-14)
         )
         how = "Simulation, dop853, tolerance 1e-14"
@@ -237,7 +237,7 @@ def solve_reference(
         how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers}"
     else:
         fine = solution.astype(np.longdouble)
-        rough = problem.fixed_steps(machine, best // 2).astype(np.longdouble)
+        rough = problem.run_steps(machine, best // 2).astype(np.longdouble)
         how = f"DOP853, {problem.interval / best:.3g} s steps, double precision"
     return ReferenceSolution(fine, _own(problem, rough, fine), how)
 
@@ -245,9 +245,9 @@ def solve_reference(
 def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int, Array]:
     """Halve the step until rounding dominates; return steps an interval, and the solution."""
     found: list[tuple[float, int, Array]] = []
-    before = problem.fixed_steps(machine, 1)
+    before = problem.run_steps(machine, 1)
     for power in range(1, 14):
-        after = problem.fixed_steps(machine, 2**power)
+        after = problem.run_steps(machine, 2**power)
         change = problem.errors(before, after.astype(np.longdouble))[1].orientation
         if math.isfinite(change):
             found.append((change, 2**power, after))

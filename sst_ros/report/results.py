@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-def table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> DataFrame:
+def data_frame(
+    rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
+) -> DataFrame:
     """Return a DataFrame of rows; what is unknown stays None.
 
     Raises:

@@ -53,7 +53,7 @@ class RunEvaluation(NamedTuple):
     summary: dict[str, Any]
 
 
-def evaluate(run: Recording) -> RunEvaluation:
+def evaluate_run(run: Recording) -> RunEvaluation:
     """Evaluate a recorded run.
 
     Raises:
@@ -72,7 +72,7 @@ def evaluate(run: Recording) -> RunEvaluation:
     return RunEvaluation(measured, integration, ideal, result)
 
 
-def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
+def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
 
     Args:
@@ -90,11 +90,11 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     """
     run = recording.read(bag, damaged=damaged)
     with write_into(out, "report"):
-        measured, integration, ideal, result = evaluate(run)
+        measured, integration, ideal, result = evaluate_run(run)
         errors = {"(a) integration error, against the same torques": integration}
         if ideal is not None:
             errors["(b) sample-and-hold error, against continuous torques"] = ideal
-        drawn, _ = pictures.draw(run.signals, out, DRAWN, ["png"])
+        drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
         figure = overview.draw_errors(run.seconds, errors)
         title = f"Error against run time, {run.scene.name}"
         drawn += pictures.save(figure, title, out, "error", ["png"])
@@ -105,8 +105,8 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
             "run.html",
             s=result,
             table=summary_table(result),
-            overview=_embed(out / PAGE),
-            pictures=[(path.stem.replace("_", " "), _embed(path)) for path in drawn],
+            overview=_encode(out / PAGE),
+            pictures=[(path.stem.replace("_", " "), _encode(path)) for path in drawn],
             made=made_line(result["report"]),
         )
         (out / HTML).write_text(page, encoding="utf-8")
@@ -115,7 +115,7 @@ def report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     return result
 
 
-def _embed(picture: Path) -> str:
+def _encode(picture: Path) -> str:
     return base64.b64encode(picture.read_bytes()).decode("ascii")
 
 
@@ -170,7 +170,7 @@ def summarise(
     summary = {
         "scene": run.scene.name,
         "bag": str(run.path),
-        **_reported(run),
+        **_read_diagnostics(run),
         **_loss(run),
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
         "tracking_error_rms_rad": None if found is None else found.rms.tolist(),
@@ -200,7 +200,7 @@ def summarise(
     }
 
 
-def _reported(run: Recording) -> dict[str, Any]:
+def _read_diagnostics(run: Recording) -> dict[str, Any]:
     """Take numbers and texts from the last diagnostics of the simulator."""
     reported = run.diagnostics
     texts = ("phase", "fault", "integrator")

@@ -38,7 +38,7 @@ def summary(scene: Scene) -> str:
         _right_hand_side(scene, dynamics),
         ["ends", *_columns(_ends(scene))],
         ["topics of the simulator", *_columns(_topics(dynamics))],
-        ["advice", *_wrapped(step_advice(scene).text, "  ")],
+        ["advice", *_wrap(step_advice(scene).text, "  ")],
         ["sources of the numbers", *_columns(scene.provenance)],
     )
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
@@ -84,7 +84,7 @@ def _right_hand_side(scene: Scene, dynamics: Dynamics) -> list[str]:
     for cost in costs(scene):
         lines.append(f"  {cost.name:<21}{cost.adds:>19}{cost.without:>24}")
     absent = [term for term in TERMS if not has(scene, term)]
-    return [*lines, "", "terms absent", *_wrapped(", ".join(absent) or "none", "  ")]
+    return [*lines, "", "terms absent", *_wrap(", ".join(absent) or "none", "  ")]
 
 
 def _ends(scene: Scene) -> Iterator[tuple[str, str]]:
@@ -110,10 +110,10 @@ def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
     pairs = list(rows)
     width = max((len(name) for name, _ in pairs), default=0)
     for name, text in pairs:
-        yield from _wrapped(text, f"  {name:<{width}}  ")
+        yield from _wrap(text, f"  {name:<{width}}  ")
 
 
-def _wrapped(text: str, first: str) -> list[str]:
+def _wrap(text: str, first: str) -> list[str]:
     return textwrap.wrap(
         text,
         WIDTH,

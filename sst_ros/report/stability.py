@@ -29,7 +29,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.methods import draw_stability
-from sst_ros.report.results import markdown, provenance, records, render, table, write
+from sst_ros.report.results import data_frame, markdown, provenance, records, render, write
 from sst_ros.report.step_advice import (
     LONGEST_S,
     TOLERANCE,
@@ -118,7 +118,7 @@ class StabilityReport(NamedTuple):
         return all(run.passed is not False for run in self.runs)
 
 
-def report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
+def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
 
     Args:
@@ -134,7 +134,7 @@ def report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
         SstError: the scene cannot start.
 
     """
-    found = examine(scene, only, shown=True)
+    found = examine_stability(scene, only, shown=True)
     said = page(found)
     print(said)
     steps, runs = records(found.steps.replace(math.inf, None)), records(_run_table(found))
@@ -144,7 +144,9 @@ def report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     return found.passed
 
 
-def examine(scene: Scene, only: Sequence[str] = (), *, shown: bool = False) -> StabilityReport:
+def examine_stability(
+    scene: Scene, only: Sequence[str] = (), *, shown: bool = False
+) -> StabilityReport:
     """Find the stable steps along the motion of a scene, and run it with other numbers."""
     for name in only:
         if name not in ROWS:
@@ -178,7 +180,7 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
         decay, oscillation = max(0.0, -values.real.min()), np.abs(values.imag).max()
         limits = {name: largest_stable_step(method, values) for name, method in METHODS.items()}
         rows.append({"t_s": t, "decay": float(decay), "oscillation": float(oscillation), **limits})
-    return table(rows)
+    return data_frame(rows)
 
 
 def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRun:
@@ -352,7 +354,7 @@ ROWS: dict[str, tuple[str, Change]] = {
 
 
 def _run_table(found: StabilityReport) -> DataFrame:
-    return table((run._asdict() for run in found.runs), StressRun._fields)
+    return data_frame((run._asdict() for run in found.runs), StressRun._fields)
 
 
 def step_lines(found: StabilityReport) -> Iterator[str]:
@@ -392,7 +394,7 @@ def page(found: StabilityReport) -> str:
         failed=sum(run.passed is False for run in found.runs),
         factor=FACTOR,
         rounding=ROUNDING,
-        runs=markdown(table(rows)),
+        runs=markdown(data_frame(rows)),
         provenance=provenance(),
     )
 
@@ -400,5 +402,5 @@ def page(found: StabilityReport) -> str:
 def figure(found: StabilityReport) -> Figure:
     """Draw the report."""
     runs = [run for run in found.runs if run.passed is not None]
-    rows = table((run._asdict() for run in runs), StressRun._fields)
+    rows = data_frame((run._asdict() for run in runs), StressRun._fields)
     return draw_stability(found.steps, rows, f"Stability of {found.scene}", provenance())

@@ -121,13 +121,13 @@ def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.
     one = np.ones_like(z)
     if isinstance(method, Rosenbrock):
         for a, c in zip(method.a, method.c, strict=True):
-            at = one + _weighted(a, stages)
-            stages.append((z * at + _weighted(c, stages)) / (4.0 - z))
+            at = one + _combine(a, stages)
+            stages.append((z * at + _combine(c, stages)) / (4.0 - z))
         return np.asarray(at + stages[-1])
     for row in method.a:
-        stages.append(one + z * _weighted(row, stages))
-    return np.asarray(one + z * _weighted(method.b, stages))
+        stages.append(one + z * _combine(row, stages))
+    return np.asarray(one + z * _combine(method.b, stages))
 
 
-def _weighted(weights: tuple[float, ...], stages: list[Any]) -> Any:
+def _combine(weights: tuple[float, ...], stages: list[Any]) -> Any:
     return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)

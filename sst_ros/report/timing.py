@@ -112,7 +112,7 @@ def measure(recording: Recording) -> Timing:
         pace_s=pace_s,
         pace=pace,
         late_us=(late - late.min()) / 1e3,
-        reported=_reported(recording),
+        reported=_read_reports(recording),
         latency=pair_commands(recording, missing),
         energy=energy_residual(recording, missing),
         missing=tuple(missing),
@@ -155,7 +155,7 @@ def _pace(recording: Recording) -> tuple[Array, Array]:
     return (0.5 * (time[1:] + time[:-1]) / NANOSECONDS)[good], pace[good]
 
 
-def _reported(recording: Recording) -> Array:
+def _read_reports(recording: Recording) -> Array:
     """Return times of the run [s] and the numbers of REPORTED, from the simulator's reports."""
     rows = [
         [at - recording.received_ns[0], *(float(values.get(key) or "nan") for key in REPORTED)]
@@ -197,7 +197,7 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     most = np.inf if limit is None else limit
     asked, applied = (np.clip(each.torque, -most, most) for each in (commands, ticks))
     new, changed = _changes(asked), _changes(applied)
-    step_ns = _received(recording, ticks.end_ns[changed])
+    step_ns = _reception_of(recording, ticks.end_ns[changed])
     # The recorder may have received a command a little later than the simulator.
     earliest_ns = commands.received_ns[new] - ticks.period_ns
     command, tick = _pairs(asked[new], earliest_ns, applied[changed], step_ns)
@@ -209,11 +209,11 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     answered = np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan)
     passed = (step_ns[tick] - commands.received_ns[new][command]) / 1e3
     # A torque that is commanded once and for all answers no samples.
-    share, age = _answered(recording, begins) if len(begins) > 1 else (None, None)
+    share, age = _measure_answers(recording, begins) if len(begins) > 1 else (None, None)
     return Latency(begins / NANOSECONDS, passed, answered, share, age)
 
 
-def _answered(recording: Recording, begins: Integers) -> tuple[float, float]:
+def _measure_answers(recording: Recording, begins: Integers) -> tuple[float, float]:
     """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
     received, commands = recording.received_ns, recording.commands
     if commands.stamp_ns.any():
@@ -228,7 +228,7 @@ def _answered(recording: Recording, begins: Integers) -> tuple[float, float]:
     return share, float(held.mean() / NANOSECONDS) if len(held) else 0.0
 
 
-def _received(recording: Recording, time_ns: Integers) -> Integers:
+def _reception_of(recording: Recording, time_ns: Integers) -> Integers:
     """Return when times of the run were received [ns], interpolated between samples."""
     first = recording.received_ns[0]
     since = (recording.received_ns - first).astype(float)

@@ -54,7 +54,7 @@ class TrackedRun:
     limited: int | None
 
 
-def read(path: Path) -> TrackedRun:
+def read_tracking(path: Path) -> TrackedRun:
     """Read a rosbag2 recording of a run with the topics of the inverse-dynamics controller.
 
     Raises:
@@ -93,9 +93,9 @@ def of(run: Recording) -> TrackedRun | None:
         error_rate=off_rate,
         feedforward=feedforward,
         feedback=feedback,
-        torque=_applied(run, times, feedforward + feedback),
+        torque=_torque_of_ticks(run, times, feedforward + feedback),
     )
-    return TrackedRun(run, track, rows, _orientation_error(run, rows, gamma), _limited(run))
+    return TrackedRun(run, track, rows, _orientation_error(run, rows, gamma), _count_limited(run))
 
 
 def metrics(tracked: TrackedRun) -> TrackingMetrics:
@@ -103,7 +103,7 @@ def metrics(tracked: TrackedRun) -> TrackingMetrics:
     return evaluate_tracking(tracked.track, tracked.limited)
 
 
-def report(bag: Path, out: Path) -> str:
+def write_tracking_report(bag: Path, out: Path) -> str:
     """Evaluate a recorded run: write the table and the pictures into `out`, return the table.
 
     Raises:
@@ -111,23 +111,20 @@ def report(bag: Path, out: Path) -> str:
             cannot be written.
 
     """
-    tracked = read(bag)
-    lines = [
-        f"Tracking of {tracked.recording.scene.name}, from {bag}",
-        "",
-        tracking_table(metrics(tracked)),
-    ]
+    tracked = read_tracking(bag)
+    title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
+    lines = [title, "", tracking_table(metrics(tracked))]
     if np.isfinite(tracked.orientation_error).any():
         worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
     text = "\n".join(lines)
     with write_into(out, "report"):
         (out / TABLE).write_text(text, encoding="utf-8")
-    pictures.draw(tracked.recording.signals, out, PICTURES, ["png"])
+    pictures.draw_run(tracked.recording.signals, out, PICTURES, ["png"])
     return text
 
 
-def _limited(run: Recording) -> int | None:
+def _count_limited(run: Recording) -> int | None:
     counts = (
         status.values.get("samples_limited", "")
         for status in reversed(run.signals.statuses)
@@ -136,7 +133,7 @@ def _limited(run: Recording) -> int | None:
     return next((int(count) for count in counts if count.isdecimal()), None)
 
 
-def _applied(run: Recording, times: Integers, asked: Array) -> Array:
+def _torque_of_ticks(run: Recording, times: Integers, asked: Array) -> Array:
     """Torque of the tick that begins at each sample; what was lost is what was asked for.
 
     A sample after the last tick has no torque.

@@ -34,7 +34,7 @@ from sst_ros.report.reference_solution import (
     ReferenceSolution,
     solve_reference,
 )
-from sst_ros.report.results import table
+from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import GAUSS, simulate
@@ -187,7 +187,7 @@ def work_precision(
     rows: list[dict[str, Any]] = []
     ends: list[Array] = []
     for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
-        for row, end in refined(grid[part.start], problem, truth, longest_s):
+        for row, end in refine(grid[part.start], problem, truth, longest_s):
             rows.append({"scene": scene.name, **row})
             ends.append(end)
     zero = np.zeros((len(target.times), 3))
@@ -200,15 +200,17 @@ def work_precision(
         ends=target.ends,
         compiled=compiled,
         reference=truth,
-        rows=table(rows, COLUMNS),
+        rows=data_frame(rows, COLUMNS),
         advice=step_advice(scene),
-        measured=_measured(problem, truth),
+        measured=_measure_advice(problem, truth),
         formulation=difference,
         warnings=tuple(_warnings(problem, truth, rows, ends, difference)),
     )
 
 
-def _measured(problem: InitialValueProblem, truth: ReferenceSolution) -> tuple[float, float] | None:
+def _measure_advice(
+    problem: InitialValueProblem, truth: ReferenceSolution
+) -> tuple[float, float] | None:
     """Error and wall time of `simulate` with the method "auto"; None where it stops before."""
     began = time.perf_counter()
     motion = simulate(problem.scene, duration=problem.seconds, t_eval=problem.times)
@@ -275,31 +277,33 @@ def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[S
     found: list[Iterator[SolverSetting]] = []
     for method in METHODS.values():
         if not problem.clamped:  # fixed steps know no limit of torque
-            found.append(_fixed(problem, method, compiled))
+            found.append(_list_steps(problem, method, compiled))
         if not method.error_order:
             continue
         if not problem.kinked:
-            found.append(_adaptive(problem, method, compiled))
+            found.append(_list_tolerances(problem, method, compiled))
         elif not isinstance(method, Rosenbrock):  # which takes no torques that are functions
-            found.append(_simulated(problem, method))
+            found.append(_list_simulations(problem, method))
     if not problem.kinked:
-        found += [_collocated(problem, compiled, kind) for kind in (FIXED, TOLERANCE)]
+        found += [_list_collocation(problem, compiled, kind) for kind in (FIXED, TOLERANCE)]
     return found
 
 
-def _fixed(problem: InitialValueProblem, method: Method, compiled: bool) -> Iterator[SolverSetting]:
+def _list_steps(
+    problem: InitialValueProblem, method: Method, compiled: bool
+) -> Iterator[SolverSetting]:
     machine = CompiledMethod(problem.system, method, compiled=compiled)
     for steps in _STEPS_PER_INTERVAL:
         count, h = steps * problem.count, problem.interval / steps
 
         def solve(steps: int = steps, count: int = count) -> tuple[Array, int]:
-            return problem.fixed_steps(machine, steps), len(method.a) * count
+            return problem.run_steps(machine, steps), len(method.a) * count
 
         timed = partial(machine.step_fixed, 0.0, h, count, list(problem.start), problem.drive)
         yield SolverSetting(method.name, FIXED, h, solve, timed)
 
 
-def _adaptive(
+def _list_tolerances(
     problem: InitialValueProblem, method: Method, compiled: bool
 ) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
@@ -329,7 +333,9 @@ def _run_adaptively(
     return np.array(rows)
 
 
-def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iterator[SolverSetting]:
+def _list_collocation(
+    problem: InitialValueProblem, compiled: bool, kind: str
+) -> Iterator[SolverSetting]:
     """Yield settings of Gauss collocation, with the steps that each tolerance chooses.
 
     A run of fixed steps is one of a motion that has been prepared. One for a tolerance searches
@@ -357,9 +363,9 @@ def _collocated(problem: InitialValueProblem, compiled: bool, kind: str) -> Iter
                 yield SolverSetting(GAUSS, kind, motion.h, solve, motion.run)
 
 
-def _simulated(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
+def _list_simulations(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
-        run = partial(problem.simulated, method.name, tolerance)
+        run = partial(problem.run_simulation, method.name, tolerance)
 
         def solve(run: Callable[[], Array] = run) -> tuple[Array, None]:
             return run(), None
@@ -367,7 +373,7 @@ def _simulated(problem: InitialValueProblem, method: Method) -> Iterator[SolverS
         yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 
 
-def refined(
+def refine(
     settings: Iterator[SolverSetting],
     problem: InitialValueProblem,
     truth: ReferenceSolution,
@@ -394,7 +400,7 @@ def _result(
     with np.errstate(all="ignore"):
         try:
             states, evaluations = setting.solve()
-            wall = _timed(setting.timed)
+            wall = _measure_time(setting.timed)
         except (SstError, ArithmeticError, ValueError) as error:
             failure = str(error).splitlines()[0] if str(error) else "not finite"
     if not failure and not np.isfinite(states[:, :7]).all():
@@ -414,7 +420,7 @@ def _result(
     return row | {"failure": failure}, states[-1]
 
 
-def _timed(run: Callable[[], object]) -> tuple[float, float]:
+def _measure_time(run: Callable[[], object]) -> tuple[float, float]:
     walls: list[float] = []
     while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
         began = time.perf_counter()

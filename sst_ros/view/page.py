@@ -348,11 +348,11 @@ def _move(slider: GuiSliderHandle[float], value: float) -> None:
 def _ask(name: str, act: Callable[[], tuple[bool, str]]) -> Callable[[Any], None]:
     """Return a handler that acts and notifies the client of a refusal."""
 
-    def clicked(event: Any) -> None:
+    def on_click(event: Any) -> None:
         done, message = act()
         if not done and event.client is not None:
             event.client.add_notification(
                 f"{name} refused", message, auto_close_seconds=_REFUSAL_S, color="red"
             )
 
-    return clicked
+    return on_click

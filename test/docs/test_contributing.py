@@ -37,7 +37,7 @@ import pathlib, sys, threading
 import bags, sst_ros
 from sst_ros import Simulation, load_scene
 from sst_ros.recording.recording import read
-from sst_ros.report.run import evaluate, summary_table
+from sst_ros.report.run import evaluate_run, summary_table
 
 def passed(call):
     files, base = set(), pathlib.Path(sst_ros.__file__).parent
@@ -58,7 +58,7 @@ def step():
     simulation.step((0.0, 0.0, 0.0), 1_000_000)
 
 def report():
-    summary_table(evaluate(read(bag)).summary)
+    summary_table(evaluate_run(read(bag)).summary)
 
 # What is imported at the first use is imported before.
 Simulation("friction")

@@ -10,7 +10,7 @@ import pytest
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.plot import compare
-from sst_ros.plot.compare import PICTURES, differences, draw
+from sst_ros.plot.compare import PICTURES, differences, draw_comparison
 from sst_ros.recording import signals
 
 
@@ -84,14 +84,20 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
 def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(pair, bags, example2, tmp_path):
     poor = bags.write(tmp_path / "poor", [e for e in example2 if e.topic == bags.APPLIED])
     runs = [*pair, signals.read(poor)]
-    paths, missing = draw(runs, tmp_path / "out", ["gamma", "torques"])
+    paths, missing = draw_comparison(runs, tmp_path / "out", ["gamma", "torques"])
     assert [path.stem for path in paths[::2]] == ["compare_gamma", "compare_torques"]
     assert missing == {"gamma": "without poor: no joint_states there"}
     found = differences(runs).loc["poor"]
     assert found.tolist()[:2] == [0, 0] and found[2:].isna().all()
-    assert compare.table(runs).splitlines()[-1].split() == ["poor", "0", "of", "0", *"-----"]
+    assert compare.difference_text(runs).splitlines()[-1].split() == [
+        "poor",
+        "0",
+        "of",
+        "0",
+        *"-----",
+    ]
 
 
 def test_runs_that_cannot_be_told_apart_are_refused(pair, tmp_path):
     with pytest.raises(InputError, match="must be 2 to 6 bags"):
-        draw([pair[0]] * 7, tmp_path)
+        draw_comparison([pair[0]] * 7, tmp_path)

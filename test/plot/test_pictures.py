@@ -10,7 +10,7 @@ from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros.plot import motion, pictures
-from sst_ros.plot.pictures import PICTURES, draw
+from sst_ros.plot.pictures import PICTURES, draw_run
 from sst_ros.recording import recording, signals
 from sst_ros.report import timing
 from sst_ros.scene import scene
@@ -42,7 +42,7 @@ def drawn(run, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pictures, "save", keep)
-        paths, missing = draw(run, out)
+        paths, missing = draw_run(run, out)
     assert missing == {}
     assert {path.stem for path in paths} == set(kept) and len(kept) == len(PICTURES)
     return kept, out

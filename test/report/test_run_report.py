@@ -19,7 +19,7 @@ from sst_ros.errors import InputError
 from sst_ros.integration.propagator import TickPropagator
 from sst_ros.recording import recording
 from sst_ros.report import overview, reference, timing
-from sst_ros.report.run import evaluate, report, summary_table, summary_text
+from sst_ros.report.run import evaluate_run, summary_table, summary_text, write_run_report
 from sst_ros.scene import scene
 
 ROOT = str(Path(__file__).parents[2])
@@ -64,7 +64,7 @@ def more_effort(by):
 def whole(tmp_path_factory, bags, example2):
     """Report of a whole run: summary and folder."""
     folder = tmp_path_factory.mktemp("report")
-    return report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
+    return write_run_report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
 
 
 def _numbers(value):
@@ -123,7 +123,7 @@ def test_the_pictures_are_pictures(whole):
 def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     out = tmp_path / "out"
     kept = bags.without(lively, bags.DIAGNOSTICS, bags.EULER)
-    summary = report(bags.write(tmp_path / "bag", kept), out)
+    summary = write_run_report(bags.write(tmp_path / "bag", kept), out)
     assert summary["page"] == ["page.png", "page.html"]
     pixels = image.imread(out / "page.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 5000
@@ -149,7 +149,7 @@ def test_the_page_shows_text_as_text(whole, monkeypatch):
 def test_loss_is_counted_and_survived(read, bags, example2):
     lost = {20, 21, 60, 150}  # the last one can only be missed by what was published
     kept = [e for e in bags.without(example2, bags.COMMANDS) if e.sample not in lost]
-    summary = evaluate(read(kept)).summary
+    summary = evaluate_run(read(kept)).summary
     assert summary["samples_published"] == 151 and summary["samples_recorded"] == 147
     assert (summary["samples_lost"], summary["stamp_gaps"]) == (4, 2)
     assert summary["samples_missing_between_stamps"] == 3
@@ -161,7 +161,7 @@ def test_loss_is_counted_and_survived(read, bags, example2):
 
 
 def test_what_is_not_recorded_is_unknown(read, bags, example2):
-    found = evaluate(read(bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)))
+    found = evaluate_run(read(bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)))
     summary = found.summary
     assert summary["ticks"] is summary["real_time_factor"] is summary["phase"] is None
     assert summary["samples_lost"] == 0
@@ -178,7 +178,9 @@ def test_what_is_not_recorded_is_unknown(read, bags, example2):
 def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
     start = scene.Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
     near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
-    summary = report(bags.write(tmp_path / "bag", bags.simulated(near, 0.3)), tmp_path / "out")
+    summary = write_run_report(
+        bags.write(tmp_path / "bag", bags.simulated(near, 0.3)), tmp_path / "out"
+    )
     assert summary["phase"] == "fault" and summary["fault"].startswith("stopped at t = 0.0")
     assert summary["ticks"] == 5 and summary["samples_recorded"] == 4  # at 0, 2, 4 and 5 ms
     assert summary["sample_period_s"] == 0.002 and summary["stamp_gaps"] == 0
@@ -191,12 +193,12 @@ def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, written, example2):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"out = .*must be a folder that can be written"):
-        report(written(example2), tmp_path / "file")
+        write_run_report(written(example2), tmp_path / "file")
 
 
 def test_a_good_run_is_ok_in_few_lines(read, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate(read([*plain, *commands(bags, 1, 600_000)])).summary
+    summary = evaluate_run(read([*plain, *commands(bags, 1, 600_000)])).summary
     said = text_of(summary)
     lines = said.splitlines()
     assert (summary["verdict"], summary["reasons"]) == ("OK", [])
@@ -212,7 +214,7 @@ def text_of(summary):
 
 def test_a_slow_controller_is_warned_of(read, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate(read([*plain, *commands(bags, 40, 600_000)])).summary
+    summary = evaluate_run(read([*plain, *commands(bags, 40, 600_000)])).summary
     first = text_of(summary).splitlines()[0]
     assert first.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
     assert summary["command_age_mean_s"] == pytest.approx(0.0187, abs=0.002)
@@ -220,7 +222,7 @@ def test_a_slow_controller_is_warned_of(read, bags, example2):
 
 def test_a_negative_delay_has_its_meaning(read, bags, example2):
     plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate(read([*plain, *commands(bags, 1, 1_900_000)])).summary
+    summary = evaluate_run(read([*plain, *commands(bags, 1, 1_900_000)])).summary
     assert summary["command_latency_min_us"] < 0.0
     said = text_of(summary)
     assert "the recorder received a command after the step that applied it" in said
@@ -229,7 +231,7 @@ def test_a_negative_delay_has_its_meaning(read, bags, example2):
 def test_losses_and_errors_are_reasons(read, bags, example2):
     change = more_effort(1e-9 * np.eye(9)[1])
     entries = bags.edited(bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change)
-    summary = evaluate(read([e for e in entries if e.sample not in {20, 21, 60}])).summary
+    summary = evaluate_run(read([e for e in entries if e.sample not in {20, 21, 60}])).summary
     said = "; ".join(summary["reasons"])
     assert summary["verdict"] == "WARNING" and "3 samples lost" in said
     assert "2 gaps between applied torques" in said and "efforts differ" in said
@@ -238,7 +240,7 @@ def test_losses_and_errors_are_reasons(read, bags, example2):
 def test_tracking_figures_are_there_where_there_is_a_reference(read, bags, example2):
     start = np.array(scene.load("example2").initial.gamma)
     run = read(bags.tracked(example2, lambda _: (start, np.zeros(3))))
-    lines = [line.strip() for line in text_of(evaluate(run).summary).splitlines()]
+    lines = [line.strip() for line in text_of(evaluate_run(run).summary).splitlines()]
     assert any(line.startswith("tracking error, RMS") for line in lines)
     assert any(line.startswith("settling time") for line in lines)
 
@@ -305,7 +307,7 @@ def test_an_altered_effort_of_joint_states_shows_when_it_was(read, bags, example
     run = read(bags.edited(example2, bags.JOINTS, 75, more_effort(1e-9 * np.eye(9)[1])))
     off = run.effort_difference
     assert np.isnan(off[0]) and np.flatnonzero(off > 0.0).tolist() == [75]
-    summary = evaluate(run).summary
+    summary = evaluate_run(run).summary
     assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
     assert summary["effort_difference_largest_at_s"] == 0.15
     assert "(at 0.15 s)" in summary_table(summary)
@@ -346,7 +348,7 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, e
         said |= {"error_estimate": 10.0 ** -(12 - k), "hold_error_start": 1e-3 * k}
         entries.append(bags.diagnostics_entry(bags.START_NS + k * 100_000_000, **said))
     run = read(entries)
-    found = evaluate(run)
+    found = evaluate_run(run)
     drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
     titles = {axes.get_title("left"): axes for axes in drawn.axes}
     panel = titles["Error against computing time used, over the run"]
@@ -377,7 +379,7 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
     assert missed.tolist() == list(reports.values())
     assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
     assert not len(found.lost_s)
-    assert evaluate(run).summary["ticks_missed"] == 7
+    assert evaluate_run(run).summary["ticks_missed"] == 7
 
 
 @pytest.fixture(scope="module")
@@ -430,7 +432,7 @@ def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
 
 @pytest.mark.slow
 def test_a_minute_is_reported_whole(long_bag, tmp_path):
-    summary = report(long_bag.write(tmp_path / "bag", 60.0), tmp_path / "out")
+    summary = write_run_report(long_bag.write(tmp_path / "bag", 60.0), tmp_path / "out")
     assert summary["samples_recorded"] == summary["samples_compared"] == 30_001
     assert summary["integration_error_gamma_rad"] < 1e-12
     assert summary["commands_followed"] == 30_000

@@ -16,7 +16,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report import stability
-from sst_ros.report.stability import ROWS, examine, figure, page
+from sst_ros.report.stability import ROWS, examine_stability, figure, page
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 
@@ -26,7 +26,7 @@ FEW = ("as-it-is", "stroke", "singularity")
 
 @pytest.fixture(scope="module")
 def found():
-    return examine(EXAMPLE2, FEW)
+    return examine_stability(EXAMPLE2, FEW)
 
 
 def changed(name, scene=EXAMPLE2):
@@ -50,7 +50,9 @@ def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch):
         return motion
 
     monkeypatch.setattr(stability, "simulate", careless)
-    report = examine(dataclasses.replace(load("example2_stroke"), duration=0.5), ["as-it-is"])
+    report = examine_stability(
+        dataclasses.replace(load("example2_stroke"), duration=0.5), ["as-it-is"]
+    )
     assert report.runs[0].passed is False and not report.passed
     assert "| **FAILED** |" in page(report) and "1 runs, 1 failed" in page(report)
 
@@ -82,7 +84,7 @@ def test_a_run_at_a_limit_starts_there_and_goes_into_it(kind):
     rotation = rotation_matrix(np.array(scene.initial.orientation))
     measured = workspace.measures(geometry, np.array(scene.initial.gamma), rotation)
     assert 0.0 <= getattr(measured, kind) < 1e-9
-    report = examine(EXAMPLE2, [kind])
+    report = examine_stability(EXAMPLE2, [kind])
     assert report.passed and report.runs[0].result.startswith("stopped at t = 0.0000")
 
 
@@ -98,7 +100,7 @@ def test_a_run_beside_a_singularity_starts_beside_it():
 def test_the_steps_are_those_of_the_eigenvalues(found):
     assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
     assert (found.steps.rodas4 == math.inf).all()
-    stiff = examine(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
+    stiff = examine_stability(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
     for name, reach in (("rk4", 2.785), ("dopri5", 3.307)):
         assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(reach, rel=3e-3)
     assert "rodas4: every step is stable." in page(stiff)
@@ -130,4 +132,4 @@ def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
 
 def test_an_unknown_row_is_refused_with_the_nearest():
     with pytest.raises(InputError, match="singularity"):
-        examine(EXAMPLE2, ["singularities"])
+        examine_stability(EXAMPLE2, ["singularities"])

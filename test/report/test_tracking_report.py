@@ -26,7 +26,7 @@ def entries():
 
 def test_the_track_is_what_was_written(entries, written):
     bag = written(entries)
-    followed = tracking.read(bag)
+    followed = tracking.read_tracking(bag)
     run, track = recording.read(bag), followed.track
     assert len(track.time) == 51 and track.time[-1] == pytest.approx(0.1)
     assert track.gamma == pytest.approx(np.tile(HOME + OFF, (51, 1)))
@@ -41,7 +41,7 @@ def test_the_track_is_what_was_written(entries, written):
 
 def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entries, written):
     plain = bags.without(entries, bags.DESIRED, bags.ERROR)
-    followed = tracking.read(written(bags.tracked(plain, lambda _: (HOME, STILL))))
+    followed = tracking.read_tracking(written(bags.tracked(plain, lambda _: (HOME, STILL))))
     q = followed.recording.quaternion
     assert followed.orientation_error.max() > 1e-3
     assert followed.orientation_error == pytest.approx(angle_between(q, q[0]), abs=1e-12)
@@ -50,11 +50,11 @@ def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entr
 def test_the_last_report_of_the_controller_says_how_often_a_torque_was_limited(entries, written):
     said = bags.diagnostics_entry(entries[-1].received_ns + 1, samples_limited=7)
     said.content.status[0].name = "/sst_inverse_dynamics: control"
-    assert tracking.read(written([*entries, said])).limited == 7
+    assert tracking.read_tracking(written([*entries, said])).limited == 7
 
 
 def test_the_report_writes_a_table_and_a_picture(entries, written, tmp_path):
-    told = tracking.report(written(entries), tmp_path)
+    told = tracking.write_tracking_report(written(entries), tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
     assert "error, largest" in told and "nan" not in told
     for name in ("tracking", "tracking_error", "control_torques"):
@@ -63,7 +63,7 @@ def test_the_report_writes_a_table_and_a_picture(entries, written, tmp_path):
 
 def test_a_recording_without_a_reference_is_refused(entries, written, tmp_path):
     with pytest.raises(InputError, match="reference"):
-        tracking.report(written(bags.without(entries, bags.DESIRED)), tmp_path)
+        tracking.write_tracking_report(written(bags.without(entries, bags.DESIRED)), tmp_path)
 
 
 def test_messages_of_other_joints_are_refused(entries, written):
@@ -71,4 +71,4 @@ def test_messages_of_other_joints_are_refused(entries, written):
         return dataclasses.replace(message, name=["a", "b", "c"])
 
     with pytest.raises(InputError, match="tracking_error"):
-        tracking.read(written(bags.edited(entries, bags.ERROR, 3, renamed)))
+        tracking.read_tracking(written(bags.edited(entries, bags.ERROR, 3, renamed)))

@@ -14,7 +14,7 @@ from matplotlib import image
 from sst_ros.errors import InputError
 from sst_ros.plot.methods import draw_summary
 from sst_ros.plot.style import save_figure
-from sst_ros.report.accuracy import documents, fastest, figure, frame, page, text
+from sst_ros.report.accuracy import documents, fastest, figure, join_grids, page, text
 from sst_ros.report.accuracy import summary as summary_of
 from sst_ros.report.reference_solution import (
     EXTENDED,
@@ -22,7 +22,7 @@ from sst_ros.report.reference_solution import (
     HighPrecisionDop853,
     InitialValueProblem,
 )
-from sst_ros.report.results import table, write
+from sst_ros.report.results import data_frame, write
 from sst_ros.report.scene_summary import cost_table, operations
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
@@ -105,7 +105,7 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     write(
         tmp_path,
         "accuracy",
-        csv=frame([short]),
+        csv=join_grids([short]),
         document=document,
         page=page([short]),
         figures=drawn,
@@ -147,7 +147,7 @@ def graded(study, *errors):
         | {ERROR: error}
         for k, error in enumerate(errors)
     ]
-    return dataclasses.replace(study, rows=table(rows, COLUMNS))
+    return dataclasses.replace(study, rows=data_frame(rows, COLUMNS))
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_failures_stay_in_sight(tmp_path):
     failed = found.rows[found.rows.failure != ""]
     assert len(failed) and failed[ERROR].isna().all()
     assert text(found).count("FAILED") == len(failed)
-    assert frame([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
+    assert join_grids([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
     save_figure(figure(found), tmp_path / "picture.png")
 
 

@@ -51,7 +51,7 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
 
     What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
     """
-    run = tracking.read(twice[0] / "bag")
+    run = tracking.read_tracking(twice[0] / "bag")
     metrics = tracking.metrics(run)
     travel = np.ptp(run.track.gamma, axis=0).max()
     assert travel > 0.2
@@ -71,7 +71,7 @@ def test_a_run_in_lockstep_is_repeated_exactly(twice):
     first, second = (recording.read(folder / "bag") for folder in twice)
     for name in ("time_ns", "gamma", "gamma_dot", "quaternion", "effort"):
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
-    tracks = [tracking.read(folder / "bag").track for folder in twice]
+    tracks = [tracking.read_tracking(folder / "bag").track for folder in twice]
     for field in dataclasses.fields(tracks[0]):
         assert np.array_equal(*(getattr(track, field.name) for track in tracks)), field.name
 
@@ -200,7 +200,7 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
     run = recording.read(bag)
     assert not run.effort[-1].any() and run.effort[:100].any()  # let go
-    metrics = tracking.metrics(tracking.read(bag))
+    metrics = tracking.metrics(tracking.read_tracking(bag))
     # The last reference that was heard may have no state beside it: the controller is gone.
     assert metrics.samples > 90 and metrics.largest.max() < 1e-3
 

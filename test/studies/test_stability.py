@@ -10,7 +10,7 @@ from matplotlib import image
 
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.style import save_figure
-from sst_ros.report.results import table
+from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import stability_function
 from studies import stability_limits
 from studies.extreme import page
@@ -128,7 +128,7 @@ def test_the_figures_show_every_method(tmp_path):
         for family in ("decay", "oscillation") for method in METHODS for c in (1e1, 1e3, 1e5)
     ]  # fmt: skip
     drawn = {
-        "steps": draw_largest_steps(table(steps), "made today"),
+        "steps": draw_largest_steps(data_frame(steps), "made today"),
         "regions": draw_regions(*regions(points=81), {"a": np.array([-1 + 1j])}, "made today"),
     }
     for name, figure in drawn.items():
