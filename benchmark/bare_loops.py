@@ -33,7 +33,7 @@ from sst_ros.host import scheduling
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
 from sst_ros.nodes.topics import Reader
-from sst_ros.report.results import markdown, table
+from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
@@ -210,7 +210,7 @@ def compare(watch: Client, seconds: float, rounds: int) -> str:
                 "missed [%]": f"{mean(run['missed'] for run in runs):.3f}",
             }
             rows.append(row)
-        tables.append(markdown(table(rows)))
+        tables.append(markdown(data_frame(rows)))
     if said is not None:
         tables.append(f"With `cpu_dma_latency` 0: {said}.")
     return "\n\n".join(tables)

@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any, TypeVar
 
 from sst_ros.host.output import slices
-from sst_ros.report.results import markdown, processor, table
+from sst_ros.report.results import data_frame, markdown, processor
 
 Key = TypeVar("Key", bound=Hashable)
 DOCS = Path(__file__).parents[1] / "docs"
@@ -100,7 +100,7 @@ def format_columns(columns: Sequence[dict[str, str]]) -> str:
         {name: key, **dict(zip(heads, (c.get(key, "") for c in columns), strict=True))}
         for key in keys[1:]
     ]
-    return markdown(table(rows))
+    return markdown(data_frame(rows))
 
 
 class Costs:

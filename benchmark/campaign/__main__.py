@@ -19,7 +19,7 @@ from multiprocessing import get_context
 
 from benchmark.campaign.ledger import KINDS, PARTS, Ledger, run_part
 from benchmark.measure import DOCS, fill_page
-from sst_ros.report.results import markdown, table
+from sst_ros.report.results import data_frame, markdown
 
 PAGE = DOCS / "robustness.md"
 
@@ -35,7 +35,7 @@ def format_ledgers(ledgers: list[Ledger]) -> str:
         }
         for one in ledgers
     ]
-    return markdown(table(rows))
+    return markdown(data_frame(rows))
 
 
 def run_apart(part: str, share: float, seed: int) -> Ledger:
