@@ -27,7 +27,7 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.methods import MARKERS
-from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, with_style
+from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, styled
 from sst_ros.recording import recording
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
@@ -318,7 +318,7 @@ HOLD_NAMES = {
 }
 
 
-@with_style
+@styled
 def figure(study: ControlStudy) -> Figure:
     """Draw the largest error over the control period and over the share of a core."""
     figure = free_figure(12.0, 6.6)

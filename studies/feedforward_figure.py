@@ -28,7 +28,7 @@ MARKERS = dict(zip(MODES, _LOOKS, strict=True))
 _FAILED, _SPREAD = 12.0, 0.13
 
 
-@with_style
+@styled
 def draw_study(study: FeedforwardStudy, title: str) -> Figure:
     """Draw a study: a panel of errors for each bandwidth, orders of the hold, and limits."""
     loops, bandwidths = study.loops, study.plan.bandwidths

@@ -22,7 +22,7 @@ from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA, value_of
-from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, with_style
+from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
 from sst_ros.scene.scene import Scene, load
@@ -116,7 +116,7 @@ def compare(out: Path, identified: str) -> str:
     return text
 
 
-@with_style
+@styled
 def draw_tracking_errors(tracks: Mapping[str, TrackingRecord], title: str) -> Figure:
     """Draw the largest tracking error of the three joints over time, a curve for each run."""
     figure = Figure(figsize=(7.0, 3.6))

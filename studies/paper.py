@@ -24,7 +24,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
 from sst_ros.plot.motion import path as path_of_e
 from sst_ros.plot.pictures import PICTURES, save
-from sst_ros.plot.style import BLUE, VERMILION, positive, with_style
+from sst_ros.plot.style import BLUE, VERMILION, positive, styled
 from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
@@ -59,7 +59,7 @@ class LargestDifference(NamedTuple):
         return f"{self.scene}: {self.what}: {self.value:.1e} {self.unit}, {limit}"
 
 
-@with_style
+@styled
 def paper(out: Path) -> list[LargestDifference]:
     """Run both examples, draw the figures into `out` and write an index page.
 

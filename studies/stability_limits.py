@@ -33,7 +33,7 @@ from sst_ros.plot.style import (
     VERMILION,
     free_figure,
     note,
-    with_style,
+    styled,
 )
 from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, step_advice
@@ -232,7 +232,7 @@ def step_table(steps: Sequence[LargestStep], family: str) -> DataFrame:
 TITLES = {"decay": "Damped: viscous friction", "oscillation": "Oscillating: springs"}
 
 
-@with_style
+@styled
 def draw_largest_steps(steps: DataFrame, footnote: str) -> Figure:
     """Draw the largest stable step over the fastest rate, a panel for each family."""
     families = list(steps.family.unique())
@@ -272,7 +272,7 @@ def regions(
     return real, imaginary, found
 
 
-@with_style
+@styled
 def draw_regions(
     x: Array,
     y: Array,

@@ -18,7 +18,7 @@ from sst_ros.identification.measured_motion import take_readings
 from sst_ros.identification.parameters import value_of
 from sst_ros.identification.simulation_fit import Sensitivities, describe_combination
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.style import BLUE, GREY, INK, save_figure, with_style
+from sst_ros.plot.style import BLUE, GREY, INK, save_figure, styled
 from sst_ros.scene.scene import load
 
 ERROR = math.radians(1.0)
@@ -67,7 +67,7 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     return powers, relative
 
 
-@with_style
+@styled
 def draw_determined(panels: Sequence[tuple[str, Sequence[str], Array]]) -> Figure:
     """Draw how well readings determine combinations of parameters, a panel for each figure read.
 

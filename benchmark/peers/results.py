@@ -24,7 +24,7 @@ from benchmark.peers.floor import Floor
 from benchmark.peers.ours import ENGINE as OURS
 from benchmark.peers.ours import PUBLIC
 from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
-from sst_ros.plot.style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, save_figure, with_style
+from sst_ros.plot.style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, save_figure, styled
 from sst_ros.report.results import markdown
 
 PACKAGES = ("numpy", "numba", "mujoco", "pin", "drake", "exudyn", "scipy", "mpmath")
@@ -259,7 +259,7 @@ def draw(folder: Path) -> None:
     save_figure(draw_engines(rows, note), folder / "peers.png")
 
 
-@with_style
+@styled
 def draw_engines(rows: pd.DataFrame, note: str) -> Figure:
     """Draw one thin curve a method, and the best of all; of sst_ros that of the public call."""
     figure = Figure(figsize=(10.5, 5.4), layout="constrained")

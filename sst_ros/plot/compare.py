@@ -20,7 +20,7 @@ from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import workspace
 from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
-from sst_ros.plot.style import LINES, leg_names, legend, positive, stack, with_style
+from sst_ros.plot.style import LINES, leg_names, legend, positive, stack, styled
 from sst_ros.recording.signals import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -98,7 +98,7 @@ PICTURES = {
 }
 
 
-@with_style
+@styled
 def draw_comparison(
     runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:

@@ -25,7 +25,7 @@ from sst_ros.plot.style import (
     free_figure,
     legend,
     note,
-    with_style,
+    styled,
 )
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ MARKERS = {
 FIXED = "fixed steps"
 
 
-@with_style
+@styled
 def draw_work_precision(
     rows: DataFrame,
     *,
@@ -105,7 +105,7 @@ def _handles(rows: DataFrame, targets: Collection[float]) -> Iterator[Line2D]:
         yield _entry(name, "o", linestyle=":", markersize=11, markerfacecolor="none")
 
 
-@with_style
+@styled
 def draw_summary(rows: DataFrame, footnote: str) -> Figure:
     """Draw the time of the fastest setting for each error, a line of markers for each scene.
 
@@ -177,7 +177,7 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-@with_style
+@styled
 def draw_stability(steps: DataFrame, runs: DataFrame, title: str, footnote: str) -> Figure:
     """Draw eigenvalues and stable steps along a motion, and how runs with other numbers ended.
 

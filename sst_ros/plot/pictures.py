@@ -29,7 +29,7 @@ from sst_ros.plot.style import (
     scale_down,
     span,
     stack,
-    with_style,
+    styled,
 )
 from sst_ros.recording.signals import Integers, Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -251,7 +251,7 @@ PICTURES = {
 }
 
 
-@with_style
+@styled
 def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `with_style` gives it the style. Long
+A function that draws takes data and returns a `Figure`; `styled` gives it the style. Long
 curves are drawn with few points: of every stretch the least and the largest value stay. No spike is
 lost, and a gap (nan) stays a gap; what is left out no picture could show.
 """
@@ -67,7 +67,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def with_style(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Give a function that makes a figure the style."""
 
     @functools.wraps(function)
@@ -78,7 +78,7 @@ def with_style(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
     return within
 
 
-@with_style
+@styled
 def save_figure(figure: Figure, *paths: Path) -> None:
     """Write a figure into files; their suffixes name the formats.
 

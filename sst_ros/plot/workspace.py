@@ -24,7 +24,7 @@ from sst_ros.mechanism import workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
-from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, with_style
+from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
 from sst_ros.recording.signals import Signals
 from sst_ros.scene.scene import Scene
 
@@ -37,7 +37,7 @@ LABEL_INSET = math.radians(5.0)
 _ALARM = "#d1182b"
 
 
-@with_style
+@styled
 def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
     """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
 

@@ -26,8 +26,8 @@ from sst_ros.plot.style import (
     scale_down,
     span,
     stack,
+    styled,
     widen,
-    with_style,
 )
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
@@ -47,7 +47,7 @@ Series: TypeAlias = "Mapping[str, tuple[Array, Array] | None]"
 """Times or computing times and values by name; None for what was not recorded."""
 
 
-@with_style
+@styled
 def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
     figure, grid = stack(["largest difference"] * len(panels), 3.1)
@@ -168,7 +168,7 @@ def _draw_losses(axes: Axes, losses: Series, end: float) -> None:
     axes.legend(fontsize=8, loc="upper left")
 
 
-@with_style
+@styled
 def draw_overview(
     run: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
 ) -> Figure:

@@ -29,7 +29,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.methods import draw_stability
-from sst_ros.report.results import data_frame, markdown, provenance, records, render, write
+from sst_ros.report.results import data_frame, provenance, records, render, write
 from sst_ros.report.step_advice import (
     LONGEST_S,
     TOLERANCE,
@@ -374,33 +374,12 @@ def step_lines(found: StabilityReport) -> Iterator[str]:
 
 def page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
-    verdicts = {True: "yes", False: "**FAILED**", None: "-"}
-    rows = [
-        {
-            "row": run.name,
-            "changed": run.change,
-            "passed": verdicts[run.passed],
-            "end": run.result,
-            "error [rad]": "-" if math.isnan(run.error) else f"{run.error:.1e}",
-            "estimate [rad]": "-" if math.isnan(run.estimate) else f"{run.estimate:.1e}",
-            "time [s]": f"{run.wall_s:.2f}",
-        }
-        for run in found.runs
-    ]
-    return render(
-        "stability.md",
-        found=found,
-        lines=step_lines(found),
-        failed=sum(run.passed is False for run in found.runs),
-        factor=FACTOR,
-        rounding=ROUNDING,
-        runs=markdown(data_frame(rows)),
-        provenance=provenance(),
-    )
+    given = {"factor": FACTOR, "rounding": ROUNDING, "provenance": provenance()}
+    return render("stability.md", found=found, lines=step_lines(found), **given)
 
 
 def figure(found: StabilityReport) -> Figure:
     """Draw the report."""
-    runs = [run for run in found.runs if run.passed is not None]
-    rows = data_frame((run._asdict() for run in runs), StressRun._fields)
+    rows = _run_table(found)
+    rows = rows[rows.passed.notna()]
     return draw_stability(found.steps, rows, f"Stability of {found.scene}", provenance())

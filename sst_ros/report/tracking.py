@@ -138,11 +138,9 @@ def _torque_of_ticks(run: Recording, times: Integers, asked: Array) -> Array:
 
     A sample after the last tick has no torque.
     """
-    ticks = run.ticks
-    index = np.minimum(np.searchsorted(ticks.start_ns, times), len(ticks.start_ns) - 1)
-    exact = (ticks.start_ns[index] == times)[:, None]
-    torque = np.where(exact, ticks.torque[index], asked)
-    torque[times >= ticks.end_ns[-1]] = 0.0
+    at = places(run.ticks.start_ns, times)
+    torque = np.where((at >= 0)[:, None], run.ticks.torque[at], asked)
+    torque[times >= run.ticks.end_ns[-1]] = 0.0
     return torque
 
 

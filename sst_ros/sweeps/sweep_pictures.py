@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, with_style
+from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
 from sst_ros.sweeps.sweep_summary import correlate_early_ends, list_outputs
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _score(table: pd.DataFrame, outputs: list[str]) -> tuple[Array, str]:
     return apart.max(axis=1).to_numpy(), f"The {MOST_RUNS} runs farthest from the median"
 
 
-@with_style
+@styled
 def draw_distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
     """Histograms of the outputs of the runs that reached the end."""
     rows = max(1, math.ceil(len(outputs) / COLUMNS))
@@ -84,7 +84,7 @@ def draw_distributions(outputs: Series, units: Mapping[str, str]) -> Figure:
     return figure
 
 
-@with_style
+@styled
 def draw_early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]) -> Figure:
     """Rank correlation of each input with an early end, and how runs ended."""
     figure = Figure(figsize=(11.0, 1.2 + 0.3 * max(len(correlations), len(counts), 4)))
@@ -101,7 +101,7 @@ def draw_early_ends(correlations: Mapping[str, float], counts: Mapping[str, int]
     return figure
 
 
-@with_style
+@styled
 def draw_scatter(inputs: Series, worst: NDArray[np.intp], title: str) -> Figure:
     """Scatter matrix of inputs: a sample of all runs, and the worst over it.
 

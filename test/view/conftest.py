@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One recording for all tests of the page."""
+"""One recording and one server for all tests of the page."""
 
 import bags
 import pytest
@@ -13,3 +13,13 @@ def bag(tmp_path_factory):
     return bags.write(
         tmp_path_factory.mktemp("view") / "bag", bags.simulated(load("example2"), 0.3)
     )
+
+
+@pytest.fixture(scope="session")
+def server():
+    """A page without a source."""
+    from sst_ros.view.server import PageServer
+
+    running = PageServer(port=18280)
+    yield running
+    running.stop()

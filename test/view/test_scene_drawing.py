@@ -22,17 +22,9 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing, add_shape
-from sst_ros.view.server import PageServer
 from sst_ros.view.source import ViewState
 
 RED = (1.0, 0.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def server():
-    running = PageServer(port=18290)
-    yield running
-    running.stop()
 
 
 def node(server, name):

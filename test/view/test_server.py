@@ -21,13 +21,6 @@ from sst_ros.errors import InputError
 from sst_ros.view.server import LOCAL, PageServer
 
 
-@pytest.fixture(scope="module")
-def server():
-    running = PageServer(port=18280)
-    yield running
-    running.stop()
-
-
 def parts(server):
     """Host with port, and token, of the URL that is printed."""
     url = urlsplit(server.url)
