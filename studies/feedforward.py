@@ -237,8 +237,7 @@ def _unheld(plant: Scene) -> tuple[float, float]:
     inverse, motion = InverseDynamics(plant), _motion(plant)
 
     def torque(time: float) -> Vector3:
-        now = motion.at(time)
-        return inverse.torque(now.quaternion, now.body_rate, now.body_acceleration)
+        return inverse.reference_torque(motion.at(time))
 
     simulation = Simulation(
         loops.at_start(plant, motion), "dop853", tolerance=1e-13,

@@ -17,8 +17,8 @@ from sst_ros.control.law import (
     ControllerSettings,
     Sample,
     command_limit,
-    feed_forward,
     feedback_gains,
+    feedforward_torques,
 )
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.errors import InputError, Problem, SstError
@@ -140,7 +140,7 @@ class Controller:
         _require_finite((*gamma, *gamma_dot), "measured")
         settings, desired = self._settings, self._motion.at(time)
         instant = time + 0.5 * self._period_s
-        torques = feed_forward(settings, self._inverse, self._motion, desired, instant)
+        torques = feedforward_torques(settings, self._inverse, self._motion, desired, instant)
         observed = self._observer.update(gamma) if settings.observes else ()
         at = Sample(desired, *torques, gamma, gamma_dot, observed, self._integral)
         command = self._law.answer(at)

@@ -302,7 +302,7 @@ class ControlLaw(NamedTuple):
             feedback = axpy(1.0, needed, -1.0, at.feedforward)
         elif mode != "feedforward":
             summed = error
-            feedback = _by_joint(self.inertia, self._feed_back(at.integral, error, rates))
+            feedback = _by_joint(self.inertia, self._correct(at.integral, error, rates))
         torque = total = add(feedforward, feedback)
         weight: Scalar = 1.0
         if self.limit is not None:
@@ -313,7 +313,7 @@ class ControlLaw(NamedTuple):
 
     def _compute_torque(self, at: Sample, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
         """Torque of computed_torque, and the error to integrate."""
-        asked = add(at.desired.gamma_ddot, self._feed_back(at.integral, error, rates))
+        asked = add(at.desired.gamma_ddot, self._correct(at.integral, error, rates))
         body_rate, body_acceleration = self.accelerate(at.observed, at.gamma_dot, asked)
         if self.settings.space == "so3":
             between = relative_quaternion(at.observed, at.desired.quaternion)
@@ -324,10 +324,10 @@ class ControlLaw(NamedTuple):
             )
             moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
             error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
-            body_acceleration = add(moving, self._feed_back(at.integral, error, rates))
+            body_acceleration = add(moving, self._correct(at.integral, error, rates))
         return self.torque(at.observed, body_rate, body_acceleration), error
 
-    def _feed_back(self, integral: Any, error: Triple, rates: Triple) -> Triple:
+    def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
         """Acceleration kp e + kd e_dot, with integral action."""
         leaning = axpy(1.0, error, self.integral_rate, integral) if integral else error
         return add(_by_joint(self.kp, leaning), _by_joint(self.kd, rates))
@@ -361,7 +361,7 @@ def command_limit(limit: Any, model: Scene) -> Array:
     return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own or np.inf)
 
 
-def feed_forward(
+def feedforward_torques(
     settings: ControllerSettings,
     inverse: InverseDynamics,
     motion: ReferenceMotion,

@@ -26,8 +26,8 @@ from sst_ros.control.law import (
     Sample,
     bound,
     command_limit,
-    feed_forward,
     feedback_gains,
+    feedforward_torques,
     is_above,
 )
 from sst_ros.control.reference import Reference
@@ -229,7 +229,9 @@ class ControlledBatch:
         for k in range(self.samples + 1):
             time = k * round(period * 1e9) / 1e9
             at = loop.motion.at(time)
-            torques = feed_forward(loop.settings, inverse, loop.motion, at, time + 0.5 * period)
+            torques = feedforward_torques(
+                loop.settings, inverse, loop.motion, at, time + 0.5 * period
+            )
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)

@@ -43,26 +43,27 @@ def rounding(scene, sample, acceleration, torque, moment=None):
     return 16.0 * EPS * np.linalg.cond(reach) * np.linalg.norm(np.linalg.inv(m)) * terms.sum()
 
 
+def check_round_trip(scene, sample, acceleration, *moment):
+    torque = InverseDynamics(scene).torque(
+        sample.quaternion, sample.body_rate, acceleration, *moment
+    )
+    numbers = [x for part in (torque, *moment) for x in part]
+    found = Dynamics.of(scene).derivative(*sample.state, *numbers)[4:]
+    error = np.abs(np.subtract(found, acceleration)).max()
+    assert error <= rounding(scene, sample, acceleration, torque, *moment)
+
+
 @FEW
 @given(samples(), st.floats(0.0, 1.0), ACCELERATIONS)
 def test_direct_dynamics_undo_inverse_dynamics_with_every_term(sample, number, acceleration):
-    scene = loaded(sample, number)
-    torque = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, acceleration)
-    found = Dynamics.of(scene).derivative(*sample.state, *torque)[4:]
-    error = np.abs(np.subtract(found, acceleration)).max()
-    assert error <= rounding(scene, sample, acceleration, torque)
+    check_round_trip(loaded(sample, number), sample, acceleration)
 
 
 @FEW
 @given(samples(), ACCELERATIONS)
 def test_a_moment_from_a_topic_counts(sample, acceleration):
     scene = dataclasses.replace(sample.scene, moment=Moment(topic=True))
-    moment = tuple(sample.moment.tolist())
-    inverse = InverseDynamics(scene)
-    torque = inverse.torque(sample.quaternion, sample.body_rate, acceleration, moment)
-    found = Dynamics.of(scene).derivative(*sample.state, *torque, *moment)[4:]
-    error = np.abs(np.subtract(found, acceleration)).max()
-    assert error <= rounding(scene, sample, acceleration, torque, moment)
+    check_round_trip(scene, sample, acceleration, tuple(sample.moment.tolist()))
 
 
 @FEW
