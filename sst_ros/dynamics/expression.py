@@ -299,9 +299,7 @@ class Operand(NamedTuple):
 
 def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Program:
     """Run `function` on one expression per input and return what it does."""
-    graph = Graph()
-    symbols = [graph.node("input", name) for name in inputs]
-    return program_of(graph, tuple(inputs), tuple(function(*symbols)))
+    return with_jacobian(function, inputs, ())
 
 
 def number_constants(value: Any, origin: tuple[str | int, ...] = ()) -> Any:

@@ -169,12 +169,12 @@ class ODE:
     @cached_property
     def program(self) -> Program:
         """The derivative."""
-        return trace(self._traced, self._inputs)
+        return trace(self._of_numbers, self._inputs)
 
     @cached_property
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
-        return with_jacobian(self._traced, self._inputs, ("t", *self.state))
+        return with_jacobian(self._of_numbers, self._inputs, ("t", *self.state))
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
@@ -210,12 +210,10 @@ class ODE:
         """Return the derivative at the time, the state and the drive given, of any kind."""
         return self._derivative(self._dynamics.model, self._torque, self._limit, time, inputs)
 
-    def _traced(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+    def _of_numbers(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative with numbers that may be others in another scene."""
-        torque, limit = (
-            number_constants(self._torque, ("torque",)),
-            number_constants(self._limit, ("limit",)),
-        )
+        torque = number_constants(self._torque, ("torque",))
+        limit = number_constants(self._limit, ("limit",))
         return self._derivative(self._dynamics.numbers, torque, limit, time, inputs)
 
     def _derivative(
@@ -260,16 +258,17 @@ def compile_program(program: Program) -> Function:
 
     The function raises ArithmeticError or ValueError where a float has no value.
     """
-    names: dict[str, Any] = {name: getattr(math, name) for name in FUNCTIONS}
-    exec(program.source("function"), names)
-    function: Function = names["function"]
-    return function
+    return _compile(program, {name: getattr(math, name) for name in FUNCTIONS})
 
 
 def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element."""
     names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
     names |= {"atan2": np.arctan2, "max": np.maximum}
+    return _compile(program, names)
+
+
+def _compile(program: Program, names: dict[str, Any]) -> Function:
     exec(program.source("function"), names)
-    function: Callable[..., tuple[Any, ...]] = names["function"]
+    function: Function = names["function"]
     return function

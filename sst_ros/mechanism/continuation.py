@@ -105,8 +105,7 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
         rotation = kinematics.admissible(geometry, points[0]).rotation
     rotations = np.empty((len(points), 3, 3))
     rotations[0] = rotate(np.array(rotation, dtype=float), np.zeros(3))
-    r = kinematics.carriage_directions(geometry, points[0])
-    if np.abs(np.sum(r * (geometry.e @ rotations[0].T), axis=1)).max() > 1e-9:
+    if np.abs(kinematics.closure(geometry, points[0], rotations[0])).max() > 1e-9:
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
@@ -114,8 +113,8 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     r = kinematics.carriage_directions(geometry, points)
     mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotations)
     mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
-    slope = cross(geometry.e @ rotations.transpose(0, 2, 1), r)
-    sigma = np.asarray(np.linalg.svd(slope, compute_uv=False)[:, 2], dtype=float)
+    slopes = _slope(geometry, points, rotations)
+    sigma = np.asarray(np.linalg.svd(slopes, compute_uv=False)[:, 2], dtype=float)
     return Branch(*frozen(points, rotations, mu, beta, sigma, det_j2))
 
 
@@ -153,9 +152,9 @@ def _segment(geometry: Geometry, start: Array, end: Array, rotation: Array, row:
 
 
 def _slope(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
-    """Matrix A, equal to J2: rows t_k x r_k = -(r_k x t_k)."""
-    r = kinematics.carriage_directions(geometry, gamma)
-    return cross(geometry.e @ rotation.T, r)
+    """Matrices A (..., 3, 3), equal to J2: rows t_k x r_k = -(r_k x t_k)."""
+    t = geometry.e @ np.swapaxes(rotation, -1, -2)
+    return cross(t, kinematics.carriage_directions(geometry, gamma))
 
 
 def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
