@@ -1,25 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The URDF of a scene, read by Pinocchio's and MuJoCo's parsers: poses, inertias, motion."""
+"""The URDF of a scene, as Pinocchio, MuJoCo and ros2_control read it; shapes of the links."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from loaded_scenes import loaded
 from models import assembly_of, seeded_samples
 
 from sst_ros.__main__ import main
-from sst_ros.description.tree import LEGS, STAR, STARS, name_actuated, name_intermediate
-from sst_ros.description.urdf import roll_pitch_yaw, urdf
+from sst_ros.description.tree import (
+    LEGS,
+    STAR,
+    STARS,
+    Arc,
+    Ball,
+    Box,
+    end_point,
+    name_actuated,
+    name_intermediate,
+    shapes,
+)
+from sst_ros.description.urdf import roll_pitch_yaw, urdf, urdf_with_ros2_control
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, load, names
 
+ACTUATORS = ["gamma_1", "gamma_2", "gamma_3"]
+CONTROLLERS = Path(__file__).parents[2] / "config" / "controllers.yaml"
 EXACT = 2e-14  # a product of nine rotations, each rounded
 LINKS = {STAR, *map(name_actuated, LEGS), *map(name_intermediate, LEGS)}
 
@@ -254,3 +269,87 @@ def test_command_line(capsys):
     assert main(["describe", "--scene", "general"]) == 0
     assert capsys.readouterr().out == urdf(load("general"))
     assert main(["describe", "--scene", "none"]) == 1
+
+
+def test_an_arc_begins_ends_and_stays_on_its_sphere():
+    begin, axis = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
+    points = Arc(begin, axis, 1.234, 0.35, 0.01, (1.0, 0.0, 0.0)).points()
+    assert points[0] == pytest.approx(0.35 * begin)
+    assert np.linalg.norm(points, axis=1) == pytest.approx(0.35)
+    assert np.arccos(points[0] @ points[-1] / 0.35**2) == pytest.approx(1.234)
+    assert points[-1] @ np.cross(axis, begin) > 0.0
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_scene_is_drawn(name):
+    drawn = shapes(load(name))
+    assert len(drawn) == 8
+    for shape in (shape for link in drawn.values() for shape in link):
+        size = shape.size.min() if isinstance(shape, Box) else getattr(shape, "radius", 1.0)
+        assert size > 0.0 and getattr(shape, "thickness", 1.0) > 0.0
+        ends = (shape.centre,) if isinstance(shape, Ball | Box) else ()
+        assert all(np.isfinite(end).all() for end in ends)
+
+
+@pytest.mark.parametrize("name", ["example2_heavy", "general"])
+def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name):
+    scene = load(name)
+    geometry = Geometry.of(scene)
+    arcs = [shape.points() for shape in shapes(scene)[STAR] if isinstance(shape, Arc)]
+    for points, e in zip(arcs, geometry.e, strict=True):
+        assert points[0] == pytest.approx(end_point(scene, np.eye(3)))
+        assert points @ e == pytest.approx(0.0, abs=1e-15)
+
+
+def test_the_tag_has_the_actuators_and_the_topics_of_the_simulator():
+    scene = load("general")
+    (tag,) = ET.fromstring(urdf_with_ros2_control(scene, "/a/commands", "/a/states")).findall(
+        "ros2_control"
+    )
+    assert tag.attrib == {"name": "sst_ros", "type": "system"}
+    hardware = tag.find("hardware")
+    assert (
+        hardware.findtext("plugin") == "joint_state_topic_hardware_interface/JointStateTopicSystem"
+    )
+    assert {param.get("name"): param.text for param in hardware.findall("param")} == {
+        "joint_commands_topic": "/a/commands",
+        "joint_states_topic": "/a/states",
+        "trigger_joint_command_threshold": "-1",
+    }
+    assert [joint.get("name") for joint in tag.findall("joint")] == ACTUATORS
+    for joint in tag.findall("joint"):
+        assert [one.get("name") for one in joint.findall("command_interface")] == ["effort"]
+        states = [one.get("name") for one in joint.findall("state_interface")]
+        assert states == ["position", "velocity", "effort"]
+
+
+def test_the_states_before_the_first_message_are_the_initial_ones():
+    """Without them a controller that is activated first holds nan, and no run starts."""
+    scene = load("swing")
+    tag = ET.fromstring(urdf_with_ros2_control(scene)).find("ros2_control")
+    given = [float(one.findtext("param")) for one in tag.iter("state_interface")]
+    assert [one.get("name") for one in tag.iter("param")][3:] == ["initial_value"] * 9
+    states = zip(scene.initial.gamma, scene.initial.gamma_dot, (0.0,) * 3, strict=True)
+    assert given == [number for state in states for number in state]
+
+
+def test_the_rest_is_the_urdf_of_the_scene(capsys):
+    assert main(["describe", "--scene", "swing", "--ros2-control"]) == 0
+    root = ET.fromstring(capsys.readouterr().out)
+    root.remove(root.find("ros2_control"))
+    plain = ET.fromstring(urdf(load("swing")))
+    for tree in (root, plain):
+        ET.indent(tree)
+    assert ET.tostring(root).split() == ET.tostring(plain).split()
+
+
+def test_every_controller_has_its_parameters_and_drives_the_actuators():
+    document = yaml.safe_load(CONTROLLERS.read_text(encoding="utf-8"))
+    given = {name.rpartition("/")[2]: node["ros__parameters"] for name, node in document.items()}
+    manager = given.pop("controller_manager")
+    assert set(given) == {name for name, value in manager.items() if isinstance(value, dict)}
+    assert given["joint_state_broadcaster"]["use_local_topics"] is True
+    for name in ("effort_controller", "trajectory_controller", "pid_controller"):
+        joints = given[name].get("joints", given[name].get("dof_names"))
+        assert joints == ACTUATORS
+        assert set(given[name].get("gains", joints)) == set(joints)
