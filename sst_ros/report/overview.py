@@ -94,7 +94,11 @@ def _missing(values: Array | None) -> str:
 def _curve(
     title: str, label: str, seconds: Array, values: Array | None, reason: str = "", **looks: Any
 ) -> Panel:
-    """Return a panel of one curve, small values in a power of ten; left out for a `reason`."""
+    """Return a panel of one curve, small values in a power of ten; left out for a `reason`.
+
+    `around` is the value that it should have, which a line shows.
+    """
+    around = looks.pop("around", None)
     absent = reason or _missing(values)
     if values is None or absent:
         return Panel(title, Axes.set_axis_off, absent)
@@ -103,6 +107,9 @@ def _curve(
     def draw(axes: Axes) -> None:
         axes.set_ylabel(label.replace("[", f"[{unit}"))
         axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
+        if around is not None:
+            axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
+            widen(axes, shown, 0.04)
 
     return Panel(title, draw, absent)
 
@@ -117,14 +124,6 @@ def _draw_used(axes: Axes, estimates: Series, reports: int) -> None:
         axes.plot(1e3 * used, positive(values), label=name, marker=marker, markersize=4, **style)
     axes.set_yscale("log")
     axes.legend(fontsize=8, loc="best")
-
-
-def _draw_pace(axes: Axes, seconds: Array, pace: Array) -> None:
-    """Draw real-time factors over time."""
-    axes.set_ylabel("real-time factor")
-    axes.plot(seconds, pace, color=BLUE, marker=".", linewidth=1.2)
-    axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--")
-    widen(axes, pace, 0.04)
 
 
 def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
@@ -217,6 +216,7 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence
     same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
     periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
     by_name = dict(zip(ESTIMATES, errors, strict=True))
+    beside_one: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
     dots: Looks = {"linestyle": "none", "marker": ".", "markersize": 3}
     return [
         Panel(
@@ -225,10 +225,12 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence
             "" if integration.compared else "nothing could be compared",
         ),
         _curve("Energy residual", "energy residual [J]", seconds, timing.energy),
-        Panel(
+        _curve(
             "Real-time factor (recorder clock)",
-            partial(_draw_pace, seconds=timing.pace_s, pace=timing.pace),
-            _missing(timing.pace),
+            "real-time factor",
+            timing.pace_s,
+            timing.pace,
+            **beside_one,
         ),
         Panel(
             "Period between received samples", periods, _missing(timing.period_us), over_time=False

@@ -26,7 +26,7 @@ from sst_ros.recording.recording import Recording
 from sst_ros.report import overview, reference, states, timing, tracking
 from sst_ros.report.reference import Comparison, Deviation
 from sst_ros.report.results import made_line, made_on, render
-from sst_ros.report.states import begins, lags
+from sst_ros.report.states import begins
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
 
@@ -192,7 +192,7 @@ def summarise(
         "formulation_states": formulation[1],
         "effort_difference_max_N_m": off,
         "effort_difference_largest_at_s": when if off else None,
-        "actuators_lag": lags(run.scene),
+        "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.damage),
         "notes": list(_notes(run, integration, ideal)),
@@ -299,7 +299,7 @@ def _notes(run: Recording, integration: Comparison, ideal: Comparison | None) ->
         yield "the moment comes from a topic: no ideal to compare with"
     if ideal is None and run.scene.torque is None:
         yield "the scene has no torques: no ideal to compare with"
-    if lags(run.scene):
+    if run.scene.lags:
         yield "the actuators lag: efforts differ from the torques that are asked for"
     if unverified := run.signals.unverified:
         yield f"{unverified} chunks have no checksum: damage would not be noticed"

@@ -175,8 +175,7 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
     for k, t in enumerate(instants.t.tolist()):
         state = (*instants.quaternion[k].tolist(), *instants.body_rate[k].tolist())
         torque = instants.torque[k].tolist()
-        lags = scene.lags
-        values = eigenvalues(scene, (*state, *torque) if lags else state, torque)
+        values = eigenvalues(scene, (*state, *torque) if scene.lags else state, torque)
         decay, oscillation = max(0.0, -values.real.min()), np.abs(values.imag).max()
         limits = {name: largest_stable_step(method, values) for name, method in METHODS.items()}
         rows.append({"t_s": t, "decay": float(decay), "oscillation": float(oscillation), **limits})

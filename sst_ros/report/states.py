@@ -39,13 +39,8 @@ def initial(scene: Scene) -> tuple[float, ...]:
         AssemblyError: the initial gamma has no unique admissible assembly.
 
     """
-    lagged = (0.0,) * (lags(scene) * 3)
+    lagged = (0.0,) * (scene.lags * 3)
     return (*initial_state(scene, Geometry.of(scene)), *lagged)
-
-
-def lags(scene: Scene) -> bool:
-    """Return whether the torques of the actuators are part of the state."""
-    return scene.lags
 
 
 def of_samples(geometry: Geometry, recording: Recording, samples: Places) -> Array:
@@ -56,7 +51,7 @@ def of_samples(geometry: Geometry, recording: Recording, samples: Places) -> Arr
     quaternion = recording.quaternion[samples]
     rates = (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
     rate = body_rates(geometry, quaternion, *(joint[samples] for joint in rates))
-    lagged = [recording.effort[samples]] if lags(recording.scene) else []
+    lagged = [recording.effort[samples]] if recording.scene.lags else []
     return np.hstack([quaternion, rate, *lagged])
 
 
