@@ -177,7 +177,7 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     defaults = SimulatorParameters()
     names = specs(SimulatorParameters).keys() - {"duration", "wait_for_subscribers"}
     assert given == {name: getattr(defaults, name) for name in names}
-    told = ["-p", "duration:=0.0", "-r", "__ns:=/left", "-r", "__node:=other"]
-    process = nodes.start("simulator", "--ros-args", "--params-file", str(path), *told)
+    told = ["--ros-args", "--params-file", str(path), "-r", "__ns:=/left", "-r", "__node:=other"]
+    process = nodes.run("simulator", *told)
     observer.told("phase", "running")
     assert nodes.stop(process)[0] == 0

@@ -95,9 +95,8 @@ def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, obser
 
 def test_two_simulators_do_not_hear_each_other(nodes, observer):
     places = ("/left", "/right")
-    given = {"wait_for_command": True, "duration": 0.0}
     started = {
-        place: nodes.start("simulator", "--ros-args", "-r", f"__ns:={place}", **given)
+        place: nodes.run("simulator", "--ros-args", "-r", f"__ns:={place}", wait_for_command=True)
         for place in places
     }
     states = {place: observer.listen(JointState, f"{place}/joint_states") for place in places}
