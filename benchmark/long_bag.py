@@ -4,8 +4,7 @@
 python -m benchmark.long_bag [--seconds 600] [--bag FOLDER] [--json FILE]
 
 The bag is a true run: Example 2 with springs and friction in its actuators, so that it stays inside
-for ever, solved by single steps at 1 kHz. Every message is what the nodes would send, made by
-writing numbers into the bytes of one.
+for ever, solved by single steps at 1 kHz. Its messages are made by the code of the nodes.
 """
 
 from __future__ import annotations
@@ -15,24 +14,22 @@ import dataclasses
 import json
 import math
 import resource
+import struct
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from benchmark.measure import describe_machine, join_line, write_json
 from sst_ros.host.output import slices
 from sst_ros.integration.propagator import TickPropagator, TickSequence
-from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.mechanism.geometry import Array
-from sst_ros.recording.topic_tables import JOINTS
+from sst_ros.nodes.publications import StateMessages, TorqueLog, stamp
+from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.report.states import initial, joint_columns
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
@@ -41,13 +38,21 @@ from sst_ros.scene.scene import Scene
 
 AT_MOST_S, AT_MOST_GB = 60.0, 1.5
 START_NS, TICK_NS, TICKS_A_SAMPLE = 1_700_000_000_000_000_000, 1_000_000, 2
+SAMPLE_NS = TICKS_A_SAMPLE * TICK_NS
 SENT_NS, ANSWER_NS = 150_000, 400_000
 """Receptions of a sample, and of the command that answers it, after the sample's stamp."""
 
-STORE = get_typestore(Stores.ROS2_KILTED)
-
+TOPICS = {
+    "/sst_simulator/scene": "std_msgs/msg/String",
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/sst_simulator/orientation": "geometry_msgs/msg/QuaternionStamped",
+    "/sst_simulator/euler_zyz": "geometry_msgs/msg/Vector3Stamped",
+    "/sst_simulator/applied_torques": "trajectory_msgs/msg/JointTrajectory",
+    "/sst_simulator/commands": "std_msgs/msg/Float64MultiArray",
+}
+CDR = b"\x00\x01\x00\x00"
+"""Begin of every message: little-endian CDR."""
 _CHUNK = 5000
-_MARK = 1.2345678901234567e300
 
 
 def endless() -> Scene:
@@ -62,49 +67,44 @@ def endless() -> Scene:
 
 def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     """Write the bag of a run of the endless scene; its folder must not exist."""
-    scene, samples = endless(), round(seconds * 1e9 / TICK_NS / TICKS_A_SAMPLE)
-    kinds = _messages()
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {
-            topic: writer.add_connection(topic, message.__msgtype__, typestore=STORE)
-            for topic, message in kinds.items()
-        }
-        raw = {t: bytes(STORE.serialize_cdr(m, m.__msgtype__)) for t, m in kinds.items()}
-        text = _make("std_msgs/String", data=yaml_document.dump(scene))
-        connection = writer.add_connection(
-            "/sst_simulator/scene", text.__msgtype__, typestore=STORE
-        )
-        writer.write(connection, START_NS, STORE.serialize_cdr(text, text.__msgtype__))
-        for rows, run in _run(scene, samples, shown):
-            stamps = START_NS + np.arange(rows.start, rows.stop) * TICK_NS * TICKS_A_SAMPLE
-            before = stamps - TICK_NS * TICKS_A_SAMPLE
-            numbers = {
-                "/joint_states": (stamps, run["joints"]),
-                "/sst_simulator/orientation": (stamps, run["quaternion"]),
-                "/sst_simulator/euler_zyz": (stamps, run["euler"]),
-                "/sst_simulator/applied_torques": (before, run["torque"]),
-                "/sst_simulator/commands": (None, run["torque"][:, -3:]),
-            }
-            first = int(rows.start == 0)  # a start has no torques before it
-            patched = {t: _patched(raw[t], *numbers[t]) for t in numbers}
-            for k, stamp in enumerate(stamps.tolist()):
-                for topic, connection in connections.items():
-                    if k >= first or topic.endswith(("states", "orientation", "zyz")):
-                        late = ANSWER_NS - 2 * TICK_NS if topic.endswith("commands") else SENT_NS
-                        writer.write(connection, stamp + late, patched[topic][k].tobytes())
+    scene, samples = endless(), round(seconds * 1e9 / SAMPLE_NS)
+    writer, messages, log = BagWriter(path), StateMessages(), TorqueLog(TICKS_A_SAMPLE, TICK_NS)
+    connections = {topic: writer.connect(topic, kind)
+                   for topic, kind in TOPICS.items()}  # fmt: skip
+
+    def send(topic: str, received_ns: int, data: bytes) -> None:
+        writer.write(connections[topic], received_ns, data)
+
+    text = yaml_document.dump(scene).encode() + b"\x00"
+    send("/sst_simulator/scene", START_NS, CDR + struct.pack("<I", len(text)) + text)
+    for rows, *arrays in _run(scene, samples, shown):
+        columns = zip(range(rows.start, rows.stop), *(a.tolist() for a in arrays), strict=True)
+        for number, y, joints, torque in columns:
+            at_ns = START_NS + number * SAMPLE_NS
+            if number:  # a start has no torques before it
+                asked_ns = at_ns - SAMPLE_NS
+                data = CDR + struct.pack("<3I4x3d", 0, 0, 3, *torque)
+                send("/sst_simulator/commands", asked_ns + ANSWER_NS, data)
+                log.append(torque, (), TICKS_A_SAMPLE)
+                received_ns = at_ns + SENT_NS
+                send("/sst_simulator/applied_torques", received_ns, log.take(asked_ns))
+            at, numbers = stamp(at_ns), (y, joints, torque if number else (0.0, 0.0, 0.0))
+            send("/joint_states", at_ns + SENT_NS, messages.joint_states(at, numbers))
+            send("/sst_simulator/orientation", at_ns + SENT_NS, messages.orientation(at, numbers))
+            send("/sst_simulator/euler_zyz", at_ns + SENT_NS, messages.euler_zyz(at, numbers))
+    writer.close()
     return path
 
 
-def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[str, Array]]]:
-    """Solve the scene; yield rows of samples in turn, and what the messages of each hold."""
+def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array, Array, Array]]:
+    """Solve the scene; yield rows of samples in turn: quaternions, joints, and torques before."""
     torque = scene.torque
     assert torque is not None
     motion = TickPropagator(scene, None, compiled=True)
     y = np.array(initial(scene))
     for rows in slices(samples + 1, _CHUNK, "writing a run", shown):
-        number = np.arange(rows.start, rows.stop)
         # Each sample is answered by a torque, which is held until the next one.
-        answered = np.maximum(number - 1, 0)[:, None] * (TICKS_A_SAMPLE * TICK_NS / 1e9)
+        answered = np.maximum(np.arange(rows.start, rows.stop) - 1, 0)[:, None] * SAMPLE_NS / 1e9
         held = torque.amplitude * np.sin(torque.frequency * answered + torque.phase)
         ticks = np.arange((rows.start - 1) * TICKS_A_SAMPLE, (rows.stop - 1) * TICKS_A_SAMPLE)
         run = ticks >= 0
@@ -119,66 +119,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, dict[
         if not rows.start:
             state = np.vstack([y, state])
         y = state[-1]
-        angles = joint_columns(motion.dynamics.model, state)
-        effort = np.zeros((len(state), 9))
-        effort[:, :3] = held * (number > 0)[:, None]
-        numbers = {"joints": np.hstack([angles, effort]), "quaternion": state[:, :4]}
-        numbers["euler"] = zyz_angles(rotation_matrix(state[:, :4]))
-        yield rows, numbers | {"torque": np.tile(held, TICKS_A_SAMPLE)}
-
-
-def _patched(raw: bytes, stamps: Any, numbers: Array) -> np.ndarray:
-    """Copies of a serialized message with other stamps and numbers in the places of the marks."""
-    rows = np.tile(np.frombuffer(raw, np.uint8), (len(numbers), 1))
-    mark = np.float64(_MARK).tobytes()
-    at = -8
-    for column in numbers.T:
-        at = raw.index(mark, at + 8)
-        rows[:, at : at + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
-    if stamps is not None:
-        time_ns = np.stack([stamps // 10**9, stamps % 10**9], axis=1).astype("<u4")
-        rows[:, 4:12] = time_ns.view(np.uint8)
-    return rows
-
-
-def _make(kind: str, **fields: Any) -> Any:
-    package, name = kind.split("/")
-    return STORE.types[f"{package}/msg/{name}"](**fields)
-
-
-def _messages() -> dict[str, Any]:
-    """Give a message for each topic, with a mark in place of each number."""
-    stamp = _make("builtin_interfaces/Time", sec=0, nanosec=0)
-    header = _make("std_msgs/Header", stamp=stamp, frame_id="base")
-    marks = {name: np.full(9, _MARK) for name in ("position", "velocity", "effort")}
-    none = {name: np.empty(0) for name in ("positions", "velocities", "accelerations")}
-    ends = [(k + 1) * TICK_NS for k in range(TICKS_A_SAMPLE)]
-    points = [
-        _make("trajectory_msgs/JointTrajectoryPoint", **none, effort=np.full(3, _MARK),
-              time_from_start=_make("builtin_interfaces/Duration", sec=0, nanosec=end))
-        for end in ends
-    ]  # fmt: skip
-    turn = _make("geometry_msgs/Quaternion", **dict.fromkeys("xyzw", _MARK))
-    angles = _make("geometry_msgs/Vector3", **dict.fromkeys("xyz", _MARK))
-    layout = _make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
-    return {
-        "/joint_states": _make(
-            "sensor_msgs/JointState", header=header, name=list(JOINTS), **marks
-        ),
-        "/sst_simulator/orientation": _make(
-            "geometry_msgs/QuaternionStamped", header=header, quaternion=turn
-        ),
-        "/sst_simulator/euler_zyz": _make(
-            "geometry_msgs/Vector3Stamped", header=header, vector=angles
-        ),
-        "/sst_simulator/applied_torques": _make(
-            "trajectory_msgs/JointTrajectory", header=header, joint_names=list(JOINTS[:3]),
-            points=points,
-        ),
-        "/sst_simulator/commands": _make(
-            "std_msgs/Float64MultiArray", layout=layout, data=np.full(3, _MARK)
-        ),
-    }  # fmt: skip
+        yield rows, state[:, :4], joint_columns(motion.dynamics.model, state), held
 
 
 def main(arguments: list[str] | None = None) -> int:

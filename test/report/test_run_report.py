@@ -387,6 +387,7 @@ def long_bag():
     """Import benchmark/long_bag.py, which is not part of the package."""
     pytest.importorskip("numba")
     sys.path.insert(0, ROOT)
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
     yield importlib.import_module("benchmark.long_bag")
     sys.path.remove(ROOT)
 
