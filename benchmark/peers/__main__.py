@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     least = find_floor(task, TARGETS)
     seconds = time.monotonic() - begin
     result = results.Results(curves, missing, truth, rounds, options.quick, seconds, least)
-    print(results.write_table(result))
+    print("\n\n".join(result.parts().values()))
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)
         results.write(result, options.out)

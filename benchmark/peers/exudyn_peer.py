@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmark.peers.study import Engine, Failed, Series, list_steps
 from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
@@ -65,7 +66,7 @@ class _Model(Engine):
             above, spin = placed[body.parent]
             angle = at.position[body.joint] if at else 0.0
             rate = at.velocity[body.joint] if at else 0.0
-            rotation = above @ _turn(body.axis, angle)
+            rotation = above @ Rotation.from_rotvec(angle * body.axis).as_matrix()
             omega = spin + rate * (above @ body.axis)
             placed[body.name] = rotation, omega
             parameters = np.array(parameters_of(rotation))
@@ -177,12 +178,6 @@ def _find_acceleration(task: Task, kind: str, radius: float, at: Moving) -> np.n
     model.solve(at.time, at.time + GATE_STEP, 4)
     after = np.array([task.w[k] @ model.output(f"a{k}", "AngularVelocity") for k in range(3)])
     return task.at_once(at, (after - before) / GATE_STEP, 0.0, GATE_STEP)
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    x, y, z = axis
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k))
 
 
 def _frame(axis: np.ndarray) -> np.ndarray:

@@ -167,21 +167,15 @@ class Results:
             f"The whole took {self.seconds:.0f} s."
         )
 
-    def missing_lines(self) -> list[str]:
-        """Why engines are missing."""
-        return [f"{engine}: {why}." for engine, why in self.missing.items()]
-
-
-def write_table(results: Results) -> str:
-    """Text for the terminal."""
-    texts = {part: str(rows.to_string(index=False)) for part, rows in results.tables().items()}
-    head = (
-        "One second of Example 2. Processor time [ms] to an error of the orientation at the end,\n"
-        "and how many times that is ours. '-': not reached by any setting tried."
-    )
-    end = "\n".join([results.run(), *results.missing_lines()])
-    verdicts = "\n".join(results.verdicts())
-    return "\n\n".join([head, texts["series"], texts["best"], verdicts, texts["floor"], end])
+    def parts(self) -> dict[str, str]:
+        """The parts of the page by name, Markdown."""
+        missing = [f"{engine}: {why}.\n" for engine, why in self.missing.items()]
+        lines = ["The settings behind the best times:\n", *(f"- {x}." for x in self.settings())]
+        return {part: markdown(rows) for part, rows in self.tables().items()} | {
+            "verdicts": "\n".join(f"- {line}." for line in self.verdicts()),
+            "settings": "\n".join([*missing, *lines]),
+            "run": self.run(),
+        }
 
 
 def write(results: Results, folder: Path) -> None:
@@ -209,14 +203,7 @@ def write(results: Results, folder: Path) -> None:
         },
     }
     write_json(folder / "peers.json", document)
-    lines = ["The settings behind the best times:", "", *(f"- {x}." for x in results.settings())]
-    missing = [line for text in results.missing_lines() for line in (text, "")]
-    parts = {part: markdown(rows) for part, rows in results.tables().items()} | {
-        "verdicts": "\n".join(f"- {line}." for line in results.verdicts()),
-        "settings": "\n".join([*missing, *lines]),
-        "run": results.run(),
-    }
-    fill_page(DOCS / "peers.md", parts, folder / "peers.md")
+    fill_page(DOCS / "peers.md", results.parts(), folder / "peers.md")
     draw(folder)
 
 
