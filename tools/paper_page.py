@@ -41,12 +41,10 @@ def places() -> dict[int, str]:
             if owner is None:
                 continue
             for number, width in numbers(text):
-                place = f"`{path.stem}.{owner.name}`"
-                best = found.get(number)
                 # Among equal widths the paper's own file wins over the helpers around it.
                 rank = width if path.stem == "virtual_work" else 2 * width
-                if best is None or rank < best[0]:
-                    found[number] = rank, place
+                if number not in found or rank < found[number][0]:
+                    found[number] = rank, f"`{path.stem}.{owner.name}`"
     return {number: place for number, (_, place) in found.items()}
 
 

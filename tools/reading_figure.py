@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmark.measure import DOCS
 from sst_ros.identification.measured_motion import take_readings
 from sst_ros.identification.parameters import value_of
 from sst_ros.identification.simulation_fit import Sensitivities, describe_combination
@@ -42,7 +42,6 @@ PANELS = (
 )
 LEAST, MOST = 1e-3, 1e2
 """Range of the relative standard deviations that are shown."""
-DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str], Array]:
