@@ -386,8 +386,8 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
 def long_bag():
     """Import benchmark/long_bag.py, which is not part of the package."""
     pytest.importorskip("numba")
-    sys.path.insert(0, ROOT)
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
+    sys.path.insert(0, ROOT)
     yield importlib.import_module("benchmark.long_bag")
     sys.path.remove(ROOT)
 
