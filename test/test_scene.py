@@ -77,26 +77,20 @@ def test_inertia_matrix_is_symmetric_with_the_tensors_entries():
     np.testing.assert_array_equal(matrix, [[3, 0.1, -0.2], [0.1, 4, 0.3], [-0.2, 0.3, 5]])
 
 
-def test_an_unknown_name_tells_the_known_ones():
-    with pytest.raises(InputError, match=r"'example9': must be .* one of .*example1, example2, "):
-        load("example9")
-
-
-def test_a_missing_file_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"No such file.*none\.yaml"):
-        load(tmp_path / "none.yaml")
-
-
-def test_a_file_that_is_no_text_is_told(tmp_path):
-    path = tmp_path / "binary.yaml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="codec can't decode"):
-        load(path)
-
-
-def test_a_name_with_a_null_character_is_told():
-    with pytest.raises(InputError, match="must be a readable"):
-        load("a\0b")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("example9", r"'example9': must be .* one of .*example1, example2, "),
+        ("none.yaml", r"No such file.*none\.yaml"),
+        ("binary.yaml", "codec can't decode"),
+        ("a\0b", "must be a readable"),
+    ],
+)
+def test_what_is_no_scene_is_refused(name, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match=message):
+        load(name)
 
 
 def test_one_link_stands_for_three():

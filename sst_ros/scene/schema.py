@@ -78,6 +78,7 @@ class Spec:
                 ["must be a list of", *" or ".join(map(str, self.lengths)).split(), "mappings"]
             ),
             "notes": "must be a mapping from keys to text",
+            "anything": "",
         }[self.kind]
 
 
@@ -86,7 +87,12 @@ def number(doc: str, unit: str, *, default: Any = dataclasses.MISSING, **spec: A
     return _declare(Spec("number", doc, unit, **spec), default)
 
 
-def integer(doc: str, unit: str, *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
+def anything(doc: str, **default: Any) -> Any:
+    """Declare what `Section.check` checks; it may be given by its place, too."""
+    return dataclasses.field(metadata={"spec": Spec("anything", doc)}, **default)
+
+
+def integer(doc: str, unit: str = "", *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
     """Declare a whole number."""
     return _declare(Spec("integer", doc, unit, **spec), default)
 
@@ -244,6 +250,8 @@ def accept(spec: Spec, value: Any) -> Any:
         return tuple((frozen_text(name), frozen_text(note)) for name, note in pairs)
     if spec.kind == "text":
         return frozen_text(value)
+    if spec.kind == "anything":
+        return value
     if spec.kind == "texts" and isinstance(value, (list, tuple)):
         return tuple(frozen_text(entry) for entry in value)
     if spec.kind == "flag" and (value is True or value is False):

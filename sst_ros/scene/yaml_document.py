@@ -387,7 +387,7 @@ def _entries(tree: Any) -> list[tuple[Any, Any]]:
 
 
 def addressed(
-    tree: Section, key: str, *, components: bool = False
+    tree: Section, key: str, *, components: bool = False, place: Place = ()
 ) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield the place of each field that a key names, its value, and what it allows.
 
@@ -395,41 +395,36 @@ def addressed(
         tree: the document.
         key: of a field.
         components: an index may also pick a component of a vector.
+        place: of the tree in a larger one.
 
     Raises:
         ValueError: there is no such field, or it is not in this scene.
 
     """
+    word, _, rest = key.partition(".")
     try:
-        words = split(key)
-    except ValueError as error:
-        words = [(str(error), None)]
-    yield from _addressed(tree, words, components, ())
-
-
-def _addressed(
-    tree: Section, words: list[tuple[str, int | None]], components: bool, place: Place
-) -> Iterator[tuple[Place, Any, Spec]]:
-    (name, index), *rest = words
+        ((name, index),) = split(word)
+    except ValueError:
+        name, index = word, None
     known = specs(type(tree))
     if name not in known:
         raise ValueError("unknown key; allowed are " + ", ".join(known))
     spec, value, here = known[name], getattr(tree, name), (*place, name)
     if not rest and index is None:
         yield here, value, spec
-    elif not rest and components and spec.kind == "number" and value is not None:
-        if not spec.shape or index is None or index >= len(value):
+    elif not rest and components and spec.shape and value is not None:
+        if index is None or index >= len(value):
             raise ValueError(NO_NUMBER)
         yield (*here, index), value[index], dataclasses.replace(spec, shape=spec.shape[1:])
     elif rest and spec.kind == "section" and index is None:
         if value is None:
             raise ValueError(f"the scene has no {name}")
-        yield from _addressed(value, rest, components, here)
+        yield from addressed(value, rest, components=components, place=here)
     elif rest and spec.kind == "sections":
         chosen = range(len(value)) if index is None else [index]
         if not chosen or max(chosen) >= len(value):
             raise ValueError(f"the scene has {len(value)} {name}")
         for i in chosen:
-            yield from _addressed(value[i], rest, components, (*here, i))
+            yield from addressed(value[i], rest, components=components, place=(*here, i))
     else:
         raise ValueError(NO_NUMBER)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.host.output import require_free, write_into
+from sst_ros.host.output import Bar, require_free, write_into
 from sst_ros.scene.scene import scene_of
 from sst_ros.sweeps.chunk_task import (
     ChunkOutcome,
@@ -31,9 +31,6 @@ from sst_ros.sweeps.sweep_study import SweepStudy
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_EVERY = 0.2
-"""Least time between two lines on a terminal [s]."""
 
 
 def sweep(
@@ -181,43 +178,29 @@ def _join(ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]) -> pd.Data
 
 
 class SweepProgress:
-    """A line that is drawn over itself on a terminal; silent elsewhere.
+    """A bar with the runs that are done and how the early ones ended.
 
     Args:
         total: rows of the study.
         done: rows that are there already.
-        shown: draw at all.
+        shown: draw it, if stderr is a terminal.
 
     """
 
     def __init__(self, total: int, done: int, *, shown: bool) -> None:
         self._total, self._before, self._done = total, done, done
-        self._began, self._drawn = time.monotonic(), 0.0
-        self._shown = shown and sys.stderr.isatty()
-        self.reasons: Counter[str] = Counter()
+        self._bar, self._began = Bar("sweep", shown), time.monotonic()
+        self._reasons: Counter[str] = Counter()
 
     def add(self, outcome: ChunkOutcome) -> None:
         """Count a chunk that is done."""
         self._done += outcome.rows
-        self.reasons.update(dict(outcome.reasons))
-        now = time.monotonic()
-        if self._shown and (now - self._drawn > _EVERY or self._done == self._total):
-            self._drawn = now
-            end = "\n" if self._done == self._total else ""
-            print(f"\r{self.line()[:110]:110}", end=end, file=sys.stderr, flush=True)
+        self._reasons.update(dict(outcome.reasons))
+        rate = (self._done - self._before) / max(time.monotonic() - self._began, 1e-9)
+        ended = ", ".join(f"{count} {text}" for text, count in self._reasons.most_common(3))
+        left = f"{rate:.0f} runs/s, {(self._total - self._done) / max(rate, 1e-9):.0f} s left"
+        self._bar.draw(self._done / self._total, left + (f"; early: {ended}" if ended else ""))
 
     def note(self, text: str) -> None:
-        """Print a message above the line."""
-        if self._shown:
-            print(f"\r{' ' * 110}\r", end="", file=sys.stderr)
+        """Print a message."""
         print(f"sweep: {text}", file=sys.stderr, flush=True)
-
-    def line(self) -> str:
-        """Return the line."""
-        seconds = max(time.monotonic() - self._began, 1e-9)
-        rate = (self._done - self._before) / seconds
-        left = (self._total - self._done) / rate if rate else float("inf")
-        bar = "#" * (20 * self._done // self._total)
-        ended = ", ".join(f"{count} {text}" for text, count in self.reasons.most_common(3))
-        early = f"; early: {ended}" if ended else ""
-        return f"[{bar:20}] {self._done}/{self._total} runs, {rate:.0f}/s, {left:.0f} s left{early}"

@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,9 @@ from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.scene import Scene, SineTorque, scene_of
-from sst_ros.scene.schema import Section, specs
+from sst_ros.scene.schema import Section, anything, choice, integer, number, specs, texts
 from sst_ros.scene.yaml_document import plain, values_of
-from sst_ros.state import QUANTITIES
+from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     LARGEST_HYPERCUBE,
     SAMPLINGS,
@@ -51,56 +51,91 @@ MOST_ROWS, MOST = 2**53, 10_000_000
 
 
 @dataclass(frozen=True)
-class SweepStudy:
+class SweepStudy(Section):
     """Many runs of a scene.
-
-    Args:
-        scene: what is simulated.
-        vary: distribution or values by key of the scene, see `variations`.
-        n: number of runs; by default that of the grid or of the table.
-        seed: of the random numbers, from 0 to 2^64 - 1.
-        sampling: random, sobol or latin_hypercube.
-        table: values by column, in place of distributions.
-        duration: length of a run [s]; by default that of the scene, or of its motion if controlled.
-        tolerance: largest error of the orientation at the end [rad], for the number of steps.
-        steps: number of steps of a run; chosen by the tolerance if not given.
-        torque: None for the scene's own torques if it has some, else zero; three constant torques
-            [N m]; or a SineTorque as a mapping.
-        control: settings of a controller and its channel, see `controlled`.
-        outputs: quantities of the final state, and `extremes` of joints at the ends of the steps.
-        trajectory: {rows: m, samples: k}: k + 1 states of each of the first m runs.
-        chunk: rows of a task and of a file.
 
     Raises:
         InputError: a value is not allowed; the message names its key and what is allowed.
 
     """
 
-    scene: Scene
-    vary: Mapping[str, Any] = field(default_factory=dict)
-    n: int | None = None
-    seed: int = 0
-    sampling: str = "random"
-    table: Mapping[str, Any] | None = None
-    duration: float | None = None
-    tolerance: float = 1e-9
-    steps: int | None = None
-    torque: Any = None
-    control: Mapping[str, Any] | None = None
-    outputs: tuple[str, ...] = DEFAULT_OUTPUTS
-    trajectory: Mapping[str, int] | None = None
-    chunk: int = CHUNK
+    ORIGIN = "sweep"
+
+    scene: Scene = anything("what is simulated")
+    vary: Mapping[str, Any] = anything(
+        "distribution or values by key of the scene, see `variations`", default_factory=dict
+    )
+    n: int | None = integer(
+        "number of runs; by default that of the grid or of the table",
+        default=None,
+        least=1,
+        most=MOST_ROWS,
+    )
+    seed: int = integer("of the random numbers", default=0, least=0, most=2**64 - 1)
+    sampling: str = choice("of random numbers", SAMPLINGS, default="random")
+    table: Mapping[str, Any] | None = anything(
+        "values by column, in place of distributions", default=None
+    )
+    duration: float | None = number(
+        "length of a run; by default that of the scene, or of its motion if controlled",
+        "s",
+        default=None,
+        above=0.0,
+    )
+    tolerance: float = number(
+        "largest error of the orientation at the end, for the number of steps",
+        "rad",
+        default=1e-9,
+        above=0.0,
+    )
+    steps: int | None = integer(
+        "number of steps of a run; chosen by the tolerance if not given",
+        default=None,
+        least=1,
+        most=MOST,
+    )
+    torque: Any = anything(
+        "None for the scene's own torques if it has some, else zero; three constant torques [N m]; "
+        "or a SineTorque as a mapping",
+        default=None,
+    )
+    control: Mapping[str, Any] | None = anything(
+        "settings of a controller and its channel, see `ControlChannel`", default=None
+    )
+    outputs: tuple[str, ...] = texts(
+        "quantities of the final state, and `extremes` of joints at the ends of the steps",
+        default=DEFAULT_OUTPUTS,
+    )
+    trajectory: Mapping[str, int] | None = anything(
+        "{rows: m, samples: k}: k + 1 states of each of the first m runs", default=None
+    )
+    chunk: int = integer("rows of a task and of a file", default=CHUNK, least=1, most=MOST)
 
     def __post_init__(self) -> None:
-        found = list(find_problems(vars(self)))
-        if found:
-            raise InputError("sweep", found)
-        object.__setattr__(self, "outputs", tuple(self.outputs))
+        super().__post_init__()
         _ = self.variations, self.rows, self.length, self.controlled
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse outputs, torques and trajectories that are none."""
+        for name in self.outputs:
+            if name not in OUTPUTS:
+                yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
+        torque, kept = self.torque, self.trajectory
+        if torque is not None and self.control is not None:
+            yield Problem("torque", "given", "has no effect: the controller gives the torques")
+        constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
+        if constant and finite_vector(torque) is None:
+            yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
+        good = isinstance(kept, Mapping) and kept.keys() == {"rows", "samples"}
+        if kept is not None and not (
+            good and all(type(x) is int and 1 <= x <= 100_000 for x in kept.values())
+        ):
+            allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
+            yield Problem("trajectory", kept, allowed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what was given, not what has been computed from it."""
-        return SweepStudy, tuple(getattr(self, one.name) for one in dataclasses.fields(self))
+        return _build_study, ({name: getattr(self, name) for name in specs(SweepStudy)},)
 
     @classmethod
     def read(cls, path: Path) -> SweepStudy:
@@ -118,7 +153,7 @@ class SweepStudy:
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping."""
-        known = [one.name for one in dataclasses.fields(cls)]
+        known = specs(cls)
         for key in values:
             if key not in known:
                 hint = suggestion(str(key), known)
@@ -130,7 +165,7 @@ class SweepStudy:
             scene = folder / scene
         if isinstance(table, str):
             table = read_table(folder / table)
-        return cls(scene_of(scene), table=table, **given)
+        return cls(scene=scene_of(scene), table=table, **given)
 
     @cached_property
     def model_scene(self) -> Scene:
@@ -229,7 +264,7 @@ class SweepStudy:
 
     def document(self) -> dict[str, Any]:
         """Return the study as nested dicts and lists; a table as its digest."""
-        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        values = {name: getattr(self, name) for name in specs(SweepStudy)}
         values["scene"] = values_of(self.scene)
         if isinstance(self.torque, SineTorque):
             values["torque"] = values_of(self.torque)
@@ -256,37 +291,8 @@ class SweepStudy:
         return targets_of(self.model_scene, key)
 
 
-def find_problems(given: Mapping[str, Any]) -> Iterator[Problem]:
-    """Yield what is wrong with the values of a study by key."""
-    ranges = {"n": (1, MOST_ROWS), "seed": (0, 2**64 - 1), "steps": (1, MOST), "chunk": (1, MOST)}
-    for name, (least, most) in ranges.items():
-        value = given[name]
-        if value is None and name in ("n", "steps"):
-            continue
-        if type(value) is not int or not least <= value <= most:
-            yield Problem(name, value, f"must be a whole number from {least} to {most}")
-    for name in ("duration", "tolerance"):
-        value = given[name]
-        real = isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0
-        if value is not None and not real:
-            yield Problem(name, value, "must be a finite number > 0")
-    if given["sampling"] not in SAMPLINGS:
-        yield Problem("sampling", given["sampling"], f"must be one of {', '.join(SAMPLINGS)}")
-    for name in given["outputs"]:
-        if name not in OUTPUTS:
-            yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
-    if given["torque"] is not None and given["control"] is not None:
-        yield Problem("torque", "given", "has no effect: the controller gives the torques")
-    torque, kept = given["torque"], given["trajectory"]
-    constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
-    if constant and (np.shape(torque) != (3,) or not np.all(np.isfinite(torque))):
-        yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
-    good = isinstance(kept, Mapping) and kept.keys() == {"rows", "samples"}
-    if kept is not None and not (
-        good and all(type(x) is int and 1 <= x <= 100_000 for x in kept.values())
-    ):
-        allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
-        yield Problem("trajectory", kept, allowed)
+def _build_study(values: Mapping[str, Any]) -> SweepStudy:
+    return SweepStudy(**values)
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,14 @@ from sst_ros.identification.regressor import BaseParameters
 NAMES = tuple(f"star.{part}" for part in STANDARD)
 
 
+def draw_points(rng, count):
+    """Masses and places of points."""
+    return rng.uniform(0.1, 1.0, count), rng.uniform(-0.2, 0.2, (count, 3))
+
+
 def of_points(rng, count=6):
     """The ten parameters of point masses."""
-    masses, places = rng.uniform(0.1, 1.0, count), rng.uniform(-0.2, 0.2, (count, 3))
+    masses, places = draw_points(rng, count)
     inertia = sum(
         m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
     )
@@ -39,14 +44,9 @@ def direct(names, noise=1e-3, rows=40, target=None, seed=0):
 
 
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
-    rng = np.random.default_rng(1)
-    masses, places = rng.uniform(0.1, 1.0, 4), rng.normal(size=(4, 3))
+    masses, places = draw_points(np.random.default_rng(1), 4)
     expected = sum(m * np.outer([*p, 1.0], [*p, 1.0]) for m, p in zip(masses, places, strict=True))
-    inertia = sum(
-        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
-    )
-    six = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    found = pseudo_inertia(np.array([masses.sum(), *(masses @ places), *six]))
+    found = pseudo_inertia(of_points(np.random.default_rng(1), 4))
     assert np.abs(found - expected).max() < 1e-14
 
 

@@ -236,6 +236,35 @@ def test_numbers_of_a_term_that_is_left_out_are_held_to_what_is_allowed_too():
         Batch(LOADED, parameters=parameters)
 
 
+SPREAD = {
+    "star.inertia.zz": (0.5, 1.6),
+    "star.inertia.xy": (-40.0, 40.0),
+    "star.mass": (0.5, 3.0),
+    "star.centre": (-1.5, 1.5),
+    "base.radius": (-0.5, 1.5),
+    "payload.inertia.xx": (-0.2, 3.0),
+    "friction.gamma.static": (0.3, 1.5),
+    "intermediate_links[1].inertia.zz": (0.2, 2.0),
+    "base.v": (-0.2, 1.5),
+}
+
+
+@pytest.mark.parametrize("key", SPREAD)
+def test_rules_refuse_the_same_rows_as_columns_and_as_scenes(key):
+    low, high = SPREAD[key]
+    value = np.array(eval(f"LOADED.{key}"))
+    factors = np.random.default_rng(5).uniform(low, high, (60, *value.shape))
+    scenarios = Scenarios(LOADED, {key: factors * value})
+    refused = set()
+    for row in range(60):
+        try:
+            scenarios.scene(row)
+        except InputError:
+            refused.add(row)
+    assert 0 < len(refused) < 60
+    assert set(scenarios.faults(most=60)) == refused == set(np.flatnonzero(scenarios._doubtful()))
+
+
 def test_no_more_than_ten_problems_are_told():
     with pytest.raises(InputError) as refused:
         Batch(EXAMPLE2, parameters={"star.inertia.zz": np.full(1000, -1.0)})
