@@ -66,7 +66,7 @@ class Inertia(Section):
 
         tensor = _entries(self)
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
-        definite = _is_positive(tensor, -SMALLEST_MOMENT)
+        definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
         yield (
             ~definite,
             lambda: refusal(
