@@ -13,11 +13,10 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import require_free
 from sst_ros.scene.scene import load
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.sweeps.chunk_task import read_sweep
+from sst_ros.sweeps.chunk_task import read_sweep, summarize
 from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
-from sst_ros.sweeps.sweep_summary import summarize
 
 PLOT = "plot"
 """Word in place of a study."""

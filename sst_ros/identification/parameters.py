@@ -19,7 +19,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import addressed, build, open_values, replace_values, values_of
+from sst_ros.scene.yaml_document import build, find_fields, open_values, replace_values, values_of
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -186,7 +186,7 @@ def _of_centre(name: str) -> str:
 def value_of(scene: Scene, name: str) -> float | None:
     """Return a number of a scene by its key, the first of a list; None where there is none."""
     try:
-        _, value, spec = next(addressed(scene, name, components=True))
+        _, value, spec = next(find_fields(scene, name, components=True))
     except ValueError:
         return None
     if spec.kind != "number" or value is None:

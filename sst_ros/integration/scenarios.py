@@ -22,9 +22,9 @@ from sst_ros.scene.scene import LARGEST, SMALLEST, Scene
 from sst_ros.scene.schema import Place, Spec
 from sst_ros.scene.yaml_document import (
     NO_NUMBER,
-    addressed,
     broken_rows,
     build,
+    find_fields,
     open_values,
     replace_values,
     values_of,
@@ -61,7 +61,7 @@ class Scenarios:
         problems, taken = [], set[Place]()
         for key, value in parameters.items():
             try:
-                for place, _, spec in addressed(scene, key):
+                for place, _, spec in find_fields(scene, key):
                     if spec.kind != "number":
                         raise ValueError(NO_NUMBER)
                     if place in taken:

@@ -386,7 +386,7 @@ def _entries(tree: Any) -> list[tuple[Any, Any]]:
     return list(vars(tree).items()) if isinstance(tree, (Section, SimpleNamespace)) else []
 
 
-def addressed(
+def find_fields(
     tree: Section, key: str, *, components: bool = False, place: Place = ()
 ) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield the place of each field that a key names, its value, and what it allows.
@@ -419,12 +419,12 @@ def addressed(
     elif rest and spec.kind == "section" and index is None:
         if value is None:
             raise ValueError(f"the scene has no {name}")
-        yield from addressed(value, rest, components=components, place=here)
+        yield from find_fields(value, rest, components=components, place=here)
     elif rest and spec.kind == "sections":
         chosen = range(len(value)) if index is None else [index]
         if not chosen or max(chosen) >= len(value):
             raise ValueError(f"the scene has {len(value)} {name}")
         for i in chosen:
-            yield from addressed(value[i], rest, components=components, place=(*here, i))
+            yield from find_fields(value[i], rest, components=components, place=(*here, i))
     else:
         raise ValueError(NO_NUMBER)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The task that a thread or a worker does: one chunk, computed and written; all of them on threads.
+"""Chunks of a study: computed and written by a thread or a worker, read as one table, summed up.
 
 Results are Parquet files, one a chunk, each complete or absent: a file is written to a temporary
 name, flushed to the disk, and renamed. Its metadata holds the study, its digest, the version and
@@ -30,6 +30,7 @@ from sst_ros.version import VERSION
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
+
 
 METADATA = b"sst_ros"
 
@@ -275,3 +276,45 @@ def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
         frame = frame.set_index("scenario")
     frame.attrs = {key: value for key, value in about.items() if key != "rows"}
     return frame
+
+
+SHOWN = 8
+NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
+
+
+def summarize(table: pd.DataFrame) -> str:
+    """Return a text of the table of a study."""
+    counts = table["reason"].value_counts()
+    steps, length = table.attrs["steps"], table.attrs["duration"]
+    lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
+    lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
+    causes = correlate_early_ends(table)
+    if len(causes):
+        lines.append("Rank correlation of inputs with an early end:")
+        lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(SHOWN).items()]
+    outputs = table.loc[table["status"] == 0, list_outputs(table)]
+    if len(outputs):
+        shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
+        shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
+        lines.append(shown.to_string(float_format="{:.6g}".format))
+    return "\n".join(lines)
+
+
+def list_outputs(table: pd.DataFrame) -> list[str]:
+    """Names of the outputs of a study."""
+    known = (*table.attrs["inputs"], *NOT_OUTPUTS)
+    return [name for name in table.columns if name not in known]
+
+
+def correlate_early_ends(table: pd.DataFrame) -> pd.Series:
+    """Spearman's rank correlation of each input with an early end, largest first.
+
+    Empty where all runs ended alike, or no input differs.
+    """
+    early = (table["status"] != 0).astype(float)
+    inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
+    if early.nunique() < 2 or not inputs:
+        return table[[]].sum()
+    ranks = table[inputs].rank()
+    found = ranks.corrwith(early.rank())
+    return found.reindex(found.abs().sort_values(ascending=False).index)

@@ -16,7 +16,7 @@ from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
-from sst_ros.sweeps.sweep_summary import correlate_early_ends, list_outputs
+from sst_ros.sweeps.chunk_task import correlate_early_ends, list_outputs
 
 if TYPE_CHECKING:
     import pandas as pd

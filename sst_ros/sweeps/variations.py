@@ -29,7 +29,7 @@ from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Section, Spec, key_of, specs
-from sst_ros.scene.yaml_document import NO_NUMBER, addressed
+from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 
 KINDS = ("uniform", "normal", "grid", "linspace")
 
@@ -145,7 +145,7 @@ def targets_of(scene: Section, key: str) -> list[Target]:
 
     """
     found = []
-    for place, value, spec in addressed(scene, key):
+    for place, value, spec in find_fields(scene, key):
         here = key_of(place)
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")

@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import spearmanr
 
 from sst_ros.cli.main import run
-from sst_ros.sweeps.chunk_task import read_sweep
-from sst_ros.sweeps.sweep_summary import correlate_early_ends
+from sst_ros.sweeps.chunk_task import correlate_early_ends, read_sweep
 
 for module in ("numba", "dask", "pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
