@@ -253,9 +253,9 @@ def _unheld(plant: Scene) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _motion(scene: Scene) -> ReferenceMotion:
-    from sst_ros.recording.recording import read_motion
+    from sst_ros.recording.recording import read_run_motion
 
-    return reference_motion(scene, read_motion)
+    return reference_motion(scene, read_run_motion)
 
 
 INTRODUCTION = """\

@@ -40,7 +40,7 @@ def check_plan(options: argparse.Namespace) -> int:
 
 def _read_motion(bag: str) -> Trajectory:
     """Read a recorded motion, which needs rosbags; others do not."""
-    found: Trajectory = function("recording.recording:read_motion")(bag)
+    found: Trajectory = function("recording.recording:read_run_motion")(bag)
     return found
 
 

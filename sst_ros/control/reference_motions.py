@@ -41,7 +41,7 @@ def reference_motion(
 
     Args:
         scene: has a `motion`.
-        read_motion: reads a bag as a `Trajectory`, as `recording.recording.read_motion` does.
+        read_motion: reads a bag as a `Trajectory`, as `recording.recording.read_run_motion` does.
 
     Raises:
         InputError: the scene has no motion, or one that cannot be made; see `through_points`.

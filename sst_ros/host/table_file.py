@@ -67,7 +67,7 @@ def write_table(
             parquet.write_table(whole, own, write_page_checksum=True)
 
 
-def read_table(
+def load_table(
     path: Path, columns: Sequence[str], texts: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Read columns and texts of a Parquet or NPZ file of any name; earlier ones have no checksum.

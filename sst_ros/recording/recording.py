@@ -219,7 +219,7 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
     return Recording(signals.read(Path(path), damaged=damaged))
 
 
-def read_motion(bag: str | Path) -> Trajectory:
+def read_run_motion(bag: str | Path) -> Trajectory:
     """Read the motion of a run, to be done again: the samples that have an orientation.
 
     Raises:

@@ -432,6 +432,6 @@ class TrajectoryFollower:
 
 
 def _read_motion(bag: str) -> Trajectory:
-    from sst_ros.recording.recording import read_motion  # needs rosbags, which others do not
+    from sst_ros.recording.recording import read_run_motion  # needs rosbags, which others do not
 
-    return read_motion(bag)
+    return read_run_motion(bag)

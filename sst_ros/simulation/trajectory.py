@@ -22,7 +22,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import MissingDependency, require
-from sst_ros.host.table_file import SUFFIXES, read_table, write_table
+from sst_ros.host.table_file import SUFFIXES, load_table, write_table
 from sst_ros.integration.adaptive_stepper import EvaluationBudget
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.methods import DOP853
@@ -293,7 +293,7 @@ class Trajectory:
         """
         allowed = "must be a trajectory that `Trajectory.save` has written"
         try:
-            columns, texts = read_table(Path(path), list(UNITS), [_KEY])
+            columns, texts = load_table(Path(path), list(UNITS), [_KEY])
             about = json.loads(texts[_KEY])
         except KeyError:
             raise InputError("load", [Problem("path", str(path), allowed)]) from None

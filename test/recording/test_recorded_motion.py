@@ -12,7 +12,7 @@ from sst_ros import __main__ as cli
 from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
-from sst_ros.recording.recording import read, read_motion
+from sst_ros.recording.recording import read, read_run_motion
 from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.motions import DesiredMotion, Recorded
 
@@ -30,7 +30,7 @@ def following(bag):
 def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag):
     """Held for 1 ms they are a staircase; the smooth motion asks for what lies between."""
     recording, held = read(bag), following(bag)
-    plan = examine_motion(reference_motion(held, read_motion), held)
+    plan = examine_motion(reference_motion(held, read_run_motion), held)
     assert plan.motion.duration == pytest.approx(recording.seconds[-1], abs=1e-12)
     for row in (0, 40, len(recording.gamma) - 1):
         at = plan.motion.at(recording.seconds[row])
@@ -55,10 +55,10 @@ def test_the_command_reads_the_bag(bag, tmp_path, capsys):
 
 def test_what_is_no_bag_is_refused(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
-        reference_motion(following(tmp_path / "nowhere"), read_motion)
+        reference_motion(following(tmp_path / "nowhere"), read_run_motion)
 
 
 def test_the_bag_of_another_manipulator_is_refused(bag):
     other = dataclasses.replace(scene.load("general"), motion=following(bag).motion)
     with pytest.raises(Exception, match="does not close the loops"):
-        reference_motion(other, read_motion)
+        reference_motion(other, read_run_motion)
