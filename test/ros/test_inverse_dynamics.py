@@ -186,7 +186,9 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     reference = observer.listen(JointState, f"{NODE}/reference")
     states = observer.states
     recorder = nodes.run("recorder", output=bag)
-    simulator = nodes.run("simulator", scene=path, wait_for_command="true", command_timeout=0.1)
+    # Slowly: while a busy machine lets the controller wait, the manipulator hardly moves.
+    slow = {"real_time_factor": 0.1, "command_timeout": 0.1}
+    simulator = nodes.run("simulator", scene=path, wait_for_command=True, **slow)
     assert nodes.line(recorder).startswith("ready")
     # The recorder reads the commands and the reference before the run begins.
     waits = {"min_subscribers": 2, "wait_for_recorder": "true"}
