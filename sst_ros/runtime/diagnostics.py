@@ -154,7 +154,7 @@ class RunDiagnostics:
 
         Args:
             values: as `values` has just read them. What the thread of the run counts meanwhile is
-                told the next time: words and values of one message never contradict each other.
+                reported the next time: words and values of one message never contradict each other.
             warnings: of the graph.
 
         """
