@@ -47,6 +47,7 @@ def test_gate_sees_a_wrong_inertia(task):
     assert series.gate(task) > series.tolerance
 
 
+@pytest.mark.slow
 def test_short_runs_converge_to_each_other(task):
     """The whole path of one engine and ours: same end to the order of their steps."""
     pytest.importorskip("numba")

@@ -66,10 +66,12 @@ scene = load_scene("example2")
 made = passed(lambda: Simulation({scene}))
 simulation = Simulation("example2")
 step()
-bag = bags.write(pathlib.Path({folder!r}), bags.simulated(scene, 0.05))
-report()
-for files in (made, passed(step), passed(report)):
-    print(*sorted(files))
+print(*sorted(made))
+print(*sorted(passed(step)))
+if {reports}:
+    bag = bags.write(pathlib.Path({folder!r}), bags.simulated(scene, 0.05))
+    report()
+    print(*sorted(passed(report)))
 """
 
 
@@ -77,7 +79,7 @@ def test_the_counts_of_files_are_those_of_calls(tmp_path):
     """The first Simulation of a scene by name and as a Scene, a later step, a later report."""
     found = []
     for scene in ('"example2"', "scene"):
-        code = TRACE.format(scene=scene, folder=str(tmp_path / f"bag{len(found)}"))
+        code = TRACE.format(scene=scene, folder=str(tmp_path / "bag"), reports=not found)
         done = python(code, env={"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"})
         found.append([set(line.split()) for line in done.stdout.splitlines()])
     (by_name, step, report), (of_scene, *_) = found

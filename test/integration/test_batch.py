@@ -89,11 +89,12 @@ def manipulators(samples):
     return rows._replace(result=rows.run(threads=3))
 
 
-@pytest.fixture(params=["swarm", "manipulators"])
+@pytest.fixture(params=["swarm", pytest.param("manipulators", marks=pytest.mark.slow)])
 def rows(request):
     return request.getfixturevalue(request.param)
 
 
+@pytest.mark.slow
 def test_a_row_is_the_scene_with_these_numbers(manipulators, samples):
     found = [manipulators.batch.scenario(n) for n in range(FEW)]
     assert found == [one.scene for one in samples]

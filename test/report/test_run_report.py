@@ -397,6 +397,7 @@ def long_run(long_bag, tmp_path_factory):
     return recording.read(long_bag.write(tmp_path_factory.mktemp("long") / "bag", 20.0))
 
 
+@pytest.mark.slow
 def test_a_long_run_is_integrated_compiled(long_run, monkeypatch):
     """The work that a report does for it, which is what its time and memory come from."""
     calls = 0
@@ -417,6 +418,7 @@ def test_a_long_run_is_integrated_compiled(long_run, monkeypatch):
     assert np.abs(energy).max() < 1e-11
 
 
+@pytest.mark.slow
 def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
     compiled = reference.integration(long_run), timing.energy_residual(long_run, [])
     monkeypatch.setenv("SST_ROS_NUMBA", "0")

@@ -64,11 +64,13 @@ def small():
     return feedforward_study(plan, workers=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ORDERS)
 def test_the_error_of_held_torques_falls_at_the_order_of_theory(small, at):
     assert small.orders()[at] == pytest.approx(ORDERS[at], abs=0.1)
 
 
+@pytest.mark.slow
 def test_torques_that_are_not_held_reach_the_floor_of_the_integrator(small):
     """Both are rounding: some 1e4 operations at 1e-16 each."""
     error, estimate = small.unheld
@@ -76,6 +78,7 @@ def test_torques_that_are_not_held_reach_the_floor_of_the_integrator(small):
     assert error < 10.0 * estimate + 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", "+-")
 def test_feedforward_helps_a_wrong_model_as_linear_theory_says(small, sign):
     """1 / SHARE, less what the hold adds; the curvature of the mechanism may take 5 %."""
@@ -85,6 +88,7 @@ def test_feedforward_helps_a_wrong_model_as_linear_theory_says(small, sign):
     assert 0.95 * bound < benefit < 1.1 / SHARE
 
 
+@pytest.mark.slow
 def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
     found = small.limits.iloc[0]
     assert found.theory == pytest.approx(1e9 / PERIOD_NS, rel=1e-5)  # Jury: 1 / zeta
@@ -147,6 +151,7 @@ def test_the_same_bits_on_any_number_of_workers():
     assert first.loops.drop(columns="seed").to_csv() != other.loops.drop(columns="seed").to_csv()
 
 
+@pytest.mark.slow
 def test_failures_stay_with_their_reason(small):
     failed = small.loops[small.loops.failure != ""]
     assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {180.0}
@@ -156,6 +161,7 @@ def test_failures_stay_with_their_reason(small):
     assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}" in said
 
 
+@pytest.mark.slow
 def test_what_it_writes_can_be_read(small, tmp_path):
     write(tmp_path, "feedforward", csv=small.loops, document=document(small), page=page(small),
           figures={"picture": draw_study(small, title(small))})  # fmt: skip
