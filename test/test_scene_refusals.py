@@ -179,6 +179,25 @@ def test_all_faults_are_told_at_once_in_order_of_their_lines():
 
 BODIES = SOURCE[: SOURCE.index("provenance:")]
 
+
+@pytest.mark.parametrize(
+    ("section", "key", "line"),
+    [
+        (
+            "springs:\n- {joint: mu_1, stiffness: 4, rest: 0}\n- {joint: mu_2, rest: 0}",
+            "springs[1].stiffness",
+            3,
+        ),
+        ("provenance:\n  ' star-mass ': guessed", "provenance.star-mass", 1),
+    ],
+)
+def test_a_key_that_no_line_has_is_told_with_the_line_of_the_deepest_part_of_it(section, key, line):
+    with pytest.raises(InputError) as caught:
+        read(Scene, BODIES + section, "origin")
+    (problem,) = caught.value.problems
+    assert (problem.key, problem.line) == (key, len(BODIES.splitlines()) + line)
+
+
 # One more section at the end of example 2, and what must be said of it after "origin: line N: ".
 SECTIONS_REFUSED = {
     "no field": ("gravity: {acceleration: [0, 0, 0]}", r"gravity\.acceleration .*: must not be z"),

@@ -274,9 +274,10 @@ def build(
 
 def line_at(lines: Mapping[str, int], key: str) -> int | None:
     """Return the line of a key, or of the deepest part of it that has one."""
+    # One entry may stand for all.
+    key = re.sub(r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key)
     while key and key not in lines:
-        first = re.sub(r"\[\d+\]", "[0]", key)  # one entry may stand for all
-        key = first if first in lines else re.sub(r"(^|\.)\w+$|\[\d+\]$", "", key)
+        key = key[: max(key.rfind("."), key.rfind("["), 0)]
     return lines.get(key)
 
 
