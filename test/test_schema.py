@@ -110,6 +110,12 @@ def test_sections_built_in_python_are_held_to_the_same_rules(build, message):
         build()
 
 
+def test_what_has_no_effect_and_what_contradicts_itself_are_told_at_once():
+    with pytest.raises(InputError) as caught:
+        Star(alpha_deg=[120, 120, 121], radius=1.0, inertia=INERTIA, centre=(0.0, 0.0, 1.0))
+    assert [problem.key for problem in caught.value.problems] == ["centre", "alpha_deg"]
+
+
 def test_long_values_are_cut_in_messages():
     with pytest.raises(InputError) as caught:
         read(Scene, SOURCE.replace("duration: 1 ", f"duration: {'x' * 500} "), "origin")

@@ -174,7 +174,7 @@ class Section:
                 object.__setattr__(self, name, accept(spec, value))
             except ValueError:
                 problems.append(Problem(name, value, spec.describe()))
-        problems = problems or list(self._find_idle()) or list(self.check())
+        problems = problems or [*self._find_idle(), *self.check()]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
 
