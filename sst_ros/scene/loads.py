@@ -7,7 +7,6 @@ A term that a scene does not name has no operation in its dynamics.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -41,10 +40,10 @@ class Moment(Section):
     value: Vector3 | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
     topic: bool = flag("take it from the topic ~/external_moment", default=False)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse both and neither."""
-        if self.topic == (self.value is not None):
-            yield Problem("", self.value, "give either value or topic: true")
+        allowed = "give either value or topic: true"
+        yield self.topic == (self.value is not None), partial(Problem, "", self.value, allowed)
 
 
 @dataclass(frozen=True)
@@ -187,29 +186,20 @@ class Stroke(Section):
         "rate of the impacts that have this restitution", "rad/s", default=None, above=0.0
     )
 
-    def check(self) -> Iterator[Problem]:
-        """Refuse coefficients of another kind of end, and a kind without its own."""
-        only = "is given with at_end: elastic, and only there"
-        elastic = self.at_end == "elastic"
-        if (self.stiffness is not None) != elastic:
-            yield Problem("stiffness", self.stiffness, only)
-        for name in ("restitution", "impact_rate"):
-            if getattr(self, name) and not elastic:
-                yield Problem(name, getattr(self, name), only)
-        if (self.restitution is None) != (self.impact_rate is None):
-            yield Problem(
-                "impact_rate", self.impact_rate, "is given with restitution, both or none"
-            )
-        yield from super().check()
-
     def rules(self) -> Rules:
-        """Refuse damping where there is none, and where restitution gives it."""
-        damped = np.not_equal(self.damping, 0.0)
-        for broken, allowed in (
-            (damped & (self.at_end != "elastic"), "is given with at_end: elastic, and only there"),
-            (damped & (self.restitution is not None), "give either damping or restitution"),
+        """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
+        elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
+        bounces, has_rate = self.restitution is not None, self.impact_rate is not None
+        only = "is given with at_end: elastic, and only there"
+        for name, broken, allowed in (
+            ("stiffness", (self.stiffness is not None) != elastic, only),
+            ("restitution", bounces and not elastic, only),
+            ("impact_rate", has_rate and not elastic, only),
+            ("impact_rate", bounces != has_rate, "is given with restitution, both or none"),
+            ("damping", damped & (not elastic), only),
+            ("damping", damped & bounces, "give either damping or restitution"),
         ):
-            yield broken, partial(Problem, "damping", self.damping, allowed)
+            yield broken, partial(Problem, name, getattr(self, name), allowed)
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ recording does. A motion that names no start begins in the initial pose of the s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
+import numpy as np
+
 from sst_ros.errors import Problem
-from sst_ros.scene.schema import Section, number, section, sections, specs, text
+from sst_ros.scene.schema import Rules, Section, number, section, sections, specs, text
 from sst_ros.state import Vector3
 
 NANOSECOND = 1e-9
@@ -36,10 +38,13 @@ class ToOrientation(Section):
     )
     duration: float = number("time that it takes", "s", least=NANOSECOND)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse a quaternion without direction."""
-        if not sum(part * part for part in self.orientation) > 0.0:
-            yield Problem("orientation", self.orientation, "must not be zero")
+        square = sum(part * part for part in self.orientation)
+        yield (
+            np.equal(square, 0.0),
+            partial(Problem, "orientation", self.orientation, "must not be zero"),
+        )
 
 
 @dataclass(frozen=True)
@@ -65,11 +70,13 @@ class Sweep(Section):
     fade: float = number("time to grow and to fade", "s", least=NANOSECOND)
     duration: float = number("time that it takes", "s", least=NANOSECOND)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse to fade for longer than there is time."""
-        if self.fade > 0.5 * self.duration:
-            allowed = f"must not exceed half the duration, {0.5 * self.duration:g} s"
-            yield Problem("fade", self.fade, allowed)
+        most = 0.5 * self.duration
+        yield (
+            np.greater(self.fade, most),
+            lambda: Problem("fade", self.fade, f"must not exceed half the duration, {most:g} s"),
+        )
 
 
 @dataclass(frozen=True)
@@ -124,13 +131,15 @@ class DesiredMotion(Section):
         """Name of the kind that is given."""
         return next(name for name in specs(DesiredMotion) if getattr(self, name))
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse none and several, and points whose times do not rise."""
         given = [name for name in specs(DesiredMotion) if getattr(self, name)]
-        if len(given) != 1:
-            allowed = "give one of " + ", ".join(specs(DesiredMotion))
-            yield Problem("", given or None, allowed)
+        allowed = "give one of " + ", ".join(specs(DesiredMotion))
+        yield len(given) != 1, partial(Problem, "", given or None, allowed)
         for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
-            if here.time < before.time + NANOSECOND:
-                allowed = f"must be > {before.time:g} s, that of the point before, by 1e-9 s"
-                yield Problem(f"waypoints[{index}].time", here.time, allowed)
+            early = np.less(here.time, before.time + NANOSECOND)
+            yield early, partial(_too_early, f"waypoints[{index}].time", here.time, before.time)
+
+
+def _too_early(key: str, time: float, before: float) -> Problem:
+    return Problem(key, time, f"must be > {before:g} s, that of the point before, by 1e-9 s")

@@ -18,6 +18,7 @@ from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Link, Spring
+from sst_ros.scene.yaml_document import find_fields
 
 pytest.importorskip("numba", reason="a batch needs numba")
 
@@ -213,6 +214,10 @@ REFUSED = [
     ({"star.inertia.zz": [0.3, np.nan]}, "scenario 1: star.inertia.zz = nan: must be a finite"),
     ({"actuated_links[0].centre": [(0.0, 0.0, np.nan)]}, r"scenario 0: actuated_links\[0\].centre"),
     ({"star.alpha_deg": [(120.0, 120.0, 121.0)]}, "scenario 0: star.alpha_deg = .*must sum to 360"),
+    (
+        {"stroke.restitution": [0.5, 0.6]},
+        "scenario 0: stroke.restitution = 0.5: is given with at_end: elastic, and only there",
+    ),
     ({"initial.gamma": np.ones((2, 3))}, "initial.gamma = .*: is given to run"),
     ({"torque.amplitude": np.ones((2, 3))}, "torque.amplitude = .*: acts with profile=True only"),
     ({"duration": [1.0, 2.0]}, "duration = .*: has no effect on a batch"),
@@ -252,7 +257,7 @@ SPREAD = {
 @pytest.mark.parametrize("key", SPREAD)
 def test_rules_refuse_the_same_rows_as_columns_and_as_scenes(key):
     low, high = SPREAD[key]
-    value = np.array(eval(f"LOADED.{key}"))
+    value = np.array(next(find_fields(LOADED, key))[1])
     factors = np.random.default_rng(5).uniform(low, high, (60, *value.shape))
     scenarios = Scenarios(LOADED, {key: factors * value})
     refused = set()
