@@ -110,7 +110,7 @@ def alone(rows, n):
         return None, "no unique admissible assembly", 0.0
     torque = scene.torque.at if rows.torque is None else tuple(rows.torque[n])
     try:
-        simulation.steps(torque, 10_000_000, round(rows.step * 1e4))
+        simulation.steps(torque, round(rows.step * 1e9), 100)
     except RunStopped as stopped:
         return simulation.state, stopped.reason, stopped.time
     return simulation.state, "reached the end", None
@@ -121,11 +121,11 @@ def test_a_scenario_equals_a_run_of_its_own(rows, n):
     state, reason, time = alone(rows, n)
     result, bound = rows.result, 1e-10 if rows.torque is None else 1e-9
     assert result.message[n] == reason
-    if time is None:
+    if state is not None:
         sign = np.sign(result.quaternion[n] @ state.quaternion)
         np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=bound)
         np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=10.0 * bound)
-    else:
+    if time is not None:
         assert abs(result.fault_time[n] - time) < 10.0 * bound
 
 
@@ -157,7 +157,7 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
     batch, result = rows.batch, rows.result
     y, _ = batch.start(rows.gamma, rows.gamma_dot)
     done = np.flatnonzero(result.success)[: SIMD_WIDTH + 1].tolist()
-    assert len(done) > 4
+    assert len(done) > (SIMD_WIDTH if rows.torque is None else 4)
     for n in done:
         scene, torque, method, drive = batch.scenario(n), EXAMPLE2.torque, DOP853, []
         if rows.torque is not None:

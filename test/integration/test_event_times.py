@@ -25,7 +25,7 @@ from sst_ros.scene.scene import Friction, Initial, JointFriction, Link, Stroke, 
 from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")
-NOTHING = Link(inertia=inertia_of(1e-17 * np.eye(3)))
+NOTHING = Link(inertia=inertia_of(1e-18 * np.eye(3)))
 FREE_STAR = replace(
     EXAMPLE2,
     star=replace(EXAMPLE2.star, inertia=inertia_of(0.3 * np.eye(3))),
