@@ -225,7 +225,7 @@ class AdaptiveStepper:
                 self._ode.eigenvalues(0.0, at.y, d)
 
     def compile(self) -> None:
-        """Take compiled steps from now on, which have the same bits, but for a function."""
+        """Take compiled steps from now on, which have the same bits; those of a function stay."""
         if self._derivative is None and not self._compiled:
             self._compiled = True
             self._methods.clear()

@@ -61,6 +61,19 @@ def batch_source(
         size: numbers in the state.
         feedback: gives the first three numbers of the drive; none by default.
 
+    Of RK4, ten lines without those of `evaluated` and `crossings`:
+
+        def batch(h, first, count, begin, end, y, d, code, when, error):
+            block = vector(4512)
+            for b in range(begin, end):
+                lo = b * 32
+                for step in range(first, first + count):
+                    for stage in range(4):
+                        if stage == 1:
+                            for x in range(224):
+                                block[224 + x] = block[0 + x] + h * (0.5 * block[992 + x])
+                        time = step * h + NODES[stage] * h
+
     """
     drive = len(program.inputs) - 1 - size
     more = "" if feedback is None else _MORE

@@ -32,6 +32,19 @@ def crossings(count: int, at: Layout) -> list[str]:
         count: number of limits.
         at: of the block, with rows was, far (2 count each), code, hit, found, share.
 
+    Ten lines, the last three of the search:
+
+        for i in range(32):
+            before = block[2016 + i]
+            falling = h * block[2592 + i]
+            after = block[3168 + i]
+            rising = h * block[3744 + i]
+            tangents = before * rising - falling * after + falling * rising
+            hit = 1.0 if tangents < 0.0 else hit
+        for k in range(32):
+            if block[4416 + k] > 0.0:
+                for j in range(18):
+
     """
     test = ["hit = 0.0"]
     for j in range(count):
