@@ -151,7 +151,7 @@ def find_consistent_values(
         are fitted than without the constraints.
 
     """
-    cones = list(_cones(tuple(names), reach))
+    cones = list(cones_of(tuple(names), reach))
     rows = np.vstack([fit.root @ base.transform, np.diag(1.0 / scales(names, given))])
     right = np.concatenate([fit.root @ fit.estimate, given / scales(names, given)])
     values = _lift_into_interior(cones, given)
@@ -188,11 +188,6 @@ def scales(names: Sequence[str], given: Array) -> Array:
             size = mass
         sizes.append(size or 1.0)
     return np.array(sizes)
-
-
-def pseudo_inertia(standard: Array) -> Array:
-    """J of the ten parameters of a body in the order of `STANDARD`, shape (4, 4)."""
-    return np.asarray(np.tensordot(standard, _PSEUDO, 1))
 
 
 def _cost(cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float) -> float:
@@ -233,7 +228,7 @@ def _newton_step(
     return step, 1.0 if least > -_CLOSE else -_CLOSE / least, float(part @ part) / barrier
 
 
-def _cones(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
+def cones_of(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
     """Yield what must be positive semidefinite."""
     index = {name: i for i, name in enumerate(names)}
     for body in bodies_of(names):

@@ -28,12 +28,7 @@ def _function(name: str) -> Callable[[Any], Any]:
     return lambda x: of_float(x) if type(x) is float else _other(name, x)
 
 
-sqrt, tanh, exp, sin = map(_function, ("sqrt", "tanh", "exp", "sin"))
-
-
-def cos(x: Any) -> Any:
-    """Cosine."""
-    return math.cos(x) if type(x) is float else _other("cos", x)
+sqrt, tanh, exp, sin, cos = map(_function, ("sqrt", "tanh", "exp", "sin", "cos"))
 
 
 def positive(x: Any) -> Any:

@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import minimize
 
 from sst_ros.identification.consistency import (
+    cones_of,
     find_consistent_values,
     fit_weighted,
-    pseudo_inertia,
     scales,
 )
 from sst_ros.identification.parameters import STANDARD
@@ -46,7 +46,7 @@ def direct(names, noise=1e-3, rows=40, target=None, seed=0):
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
     masses, places = draw_points(np.random.default_rng(1), 4)
     expected = sum(m * np.outer([*p, 1.0], [*p, 1.0]) for m, p in zip(masses, places, strict=True))
-    found = pseudo_inertia(of_points(np.random.default_rng(1), 4))
+    found = next(cones_of(NAMES, 1.0)).matrix(of_points(np.random.default_rng(1), 4))
     assert np.abs(found - expected).max() < 1e-14
 
 
@@ -100,4 +100,4 @@ def test_a_centre_stays_within_reach_and_friction_is_not_negative():
     values, _ = find_consistent_values(names, given, base, fit, 0.3)
     assert np.linalg.norm(values[1:4]) <= 0.3 * values[0]
     assert 0.0 < values[-1] < 1e-6
-    assert np.linalg.eigvalsh(pseudo_inertia(values[:10]))[0] > 0.0
+    assert np.linalg.eigvalsh(next(cones_of(NAMES, 0.3)).matrix(values))[0] > 0.0
