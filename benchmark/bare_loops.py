@@ -30,12 +30,12 @@ import rclpy
 
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import scheduling
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime.pacing import Pacer, SteadyTime
-from sst_ros.runtime.torque_input import ZERO
 from sst_ros.simulation.simulation import Simulation
 
 TICK_NS = 1_000_000

@@ -64,7 +64,7 @@ class ChannelState:
         *measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
         return Measurement(*measured)
 
-    def delayed(self, command: Vector3) -> Vector3:
+    def transmit(self, command: Vector3) -> Vector3:
         """Return the torques [N m] that act when this command has been sent."""
         torque, self._queue = self._channel.transmit(command, self._queue, self._first)
         self._first = 0.0
@@ -215,7 +215,7 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
     def torque(simulation: Simulation) -> Vector3:
         joints, now = simulation.state.joints, simulation.time_ns / NANOSECONDS
         command = controller.command(now, channel.measure(joints.gamma, joints.gamma_dot))
-        acting, desired = channel.delayed(command.torque), command.desired
+        acting, desired = channel.transmit(command.torque), command.desired
         error = axpy(1.0, desired.gamma, -1.0, joints.gamma)
         error_rate = axpy(1.0, desired.gamma_dot, -1.0, joints.gamma_dot)
         torques = *command.feedforward, *command.feedback, *acting

@@ -60,7 +60,7 @@ def report(out: Path, workers: int | None = None, *, long: bool = False) -> bool
 
     """
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
-    cases = run_jobs(_evaluated, jobs[::-1], "extreme cases   ", workers)[::-1]
+    cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ", workers)[::-1]
     cases = with_batches(cases, workers)
     steps = limits.largest_steps(workers=workers, progress="largest steps   ")
     print(page(cases, steps))
@@ -81,7 +81,7 @@ def report(out: Path, workers: int | None = None, *, long: bool = False) -> bool
     return all(case.passed for case in cases) and not list(limits.faults())
 
 
-def _evaluated(number: int) -> CaseResult:
+def _evaluate(number: int) -> CaseResult:
     return runs.evaluate_case(catalogue()[number])
 
 

@@ -162,7 +162,7 @@ def feedforward_study(
         for mode in MODES
         for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
     ]
-    jobs += [partial(_tracked, plan, error, settings) for error in errors for settings in schemes]
+    jobs += [partial(_track, plan, error, settings) for error in errors for settings in schemes]
     holds = [replace(basic, mode=OPEN_LOOP, feedforward_at=at) for at in INSTANTS]
     jobs += [
         partial(_held, scene, each, plan.period_ns * n) for each in holds for n in plan.multiples
@@ -177,7 +177,7 @@ def feedforward_study(
     )  # fmt: skip
 
 
-def _tracked(
+def _track(
     plan: FeedforwardPlan, error: ModelError, settings: ControllerSettings
 ) -> dict[str, Any]:
     """Run a loop: its row of the table."""

@@ -53,7 +53,7 @@ from sst_ros.mechanism.generic_math import (
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, choice, integer, number
-from sst_ros.state import Vector3
+from sst_ros.state import Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 
@@ -357,8 +357,8 @@ def feedback_gains(
 
 def command_limit(limit: Any, model: Scene) -> Array:
     """Return the limit of commands [N m]: the settings', 0 for none, or less by the actuators."""
-    own = model.actuators.torque_limit if model.actuators is not None else None
-    return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own or np.inf)
+    own = model.torque_limit or np.inf
+    return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own)
 
 
 def feedforward_torques(
@@ -388,11 +388,10 @@ def rotation_vector(quaternion: Quadruple) -> Triple:
 
 def bound(values: Triple, limit: Scalar) -> Triple:
     """Clamp three numbers to the interval from -limit to limit."""
+    if isinstance(limit, float):
+        return clamp(values, limit)
     first, second, third = (
-        min(max(value, -limit), limit)
-        if isinstance(value, float)
-        else value - positive(value - limit) + positive(-limit - value)
-        for value in values
+        value - positive(value - limit) + positive(-limit - value) for value in values
     )
     return first, second, third
 

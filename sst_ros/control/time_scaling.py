@@ -60,18 +60,17 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     The factors that torques allow are found on a grid first, then to rounding by bisection; a
     feasible range narrower than the grid, between others that are not, may be overlooked.
     """
-    actuators = plan.scene.actuators
-    caps = {"torque": math.inf}
-    for name, limit, _ in limits(actuators):
+    caps, torque_limit = {"torque": math.inf}, plan.scene.torque_limit
+    for name, limit, _ in limits(plan.scene.actuators):
         largest = max(abs(getattr(demand, name).value) for demand in plan.demands)
         if name != "torque":
             ratio = limit / largest if largest else math.inf
             caps[name] = ratio if name == "velocity" else math.sqrt(ratio)
     binding = min(caps, key=lambda name: caps[name])
     cap = caps[binding]
-    if actuators is None or actuators.torque_limit is None:
+    if torque_limit is None:
         return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
-    torques = _Torques(plan, actuators.torque_limit)
+    torques = _Torques(plan, torque_limit)
     top = min(cap, torques.top())
     grid = np.geomspace(SLOWEST * top, top, _GRID).tolist()
     last = _last(torques, grid, len(grid) - 1, feasible=True)

@@ -44,7 +44,7 @@ class TrackingRecord:
 
     @classmethod
     def of_rows(cls, rows: ArrayLike) -> TrackingRecord:
-        """Return a record of rows of its 22 numbers, in the order of the attributes."""
+        """Return a record of rows of its 22 numbers, shape (n, 22) or flat, in the order above."""
         time, *columns = np.split(np.reshape(rows, (-1, 22)), range(1, 22, 3), axis=1)
         return cls(time[:, 0], *columns)
 

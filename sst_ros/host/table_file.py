@@ -70,7 +70,15 @@ def write_table(
 def load_table(
     path: Path, columns: Sequence[str], texts: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Read columns and texts of a Parquet or NPZ file of any name; earlier ones have no checksum.
+    """Read a Parquet or NPZ file of any name; Parquet of earlier versions has no checksum.
+
+    Args:
+        path: of the file.
+        columns: names of those that are read.
+        texts: names of those that are read.
+
+    Returns:
+        The columns, shape (n,), and the texts by name.
 
     Raises:
         KeyError: a column or a text is not in the file.

@@ -27,10 +27,11 @@ from std_msgs.msg import String
 
 from sst_ros.description.urdf import urdf
 from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATORS, ZERO, HasState
+from sst_ros.runtime.torque_input import ACTUATORS, HasState
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump

@@ -23,6 +23,7 @@ from sst_ros.errors import InputError, SstError
 from sst_ros.host import scheduling
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import codegen, compiled_method
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, simulation_interfaces, topics
 from sst_ros.nodes.process import every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
@@ -31,7 +32,7 @@ from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ZERO, MessageRefused, TorqueInput, by_name
+from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation

@@ -26,8 +26,9 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import SstError
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.settings import AnsweringParameters
-from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING, ZERO
+from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING
 from sst_ros.state import NANOSECONDS, Vector3, is_idle, nanoseconds
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"

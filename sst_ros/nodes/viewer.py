@@ -19,10 +19,10 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.errors import InputError
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
 from sst_ros.runtime.settings import ViewerParameters
-from sst_ros.runtime.torque_input import ZERO
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene

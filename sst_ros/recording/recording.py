@@ -71,6 +71,9 @@ class Ticks:
 class Recording:
     """A run from its bag. Samples are in order of time; rows belong to samples.
 
+    Args:
+        found: all columns of the recording.
+
     Attributes:
         path: where the bag is.
         scene: what was simulated.
@@ -90,7 +93,7 @@ class Recording:
             shape (c,); `torque` [N m], shape (c, 3).
         reports: diagnostics of the simulator's run: when received [ns], text by key.
         missing: keys of the topics that are not in the recording.
-        signals: all columns of the recording.
+        signals: those given.
 
     Raises:
         InputError: the signals are not those of a whole run; the error names the fault.

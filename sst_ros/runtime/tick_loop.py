@@ -10,8 +10,9 @@ import time
 from typing import Protocol
 
 from sst_ros.errors import RunStopped, SstError
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import Pacer, RunSettings
-from sst_ros.runtime.torque_input import ZERO, HasState, TorqueInput
+from sst_ros.runtime.torque_input import HasState, TorqueInput
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulation import Simulation, State
 from sst_ros.state import Vector3

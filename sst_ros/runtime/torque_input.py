@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp, finite_vector, nanoseconds
 
-ZERO: Vector3 = (0.0, 0.0, 0.0)
 ACTUATORS = JOINTS[:3]
 
 MOST_WAITING = 50

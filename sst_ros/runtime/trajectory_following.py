@@ -39,6 +39,8 @@ NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""
 
 _QUANTITIES = (("position", "rad"), ("velocity", "rad/s"))
+_NUMBERS = 256 * 22
+"""Numbers of samples, 22 each, that are added to the tracking metrics at once."""
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
@@ -222,10 +224,6 @@ def _multi_dof(message: Any) -> Iterator[Problem]:
     ):
         if len(rows):
             yield Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
-
-
-_NUMBERS = 256 * 22
-"""Numbers of samples, 22 each, that are added to the tracking metrics at once."""
 
 
 class Stage(Enum):

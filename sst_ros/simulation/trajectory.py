@@ -289,6 +289,7 @@ class Trajectory:
 
         Raises:
             InputError: there is no such file, it holds no trajectory, or it is damaged.
+            MissingDependency: pyarrow (.parquet) is not installed.
 
         """
         allowed = "must be a trajectory that `Trajectory.save` has written"

@@ -127,10 +127,8 @@ class ControlledBatch:
             own = (getattr(settings if hasattr(settings, n) else channel, n) for n in names)
             return any(own) or bool(varied & {f"control.{name}" for name in names})
 
-        plants = loop.model, batch.scene
-        self._limited = has("torque_limit") or any(
-            plant.actuators is not None and plant.actuators.torque_limit for plant in plants
-        )
+        limits = loop.model.torque_limit, batch.scene.torque_limit
+        self._limited = has("torque_limit") or any(limits)
         self._noise = _NOISE if has("angle_noise", "rate_noise") else 0
         self._memory_sizes = {
             "integral": 3 if has("integral_rate") else 0,

@@ -52,9 +52,8 @@ def test_settling_time_of_a_decay_after_the_motion():
 
 def test_settling_time_is_unknown_where_it_is_not_seen():
     assert evaluate_tracking(track(np.full_like(TIME, 0.5))).settling is None  # never settles
-    assert (
-        evaluate_tracking(track(0.0 * TIME, gamma=TIME)).settling is None
-    )  # the motion never ends
+    endless = track(0.0 * TIME, gamma=TIME)  # the motion never ends
+    assert evaluate_tracking(endless).settling is None
     assert evaluate_tracking(track(0.0 * TIME)).settling == 0.0
 
 

@@ -246,6 +246,16 @@ def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
     assert say("waiting", 62_000_000) != list(motion.at(0.06).gamma)
 
 
+def test_it_refuses_to_begin_where_the_manipulator_is_not(nodes, observer, tmp_path):
+    commands = observer.listen(Float64MultiArray, COMMANDS)
+    controller = nodes.run("inverse_dynamics", scene=written(tmp_path))
+    states, elsewhere = observer.publisher(JointState, "/joint_states"), idle()
+    elsewhere.position[1] += 0.06
+    observer.publish_until(states, elsewhere, lambda: controller.poll() is not None, "the end")
+    status, _, err = nodes.ended(controller)
+    assert (status, commands) == (1, []) and "where the motion begins" in err
+
+
 def test_what_is_not_finite_ends_it_with_zero_torque(nodes, observer, tmp_path):
     commands = observer.listen(Float64MultiArray, COMMANDS)
     reference = observer.listen(JointState, f"{NODE}/reference")

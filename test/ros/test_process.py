@@ -215,13 +215,14 @@ def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
     reader = topics.Reader(node, topics.SIMULATOR["commands"])
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
+    assert not reader.read(time.monotonic_ns())
     publish(node, 1.0, 2.0, 3.0)
     for _ in range(20):
         executor.spin_once(timeout_sec=0.0)  # what else there was to do
     before = time.thread_time()
     executor.spin_once(timeout_sec=1.0)
     assert time.thread_time() - before < 0.05  # 0.002 asleep, up to 1.0 awake
-    assert len(reader.read(math.inf)) == 1
+    assert len(reader.read(math.inf)) == 1  # without a time at once, not 20 ms after the last look
     executor.shutdown()
 
 

@@ -13,12 +13,13 @@ import pytest
 from sst_ros import load_scene
 from sst_ros.errors import RunStopped
 from sst_ros.integration import codegen
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes.simulation_interfaces import SimulationInterfaces
 from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import MOST_WAITING, ZERO, TorqueInput
+from sst_ros.runtime.torque_input import MOST_WAITING, TorqueInput
 from sst_ros.simulation.simulation import Simulation
 
 
@@ -94,7 +95,7 @@ class Bench:
             yield self.loop
         finally:
             self.loop.stop()
-            self.thread.join(10)
+            self.thread.join(40)
             assert not self.thread.is_alive()
 
     def begin(self):
@@ -102,7 +103,7 @@ class Bench:
         self.stamped.append(answer(0))
         self.until(lambda: self.output.samples)
 
-    def until(self, condition, timeout=10.0):
+    def until(self, condition, timeout=40.0):
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline
@@ -436,7 +437,7 @@ def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
     with running(build=Stuck) as (bench, loop):
         bench.until(lambda: len(bench.output.samples) > 2)
         bench.loop.simulation.stuck.set()
-        began = time.monotonic()
+        began = time.process_time()  # its own: on a busy machine 0.4 s of it take any time
 
         def watched():
             loop.watch()
@@ -445,10 +446,10 @@ def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered():
 
         bench.until(watched)
         assert bench.output.phases[-1].startswith("fault: a step has not ended after")
-        asked = time.monotonic()
+        asked = time.process_time()
         assert loop.ask(loop.reset) == (False, f"not done: {loop.fault}")
-        assert time.monotonic() - asked < 0.5
-        assert asked - began < 5.0  # 0.4 s of its processor time, on a busy machine
+        assert time.process_time() - asked < 0.5
+        assert 0.4 < asked - began < 1.0
         loop.simulation.released.set()
         bench.until(lambda: bench.output.idles and bench.output.idles[-1][1])
         assert loop.ask(loop.reset).success  # what could not be done has been forgotten

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from sst_ros import load_scene
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import MOST_WAITING, ZERO, MessageRefused, TorqueInput, by_name
+from sst_ros.runtime.torque_input import MOST_WAITING, MessageRefused, TorqueInput, by_name
 from sst_ros.scene.scene import Actuators
 from sst_ros.simulation.simulation import Simulation
 

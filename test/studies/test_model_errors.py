@@ -61,13 +61,13 @@ GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 def test_a_channel_that_loses_nothing_changes_nothing():
     wire = ChannelState(ControlChannel(), 0)
     assert wire.measure(GAMMA, RATE) == Measurement(GAMMA, RATE)
-    assert wire.delayed((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
+    assert wire.transmit((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 5])
 def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
     wire = ChannelState(ControlChannel(delay=delay), 0)
-    came = [wire.delayed((float(k), 0.0, 0.0))[0] for k in range(10)]
+    came = [wire.transmit((float(k), 0.0, 0.0))[0] for k in range(10)]
     assert came == [max(k - delay, 0) for k in range(10)]
 
 
