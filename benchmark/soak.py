@@ -12,6 +12,7 @@ status is 1.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import signal
 import subprocess
@@ -76,18 +77,31 @@ def start_all(stack: ExitStack, folder: Path, seconds: float) -> dict[str, Proce
     return processes
 
 
-def list_shared(pids: Iterable[int]) -> set[Path]:
-    """Files of Fast DDS in /dev/shm that these processes have mapped."""
-    maps = (Path(f"/proc/{pid}/maps").read_text() for pid in pids)
-    return {Path(name) for text in maps for name in re.findall(r"/dev/shm/fast\S+", text)}
+def list_shared(pids: Iterable[int | str]) -> set[Path]:
+    """Files of Fast DDS in /dev/shm that these processes have open or mapped."""
+    names: set[str] = set()
+    for pid in pids:
+        folder = Path(f"/proc/{pid}")
+        with contextlib.suppress(OSError):  # it has ended, or belongs to another user
+            names.update(re.findall(r"/dev/shm/fast\S+", (folder / "maps").read_text()))
+            for path in (folder / "fd").iterdir():
+                with contextlib.suppress(OSError):
+                    names.update(re.findall(r"^/dev/shm/fast\S+$", str(path.readlink())))
+    return {Path(name) for name in names}
 
 
 def list_left(files: set[Path], seconds: float = 10.0) -> list[str]:
-    """Return which of them still exist after at most so long."""
+    """Return which of them still exist after at most so long, unless a living process uses them.
+
+    Other programs on this machine may use the same ports.
+    """
     end = time.monotonic() + seconds
-    while (found := [file.name for file in files if file.exists()]) and time.monotonic() < end:
+    while found := {file for file in files if file.exists()}:
+        found -= list_shared(path.name for path in Path("/proc").glob("[0-9]*"))
+        if not found or time.monotonic() > end:
+            break
         time.sleep(0.2)
-    return sorted(found)
+    return sorted(file.name for file in found)
 
 
 def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]:

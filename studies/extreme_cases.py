@@ -95,14 +95,9 @@ def from_tight(case: Case, simulation: Simulation) -> float:
     return apart(simulation, tight_end(case))
 
 
-def from_reference(_: Case, simulation: Simulation) -> float:
-    """Angle from the end of the reference motion [rad]."""
-    return apart(simulation, tight_end(REFERENCE))
-
-
-def from_turned(_: Case, simulation: Simulation) -> float:
-    """Angle from the end of the slow turn [rad]."""
-    return apart(simulation, tight_end(TURNED))
+def from_end(other: Case, _: Case, simulation: Simulation) -> float:
+    """Angle from the end of another case at the tightest tolerance [rad]."""
+    return apart(simulation, tight_end(other))
 
 
 def from_stiffer_bounce(case: Case, simulation: Simulation) -> float:
@@ -192,6 +187,7 @@ def stop_time(changes: Changes) -> float:
 
 ENERGY = ("energy is constant", energy_drift)
 RESTING = ("rest stays rest", body_rate)
+from_reference, from_turned = partial(from_end, REFERENCE), partial(from_end, TURNED)
 TIGHT = ("the motion at a tolerance of 1e-14", from_tight)
 
 SHORT_CONTACT = (

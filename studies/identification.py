@@ -22,7 +22,7 @@ from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import INERTIA, value_of
-from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, save_figure, styled
+from sst_ros.plot.style import BLUE, SMALLEST_SHOWN, VERMILION, legend, save_figure, stack, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
 from sst_ros.scene.scene import Scene, load
@@ -119,19 +119,15 @@ def compare(out: Path, identified: str) -> str:
 @styled
 def draw_tracking_errors(tracks: Mapping[str, TrackingRecord], title: str) -> Figure:
     """Draw the largest tracking error of the three joints over time, a curve for each run."""
-    figure = Figure(figsize=(7.0, 3.6))
-    axes = figure.subplots()
+    figure, (axes,) = stack(["largest error of γ [rad]"], 2.6)
     errors = {label: np.abs(track.error).max(axis=1) for label, track in tracks.items()}
     for (label, error), colour in zip(errors.items(), (VERMILION, BLUE), strict=True):
         shown = np.maximum(error, SMALLEST_SHOWN)
         axes.semilogy(tracks[label].time, shown, color=colour, linewidth=1.6, label=label)
     axes.set_ylim(min(float(np.quantile(error, 0.05)) for error in errors.values()) / 3.0,
                   max(float(error.max()) for error in errors.values()) * 2.0)  # fmt: skip
-    axes.set_xlabel("time t [s]")
-    axes.set_ylabel("largest error of γ [rad]")
     axes.set_title(title, pad=22)
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=2, frameon=False, fontsize=9,
-                borderaxespad=0.1)  # fmt: skip
+    legend(axes)
     return figure
 
 

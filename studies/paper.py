@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from benchmark.peers.pinocchio_peer import Model
@@ -24,7 +23,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
 from sst_ros.plot.motion import path as path_of_e
 from sst_ros.plot.pictures import PICTURES, save
-from sst_ros.plot.style import BLUE, VERMILION, positive, styled
+from sst_ros.plot.style import BLUE, VERMILION, positive, stack, styled
 from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
@@ -195,17 +194,14 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     times = motion.t[middle]
     given = scene.torque.amplitude[0] * np.sin(scene.torque.frequency[0] * times)
     apart = np.abs(torque - given[:, None]).max(axis=1)
-    figure = Figure(figsize=(7.0, 6.4))
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    labels = ["torque [N m]", "largest difference\nof three actuators [N m]"]
+    figure, (above, below) = stack(labels, 2.7)
     above.plot(times, given, color=BLUE, linewidth=2.6, label="1.13 sin 12t")
     above.plot(times, torque[:, 0], "--", color=VERMILION, linewidth=1.8,
                label="inverse dynamics of the simulated motion, actuator 1")  # fmt: skip
-    above.set_ylabel("torque [N m]")
     above.legend(fontsize=9)
     below.plot(times, positive(apart), color=VERMILION)
     below.set_yscale("log")
-    below.set_ylabel("largest difference\nof three actuators [N m]")
-    below.set_xlabel("time t [s]")
     title = f"Inverse dynamics of Example 1, the check in the paper's text\n{ASSUMPTION}"
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
     what = "torques by inverse dynamics against 1.13 sin 12t"

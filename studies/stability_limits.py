@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -193,16 +195,12 @@ def bisect_step(stable: Callable[[float], bool]) -> float:
 def largest_steps(*, workers: int | None = None, progress: str = "") -> list[LargestStep]:
     """Find the largest stable step of every method in both families."""
     jobs = [
-        (family, method, coefficient)
+        partial(largest_step, family, method, coefficient)
         for family, (_, powers) in FAMILIES.items()
         for coefficient in [10.0**power for power in powers]
         for method in METHODS.values()
     ]
-    return run_jobs(_largest_step, jobs, progress, workers)
-
-
-def _largest_step(job: tuple[str, Method, float]) -> LargestStep:
-    return largest_step(*job)
+    return run_jobs(methodcaller("__call__"), jobs, progress, workers)
 
 
 def scene_points() -> dict[str, NDArray[np.complex128]]:

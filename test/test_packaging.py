@@ -48,7 +48,7 @@ WITHOUT_KEY = {"dask", "pyarrow", "viser", "xarray"}
 ROS_KEYS = {
     *("ament_copyright", "ament_flake8", "ament_index_python", "ament_pep257", "ament_xmllint"),
     *("builtin_interfaces", "control_msgs", "diagnostic_msgs", "geometry_msgs", "launch"),
-    *("launch_ros", "launch_testing", "rcl_interfaces", "rclpy", "robot_state_publisher"),
+    *("launch_ros", "rcl_interfaces", "rclpy", "robot_state_publisher"),
     *("ros2bag", "ros2launch", "rosbag2_storage_mcap", "rosgraph_msgs", "rviz2", "sensor_msgs"),
     *("simulation_interfaces", "std_msgs", "std_srvs", "trajectory_msgs"),
 }
@@ -154,6 +154,12 @@ def test_package_xml_is_valid():
     assert (parsed.version, parsed.get_build_type()) == (sst_ros.__version__, "ament_python")
 
 
+def data_of(package):
+    """Return the files of a package that are no code: templates, profiles, the mark of types."""
+    files = (path for path in package.rglob("*") if path.is_file())
+    return {path.relative_to(package) for path in files if path.suffix not in (".py", ".pyc")}
+
+
 def check_installed(python, folder):
     """Try what an installation without any extra offers, from a folder that is not the source."""
     environment = {**os.environ, "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
@@ -184,11 +190,10 @@ def check_installed(python, folder):
         done = run(node)
         assert done.returncode == 1
         assert re.fullmatch(r"sst-ros: \w+ is not installed: .*\n", done.stderr), done.stderr
-    code = (
-        "import sst_ros as s, pathlib; print((pathlib.Path(s.__path__[0]) / 'py.typed').exists())"
-    )
-    typed = run(python, "-c", code)
-    assert typed.stdout == "True\n", typed.stderr
+    where = run(python, "-c", "import sst_ros; print(*sst_ros.__path__)")
+    installed = Path(where.stdout.strip())
+    assert installed.is_relative_to(python.parents[1]), where.stderr
+    assert data_of(installed) == data_of(ROOT / "sst_ros") > {Path("py.typed")}
 
 
 @pytest.mark.slow

@@ -102,14 +102,14 @@ def _curve(
     absent = reason or _missing(values)
     if values is None or absent:
         return Panel(title, Axes.set_axis_off, absent)
-    shown, unit = scale_down(values)
+    shown, unit = (values, "") if around is not None else scale_down(values)
 
     def draw(axes: Axes) -> None:
         axes.set_ylabel(label.replace("[", f"[{unit}"))
         axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
         if around is not None:
             axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
-            widen(axes, shown, 0.04)
+            widen(axes, np.append(shown, around), 0.04)
 
     return Panel(title, draw, absent)
 

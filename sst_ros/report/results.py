@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import datetime
-import functools
 import json
 import os
 import platform
@@ -12,6 +11,8 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import jinja2
 
 from sst_ros.extras import require
 from sst_ros.host.output import write_into
@@ -21,6 +22,14 @@ from sst_ros.plot.style import save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+_templates = jinja2.Environment(
+    loader=jinja2.PackageLoader("sst_ros.report"),
+    autoescape=jinja2.select_autoescape(["html"]),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
 
 
 def data_frame(
@@ -55,26 +64,9 @@ def markdown(frame: DataFrame) -> str:
     return "\n".join(lines)
 
 
-@functools.cache
-def _templates() -> Any:
-    jinja2 = require("jinja2")
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("sst_ros.report"),
-        autoescape=jinja2.select_autoescape(["html"]),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-
-
 def render(template: str, **values: Any) -> str:
-    """Fill in a template of this folder; of text no line ends with blanks.
-
-    Raises:
-        MissingDependency: jinja2 is not installed.
-
-    """
-    lines: str = _templates().get_template(template).render(values)
+    """Fill in a template of this folder; no line ends with blanks."""
+    lines = _templates.get_template(template).render(values)
     return "\n".join(line.rstrip() for line in lines.splitlines()) + "\n"
 
 
@@ -146,7 +138,7 @@ def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:
     """Return versions, machine and date of a report in one line.
 
     Args:
-        made: as in `summary.made_on`.
+        made: as `made_on` returns it.
         compiled: whether numba was used; None for wherever it is installed.
 
     """

@@ -19,6 +19,7 @@ from sst_ros.errors import InputError
 from sst_ros.integration.propagator import TickPropagator
 from sst_ros.recording import recording
 from sst_ros.report import overview, reference, timing
+from sst_ros.report.results import render
 from sst_ros.report.run import evaluate_run, summary_table, summary_text, write_run_report
 from sst_ros.scene import scene
 
@@ -137,10 +138,8 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     assert "Not known: no diagnostics" in summary_table(summary)
 
 
-def test_the_page_shows_text_as_text(whole, monkeypatch):
+def test_the_page_shows_text_as_text(whole):
     """The name of a scene is a stranger's: it must be no HTML."""
-    from sst_ros.report.results import render
-
     summary = whole[0] | {"scene": "<script>", "unknown": ["<b>"]}
     page = render("run.html", s=summary, table="<i>", overview="", pictures=[], made="")
     assert "&lt;script&gt;" in page and not re.search("<script>|<b>|<i>", page)
@@ -360,6 +359,21 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, e
     assert estimate[:2, 0] == pytest.approx([5.0, 10.0])  # 100 and 200 steps of 50 us, in ms
     assert estimate[:2, 1] == pytest.approx([1e-11, 1e-10])
     assert curves["hold error if torques are those of the start"][1, 1] == pytest.approx(2e-3)
+
+
+def test_a_slow_run_shows_its_real_time_factor_beside_one(read, bags, example2):
+    """At a thousandth of real time numbers are what they are, and the line at 1 is in sight."""
+    slow = [
+        dataclasses.replace(e, received_ns=bags.START_NS + 2000 * (e.received_ns - bags.START_NS))
+        for e in example2
+    ]
+    run = read(slow)
+    found = evaluate_run(run)
+    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
+    panel = next(a for a in drawn.axes if a.get_title("left").startswith("Real-time factor"))
+    assert panel.lines[0].get_ydata() == pytest.approx(1 / 2000, rel=0.1)
+    low, high = panel.get_ylim()
+    assert low < 1 / 2000 and high > 1.0
 
 
 def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
