@@ -102,7 +102,7 @@ def check_torques(case):
                 gamma = tuple(np.add(gamma, noise[0] * np.array(drawn[:3])).tolist())
                 gamma_dot = tuple(np.add(gamma_dot, noise[1] * np.array(drawn[3:])).tolist())
             command = controller.command(k * PERIOD, Measurement(gamma, gamma_dot))
-            expected = encoders.delayed(command.torque)
+            expected = encoders.transmit(command.torque)
             scale = max(1.0, np.abs(command.feedback).max())
             np.testing.assert_allclose(torques[k][:, lane], expected, rtol=0, atol=1e-12 * scale)
 
