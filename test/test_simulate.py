@@ -100,8 +100,8 @@ def test_the_same_call_again_gives_the_same_bits_and_its_own_arrays():
     ],
 )
 def test_auto_says_why_collocation_is_not_chosen_and_gauss_refuses(scene, torque, said):
-    assert said in simulate(scene, torque, 0.02).method or scene == "friction"
-    if scene != "friction":
+    assert said in simulate(scene, torque, 0.1).method
+    if scene != "friction":  # collocation does that by more steps, where it is asked for
         with pytest.raises(InputError, match=said):
             simulate(scene, torque, 0.02, method="gauss")
 

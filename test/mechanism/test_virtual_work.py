@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import lagrange
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -46,6 +47,15 @@ def test_direct_dynamics_is_lagranges(sample, pushed):
     motion = Motion(truth, sample.gamma, sample.gamma_dot, gamma_ddot)
     expected = motion.here.rotation.T @ motion.omega_dot[0]
     agree(accelerate(sample, *(tuple(load.tolist()) for load in loads)), expected)
+
+
+def test_the_truth_does_not_depend_on_its_steps(monkeypatch):
+    sample = SAMPLES[-1]
+    truth = Lagrange(sample.scene, sample.rotation)
+    given_motion = sample.gamma, sample.gamma_dot, sample.torque, sample.moment
+    fine = truth.acceleration(*given_motion)
+    monkeypatch.setattr(lagrange, "STEP", 100 * lagrange.STEP)
+    assert 0 < abs(truth.acceleration(*given_motion) - fine).max() < 1e-17
 
 
 @every_sample
