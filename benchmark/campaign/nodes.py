@@ -151,12 +151,15 @@ def floods(ledger: Ledger) -> None:
                 sent[index] += 1
 
         with ThreadPoolExecutor(3) as pool:
-            pool.map(flood, range(3))
+            done = pool.map(flood, range(3))
             end = time.monotonic() + max(1.0, 20.0 * ledger.share)
-            while time.monotonic() < end:
-                if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
-                    break
-            enough.set()
+            try:
+                while time.monotonic() < end:
+                    if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
+                        break
+            finally:
+                enough.set()
+            list(done)  # an error in a thread is an error of the part
         ledger.tried = sum(sent)
         stop(ledger, process, signal.SIGTERM)
 

@@ -217,7 +217,7 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence
     periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
     by_name = dict(zip(ESTIMATES, errors, strict=True))
     beside_one: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
-    dots: Looks = {"linestyle": "none", "marker": ".", "markersize": 3}
+    dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
     return [
         Panel(
             "Integration error, against the same torques",
