@@ -110,8 +110,7 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
         torque = torque[:-1]
     if delay:
         torque = _shift(t, torque, held, delay)
-    actuators = None if scene is None else scene.actuators
-    limit = None if actuators is None else actuators.torque_limit
+    limit = None if scene is None else scene.torque_limit
     saturated = np.abs(torque).max(axis=1) >= (np.inf if limit is None else limit * (1.0 - 1e-9))
     start = None if quaternion is None else np.asarray(quaternion, dtype=float)
     return MeasuredMotion(t, gamma, gamma_dot, torque, start, saturated)
@@ -142,7 +141,7 @@ def _take_recording(recording: Recording) -> dict[str, Any]:
     ticks, motion = recording.ticks, recording.trajectory
     begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
     given = _take(motion, (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12))
-    if recording.scene.actuators is not None and recording.scene.actuators.time_constant:
+    if recording.scene.lags:
         # The lag is between the tick's torque and the joint; the recorded effort is behind it.
         return given
     return given | {"torque": _average(TorqueTable(begins, ticks.torque), given["t"]), "held": True}
