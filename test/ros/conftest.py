@@ -162,6 +162,7 @@ class Observer:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.heard, self._publishers, self._clients = {}, {}, {}
+        self.diagnostics()  # a short run has ended before a late reader is known to it
 
     def listen(self, kind, topic, *, latched=False):
         """Messages of a topic since the first call of this, which grow."""

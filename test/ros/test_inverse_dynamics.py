@@ -114,7 +114,6 @@ def deaf(tmp_path_factory, nodes_of_module, observer_of_module):
     nodes, observer = nodes_of_module, observer_of_module
     path = written(tmp_path_factory.mktemp("deaf"), actuators=Actuators(torque_limit=8.0))
     commands = observer.listen(Float64MultiArray, COMMANDS)
-    observer.diagnostics()
     controller = nodes.run("inverse_dynamics", scene=path, motion="topic")
     states = observer.publisher(JointState, "/joint_states")
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")

@@ -100,7 +100,6 @@ def test_two_simulators_do_not_hear_each_other(nodes, observer):
         for place in places
     }
     states = {place: observer.listen(JointState, f"{place}/joint_states") for place in places}
-    observer.diagnostics()
     commands = {
         place: observer.publisher(Float64MultiArray, f"{place}{NODE}/commands") for place in places
     }

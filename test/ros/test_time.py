@@ -22,7 +22,6 @@ def test_other_speeds_are_kept_and_lose_no_sample(nodes, observer, speed):
         "simulator", real_time_factor=speed, duration=2.0, publish_rate=100, wait_for_command=True
     )
     observer.preview()
-    observer.diagnostics()
     observer.command(0.0, 0.0, 0.0)
     said = observer.told("phase", "finished")
     if speed:
