@@ -7,6 +7,7 @@ read has its name when it is whole.
 
 from __future__ import annotations
 
+import os
 import sys
 import uuid
 from collections.abc import Iterator
@@ -14,6 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sst_ros.errors import InputError, Problem
+
+TEMPORARY = ".part-"
+"""How the name of a file begins that is not whole yet, or that a killed process has left."""
 
 _BAG_SUFFIXES = (".mcap", ".db3")
 _PARTS = 50
@@ -71,11 +75,14 @@ def write_into(out: Path, origin: str) -> Iterator[None]:
 def replace_file(path: Path) -> Iterator[Path]:
     """Give a block a name of its own to write to; what it wrote then becomes `path` at once.
 
-    A reader of `path` has the earlier file or the later one, even if several processes write it.
+    A reader of `path` has the earlier file or the later one, even if several processes write it,
+    and after a power cut.
     """
-    own = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    own = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}")
     try:
         yield own
+        with own.open("rb") as file:
+            os.fsync(file.fileno())
         own.replace(path)
     finally:
         own.unlink(missing_ok=True)

@@ -100,15 +100,15 @@ def load_table(
             numbers = {name: table[name].to_numpy() for name in columns}
             raw = table.schema.metadata or {}
             found = {key.decode(): text.decode() for key, text in raw.items()}
-        wanted = {name: found[name] for name in texts}
+        asked = {name: found[name] for name in texts}
     except (KeyError, MissingDependency):
         raise
     except Exception as error:  # pyarrow and zipfile raise anything on bad bytes
         raise ValueError(" ".join(str(error).split())) from None
-    checksum = _checksum(wanted, numbers)
+    checksum = _checksum(asked, numbers)
     if found.get(_CHECKSUM, checksum) != checksum:
         raise ValueError("its checksum is another")
-    return numbers, wanted
+    return numbers, asked
 
 
 def _checksum(texts: Mapping[str, str], columns: Columns) -> str:

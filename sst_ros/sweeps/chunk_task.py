@@ -9,9 +9,7 @@ the units, so that a file explains itself and `--resume` knows which chunks are 
 from __future__ import annotations
 
 import json
-import os
 import platform
-import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +21,7 @@ import numpy as np
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
+from sst_ros.host.output import TEMPORARY, replace_file
 from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 
 
 METADATA = b"sst_ros"
-
-_TEMPORARY = ".part-"
 
 DONE, REFUSED, UNWRITABLE = "done", "refused", "unwritable"
 
@@ -195,20 +192,12 @@ def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) ->
     units = {name: unit for name, unit in about["units"].items() if name in names}
     about = dict(about) | {"units": units}
     table = table.replace_schema_metadata({METADATA: json.dumps(about).encode()})
-    handle, temporary = tempfile.mkstemp(prefix=_TEMPORARY, dir=folder)
-    try:
+    with replace_file(folder / name) as own:
         # Random mantissas do not compress, and their least and greatest help no reader.
         parquet.write_table(
-            table, temporary, compression="none", use_dictionary=["reason"], write_statistics=False
+            table, own, compression="none", use_dictionary=["reason"], write_statistics=False
         )
-        os.fsync(handle)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(folder / name)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(handle)
+        own.chmod(0o644)
 
 
 def read_about(path: Path) -> dict[str, Any] | None:
@@ -249,7 +238,7 @@ def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
 
 def clear_temporary(folder: Path) -> None:
     """Remove what killed processes have left."""
-    for path in folder.glob(f"{_TEMPORARY}*"):
+    for path in folder.glob(f"{TEMPORARY}*"):
         path.unlink(missing_ok=True)
 
 
