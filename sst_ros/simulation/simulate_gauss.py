@@ -32,6 +32,8 @@ _ROUNDING = 1e-14
 _HOPELESS, _SLOW = 128, 4.0
 """Steps from which on doubling them must bring two solutions nearer by this factor: a motion that
 is smooth enough gains far more, one with kinks a factor of two."""
+_FINEST_PER_SECOND, _FINEST = 1024, 4096
+"""Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
 _ITERATIONS = (5, 6, 8)
 _MOST_ITERATIONS = 10
 
@@ -58,6 +60,7 @@ class GaussMotion:
         h: length of a step [s].
         error: estimated error of the orientation at the end [rad]: the distance from a finer
             solution.
+        samples: states at the times of `grid`, shape (count + 1, numbers of the state).
 
     Raises:
         NotSmooth: the tolerance is not reached.
@@ -73,7 +76,7 @@ class GaussMotion:
         tolerance: float,
         *,
         compiled: bool | None = True,
-        finest: int = 4096,
+        finest: int = _FINEST,
     ) -> None:
         self._torque = torque
         self._dynamics = Dynamics.of(scene)
@@ -87,7 +90,7 @@ class GaussMotion:
         self.h = duration / self.count
         self._motion = self._prepared(self.count, self.iterations)
         self._lock = threading.Lock()
-        self.run()
+        self.samples = self.run()
 
     def run(self) -> Array:
         """Compute the states at the times of `grid`, shape (count + 1, numbers of the state)."""
@@ -108,11 +111,6 @@ class GaussMotion:
         return times
 
     @cached_property
-    def samples(self) -> Array:
-        """States at the times of `grid`."""
-        return self.run()
-
-    @cached_property
     def ending(self) -> tuple[float, Limit] | None:
         """Time at which the first limit is met [s], and the limit; None where none is."""
         if not self._limits or self._motion.least_distances.min() > NEAR:
@@ -126,7 +124,6 @@ class GaussMotion:
     def at(self, times: Array) -> Array:
         """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
         steps = np.clip(np.searchsorted(self.grid, times, side="right") - 1, 0, self.count - 1)
-        _ = self.samples
         with self._lock:  # all of them use the same arrays
             ends = [
                 self._inside(int(k), float(t) - float(self.grid[k]))
@@ -244,10 +241,6 @@ def _collocation(
     return Collocation(ODE(dynamics, sine), limits=program, compiled=compiled)
 
 
-_FINEST_PER_SECOND, _FINEST = 1024, 4096
-"""Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
-
-
 class CollocatedMotion:
     """A motion by collocation, prepared once.
 
@@ -295,7 +288,7 @@ class CollocatedMotion:
         }
         self._whole = None
         if not status:
-            self._whole = self._trajectory(motion.grid, motion.run())
+            self._whole = self._trajectory(motion.grid, motion.samples)
 
     def trajectory(self, times: np.ndarray | None) -> Trajectory:
         """Compute the motion; times [ns] of the samples, None for the ends of the steps."""
