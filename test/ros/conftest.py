@@ -262,12 +262,13 @@ class Observer:
         ]
 
     def told(self, key, value, timeout=40.0):
-        """Wait until the diagnostics say so; return all that they say then."""
+        """Wait until the last status with this key says so; return all that it says then."""
         meets = value if callable(value) else lambda said: said == str(value)
         said = []
 
         def is_told():
-            said[:] = self.diagnostics()[-1:]
+            # Other nodes have keys of their own, and their last word may be the newer one.
+            said[:] = [status for status in self.diagnostics() if key in status][-1:]
             return said and meets(said[0][key])
 
         self.until(is_told, f"{key} in the diagnostics", timeout)
