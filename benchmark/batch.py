@@ -142,8 +142,10 @@ class _Work:
         self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any],
         expected: np.ndarray, folder: Path,
     ) -> None:  # fmt: skip
-        size = len(batch.state)
-        text, loops = c_floor.write_batch(batch.program, batch.limit_distances, method, size)
+        size = len(batch.model.ode.state)
+        text, loops = c_floor.write_batch(
+            batch.model.program, batch.model.limit_distances, method, size
+        )
         blocks = -(-self._number // SIMD_WIDTH)
         for index, (who, flags) in enumerate(FLAGS.items()):
             library, done = c_floor.compile_batch(text, folder, f"{name}_{index}", *flags)

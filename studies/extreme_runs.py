@@ -21,11 +21,10 @@ import numpy as np
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.integration.batch import Batch
+from sst_ros.integration.batch import Batch, whole_steps
 from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.limit_crossings import whole_steps
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.yaml_document import values_of
@@ -274,7 +273,7 @@ def leaves(section: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, An
 def compare_row(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bool]:
     """Run a case as a row of a batch of `count`; what was compared, and whether it agrees."""
     scene, h = case.scene(), case.period_ns / NANOSECONDS
-    y, code = np.zeros((len(batch.state), 1)), np.zeros(1, dtype=np.int64)
+    y, code = np.zeros((len(batch.model.ode.state), 1)), np.zeros(1, dtype=np.int64)
     when, error = np.full(1, np.nan), np.zeros(1)
     y[:7, 0] = initial_state(scene, Geometry.of(scene))
     alone: list[float] = y[:, 0].tolist()

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sst_ros.extras import require
 from sst_ros.integration.batch_source import NOT_FINITE
-from sst_ros.integration.initial_states import REASONS
 from sst_ros.integration.parametric_model import OUTPUTS, ParameterColumns, ParametricModel
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
@@ -24,8 +23,15 @@ if TYPE_CHECKING:
 _BLOCK = 1024
 """Scenarios whose joints are computed at once: all numbers of the program are arrays as long."""
 
-_CODES = 4 * NOT_FINITE
-"""More than there are codes."""
+NO_ASSEMBLY, NO_RATE, OUTSIDE = -1, -2, -3
+_REASONS = {
+    0: "reached the end",
+    NO_ASSEMBLY: "no unique admissible assembly",
+    NO_RATE: "gamma_dot does not determine the body rate: singular start",
+    OUTSIDE: "initial gamma outside the stroke",
+    NOT_FINITE: "not finite",
+}
+"""How a scenario ended, by the codes that are no limit's: below zero it did not start."""
 
 _SCENARIO = ("status", "message", "fault_time", "local_error")
 
@@ -64,8 +70,7 @@ class BatchStates:
         y: Array,
     ) -> None:
         self._model, self._columns, self._torque, self._valid = model, columns, torque, valid
-        self._state = np.moveaxis(y, -2, -1)
-        self.t = t
+        self._state, self.t = np.moveaxis(y, -2, -1), t
         self._computed: dict[str, Array] = {}
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
@@ -173,22 +178,15 @@ class BatchResult(BatchStates):
     @cached_property
     def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
         """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
-        geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
         limited = (self.code > 0) & (self.code < NOT_FINITE)  # only these depend on the geometry
-        both = np.where(limited, geometry, 0) * _CODES + self.code
-        found, index = np.unique(both, return_inverse=True)
-        pairs = [(one // _CODES, one % _CODES) for one in (found + _CODES // 2).tolist()]
-        texts = [self._reason(first, second - _CODES // 2) for first, second in pairs]
-        return np.array(texts, dtype=object), index
-
-    def _reason(self, geometry: int, code: int) -> str:
-        if code == 0:
-            return "reached the end"
-        if code < 0:
-            return REASONS[code]
-        if code == NOT_FINITE:
-            return "not finite"
-        return self._model.limits(self._columns.geometries.of_rows(geometry))[code - 1].reason
+        pairs = np.stack([np.where(limited, self._columns.geometry, 0), self.code], axis=1)
+        found, index = np.unique(pairs, axis=0, return_inverse=True)
+        texts = [
+            _REASONS.get(code)
+            or self._model.limits(self._columns.geometries.of_rows(geometry))[code - 1].reason
+            for geometry, code in found.tolist()
+        ]
+        return np.array(texts, dtype=object), index.ravel()
 
     def __len__(self) -> int:
         return len(self.status)

@@ -4,15 +4,20 @@
 The operations of a lane are those of a run of its own in the same order. A lane that leaves a limit
 of its scene, or whose numbers are not finite, keeps its last valid state and a code; the others
 continue. Lanes do not depend on each other, so threads change no bit.
+
+Which limit a step passes first is found from the distances to all: over a step each is a cubic in
+its values and rates at both ends (Hermite). Its error is at most h^4 max|d^(4)| / 384. A step that
+ends outside is found, and one that leaves and comes back.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration.codegen import combination
-from sst_ros.integration.limit_crossings import crossings
+from sst_ros.integration.events import GRAZING
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
 
@@ -21,6 +26,9 @@ SIMD_WIDTH = 32
 
 NOT_FINITE = 1000
 """Code of a scenario whose numbers are no longer finite; others are 1 + the limit's index."""
+
+EARLIEST = 1e-8
+"""Least share of a step at which a crossing is reported, so that its time lies in this step."""
 
 
 class SampledFeedback(NamedTuple):
@@ -39,6 +47,53 @@ class SampledFeedback(NamedTuple):
     memory: int
     noise: int
     gains: int
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """Rows of a block that it needs."""
+        own = {"memory": self.memory, "noise": self.noise, "gains": self.gains}
+        return own | {"command": 3 + self.memory}
+
+    def load(self, at: Layout) -> list[str]:
+        """Lines that fill its rows: a loop of its own, as one with the state compiles minutes."""
+        kinds = {"memory": self.memory, "gains": self.gains}
+        return _over_lanes(
+            [f"{at.lane(name, j)} = {name}[{j}, n]" for name, m in kinds.items() for j in range(m)]
+        )
+
+    def act(self, size: int, drive: int, at: Layout) -> list[str]:
+        """Lines that evaluate the controller at the beginning of a period."""
+        given = [
+            *(f"references[sample, {j}]" for j in range(self.references)),
+            *at.rows("y", size),
+            *at.rows("memory", self.memory),
+            *at.rows("noise", self.noise),
+            *at.rows("d", drive)[3:],
+            *at.rows("gains", self.gains),
+        ]
+        noise = [
+            f"{at.lane('noise', j)} = gaussian(seed, rows[n], {self.noise} * sample + {j})"
+            for j in range(self.noise)
+        ]
+        accepted = [f"now = {at.lane('code')}"]
+        for j, name in enumerate(at.rows("d", 3) + at.rows("memory", self.memory)):
+            accepted += [
+                f"old = {name}",
+                f"new = {at.lane('command', j)}",
+                f"{name} = new if now == 0.0 else old",
+            ]
+        lines = [
+            "sample = step // hold",
+            *(_over_lanes(noise) if noise else ()),
+            *evaluated(self.program, given, at, "command"),
+            *loop(at, accepted),
+        ]
+        return ["if step % hold == 0:", *indented(4, lines)]
+
+    def store(self, at: Layout) -> list[str]:
+        """Lines that keep the memory and the torques of lane i."""
+        lines = [f"memory[{j}, lo + i] = {at.lane('memory', j)}" for j in range(self.memory)]
+        return lines + [f"d[{j}, lo + i] = {at.lane('d', j)}" for j in range(3)]
 
 
 def batch_source(
@@ -76,17 +131,32 @@ def batch_source(
 
     """
     drive = len(program.inputs) - 1 - size
-    more = "" if feedback is None else _MORE
-    stages = len(tableau.b)
+    more = ", hold, references, memory, gains, rows, seed" if feedback else ""
     at = Layout(
-        SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * stages, e=4,
+        SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * len(tableau.b), e=4,
         was=len(distances.outputs), far=len(distances.outputs), code=1, when=1, error=1,
         hit=1, found=1, share=1,
-        **_feedback_rows(feedback),
+        **(feedback.rows if feedback else {}),
     )  # fmt: skip
     outside = at.rows("d", drive)
     given = ["time", *at.rows("s", size), *outside]
     parameters = outside[drive - (len(distances.inputs) - 7) :]
+
+    def argument(stage: int) -> str:
+        """Where a stage evaluates the derivative."""
+        total = combination(tableau.a[stage], lambda m: at.lane("k", m * size, "x"))
+        more = f" + h * ({total})" if stage else ""
+        return f"{at.lane('s', 0, 'x')} = {at.lane('y', 0, 'x')}{more}"
+
+    def kept(stage: int) -> str:
+        return f"{at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}"
+
+    load = [
+        f"{at.lane(name, j)} = {name}[{j}, n]"
+        for name, m in (("y", size), ("d", drive))
+        for j in range(m)
+    ]
+    load += [f"{at.lane(name)} = {name}[n]" for name in ("code", "when", "error")]
     limits, both = len(distances.outputs) // 2, len(distances.outputs) * SIMD_WIDTH
     lines = [
         f"def batch(h, first, count, begin, end, y, d, code, when, error{more}):",
@@ -94,21 +164,16 @@ def batch_source(
         "    for b in range(begin, end):",
         f"        lo = b * {SIMD_WIDTH}",
         f"        last = min({SIMD_WIDTH}, y.shape[1] - lo) - 1",
-        # Lanes beyond the last repeat it, for all blocks to have the same length.
-        f"        for i in range({SIMD_WIDTH}):",
-        "            n = lo + min(i, last)",
-        *(f"            {at.lane('y', j)} = y[{j}, n]" for j in range(size)),
-        *(f"            {at.lane('d', j)} = d[{j}, n]" for j in range(drive)),
-        *(f"            {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")),
-        *_loaded(feedback, at),
+        *indented(8, _over_lanes(load)),
+        *indented(8, feedback.load(at) if feedback else []),
         *indented(8, evaluated(distances, [*at.rows("y", 7), *parameters], at, "was")),
         "        for step in range(first, first + count):",
-        *_sampled(feedback, size, drive, at),
-        f"            for stage in range({stages}):",
-        *indented(16, _arguments(tableau, size, at)),
+        *indented(12, feedback.act(size, drive, at) if feedback else []),
+        f"            for stage in range({len(tableau.b)}):",
+        *indented(16, _by_stage(tableau, size, argument)),
         *indented(16, ["time = step * h + NODES[stage] * h"]),
         *indented(16, evaluated(program, given, at, "f")),
-        *indented(16, _kept(tableau, size, at)),
+        *indented(16, _by_stage(tableau, size, kept)),
         *indented(12, _results(tableau, size, at)),
         *indented(12, evaluated(distances, [*at.rows("new", 7), *parameters], at, "far")),
         *indented(12, crossings(limits, at)),
@@ -120,100 +185,24 @@ def batch_source(
         f"            code[lo + i] = int({at.lane('code')})",
         f"            when[lo + i] = {at.lane('when')}",
         f"            error[lo + i] = {at.lane('error')}",
-        *_stored(feedback, at),
+        *indented(12, feedback.store(at) if feedback else []),
     ]
     return "\n".join(lines) + "\n"
 
 
-_MORE = ", hold, references, memory, gains, rows, seed"
+def _over_lanes(lines: list[str]) -> list[str]:
+    """Put a loop over the scenarios n of a block; the last is repeated, for equal lengths."""
+    return [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indented(4, lines)]
 
 
-def _feedback_rows(feedback: SampledFeedback | None) -> dict[str, int]:
-    """Rows of a block that feedback needs."""
-    if feedback is None:
-        return {}
-    return {
-        "memory": feedback.memory,
-        "noise": feedback.noise,
-        "gains": feedback.gains,
-        "command": 3 + feedback.memory,
-    }
-
-
-def _loaded(feedback: SampledFeedback | None, at: Layout) -> list[str]:
-    # In a loop of its own: one over the arrays of the state, too, compiles for minutes.
-    if feedback is None:
-        return []
-    kinds = {"memory": feedback.memory, "gains": feedback.gains}
-    lines = [f"{at.lane(name, j)} = {name}[{j}, n]" for name, m in kinds.items() for j in range(m)]
-    head = [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)"]
-    return indented(8, [*head, *indented(4, lines)])
-
-
-def _stored(feedback: SampledFeedback | None, at: Layout) -> list[str]:
-    if feedback is None:
-        return []
-    lines = [f"memory[{j}, lo + i] = {at.lane('memory', j)}" for j in range(feedback.memory)]
-    lines += [f"d[{j}, lo + i] = {at.lane('d', j)}" for j in range(3)]
-    return indented(12, lines)
-
-
-def _sampled(feedback: SampledFeedback | None, size: int, drive: int, at: Layout) -> list[str]:
-    """Evaluate the controller at the beginning of a period."""
-    if feedback is None:
-        return []
-    given = [
-        *(f"references[sample, {j}]" for j in range(feedback.references)),
-        *at.rows("y", size),
-        *at.rows("memory", feedback.memory),
-        *at.rows("noise", feedback.noise),
-        *at.rows("d", drive)[3:],
-        *at.rows("gains", feedback.gains),
-    ]
-    noise = [
-        f"{at.lane('noise', j)} = gaussian(seed, rows[n], {feedback.noise} * sample + {j})"
-        for j in range(feedback.noise)
-    ]
-    if noise:
-        noise = [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indented(4, noise)]
-    held = [at.lane("d", j) for j in range(3)] + at.rows("memory", feedback.memory)
-    accepted = [f"now = {at.lane('code')}"]
-    for j, name in enumerate(held):
-        accepted += [
-            f"old = {name}",
-            f"new = {at.lane('command', j)}",
-            f"{name} = new if now == 0.0 else old",
-        ]
-    lines = [
-        "sample = step // hold",
-        *noise,
-        *evaluated(feedback.program, given, at, "command"),
-        *loop(at, accepted),
-    ]
-    return [*indented(12, ["if step % hold == 0:"]), *indented(16, lines)]
-
-
-def _arguments(tableau: Tableau, size: int, at: Layout) -> list[str]:
-    """Where a stage evaluates the derivative, all numbers of the state in one loop."""
-    lines = []
-    for stage, row in enumerate(tableau.a):
-        total = combination(row, lambda m: at.lane("k", m * size, "x"))
-        value = f"{at.lane('y', 0, 'x')} + h * ({total})" if stage else at.lane("y", 0, "x")
-        lines += [
-            f"{'elif' if stage else 'if'} stage == {stage}:",
-            f"    for x in range({size * SIMD_WIDTH}):",
-            f"        {at.lane('s', 0, 'x')} = {value}",
-        ]
-    return lines
-
-
-def _kept(tableau: Tableau, size: int, at: Layout) -> list[str]:
+def _by_stage(tableau: Tableau, size: int, line: Callable[[int], str]) -> list[str]:
+    """Put a line for each stage, over all numbers of the state in one loop."""
     lines = []
     for stage in range(len(tableau.b)):
         lines += [
             f"{'elif' if stage else 'if'} stage == {stage}:",
             f"    for x in range({size * SIMD_WIDTH}):",
-            f"        {at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}",
+            f"        {line(stage)}",
         ]
     return lines
 
@@ -269,3 +258,88 @@ def _accepted(size: int, at: Layout) -> list[str]:
             f"{at.lane('y', j)} = new if now == 0.0 else old",
         ]
     return loop(at, inside)
+
+
+def crossings(count: int, at: Layout) -> list[str]:
+    """Lines that find which limit a step passes first, in `found`, and at which share of it.
+
+    `was` and `far` hold distances and rates at both ends. Few steps pass one, so lanes only test
+    the tangents there, which lie below a curve that turns; what is found is examined lane by lane.
+
+    Args:
+        count: number of limits.
+        at: of the block, with rows was, far (2 count each), code, hit, found, share.
+
+    Ten lines, the last three of the search:
+
+        for i in range(32):
+            before = block[2016 + i]
+            falling = h * block[2592 + i]
+            after = block[3168 + i]
+            rising = h * block[3744 + i]
+            tangents = before * rising - falling * after + falling * rising
+            hit = 1.0 if tangents < 0.0 else hit
+        for k in range(32):
+            if block[4416 + k] > 0.0:
+                for j in range(18):
+
+    """
+    test = ["hit = 0.0"]
+    for j in range(count):
+        test += [
+            f"before = {at.lane('was', j)}",
+            f"falling = h * {at.lane('was', count + j)}",
+            f"after = {at.lane('far', j)}",
+            f"rising = h * {at.lane('far', count + j)}",
+            "tangents = before * rising - falling * after + falling * rising",
+            "tangents = tangents if falling < 0.0 else 1.0",
+            "tangents = tangents if rising > 0.0 else 1.0",
+            "hit = 1.0 if tangents < 0.0 else hit",
+            f"hit = 1.0 if after < {-GRAZING} else hit",
+        ]
+    code, lanes = at.lane("code"), at.lanes
+    test += [
+        f"{at.lane('hit')} = hit if {code} == 0.0 else 0.0",
+        f"{at.lane('found')} = 0.0",
+        f"{at.lane('share')} = 1.0",
+    ]
+    was, far = at.first("was"), at.first("far")
+    search = [
+        f"for j in range({count}):",
+        f"    before = block[{was} + j * {lanes} + k]",
+        f"    falling = h * block[{was + count * lanes} + j * {lanes} + k]",
+        f"    after = block[{far} + j * {lanes} + k]",
+        f"    rising = h * block[{far + count * lanes} + j * {lanes} + k]",
+        "    square = 3.0 * (after - before) - 2.0 * falling - rising",
+        "    cube = falling + rising - 2.0 * (after - before)",
+        "    root = square * square - 3.0 * cube * falling",
+        "    root = sqrt(root) if root > 0.0 else 0.0",
+        "    turns = 1.0 if falling < 0.0 else 0.0",
+        "    turns = turns if rising > 0.0 else 0.0",
+        "    high = -falling / (square + root) if turns > 0.0 else 1.0",
+        f"    high = 1.0 if after < {-GRAZING} else high",
+        "    least = before + high * (falling + high * (square + high * cube))",
+        "    least = after if after < 0.0 else least",
+        f"    if least < {-GRAZING}:",
+        "        low = 0.0",
+        "        for trial in range(52):",
+        "            middle = 0.5 * (low + high)",
+        "            value = before + middle * (falling + middle * (square + middle * cube))",
+        "            low = middle if value >= 0.0 else low",
+        "            high = high if value >= 0.0 else middle",
+        f"        earlier = 1.0 if {at.lane('found', 0, 'k')} == 0.0 else 0.0",
+        f"        earlier = 1.0 if high < {at.lane('share', 0, 'k')} else earlier",
+        "        if earlier > 0.0:",
+        f"            {at.lane('found', 0, 'k')} = j + 1.0",
+        f"            {at.lane('share', 0, 'k')} = high if high > {EARLIEST} else {EARLIEST}",
+    ]
+    return [
+        *loop(at, test),
+        "hits = 0.0",
+        f"for k in range({lanes}):",
+        f"    hits = hits + {at.lane('hit', 0, 'k')}",
+        "if hits > 0.0:",
+        f"    for k in range({lanes}):",
+        f"        if {at.lane('hit', 0, 'k')} > 0.0:",
+        *indented(12, search),
+    ]

@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many scenarios as one program: a number that differs between them becomes an input.
+"""Many scenarios of one scene: as documents, and as one program whose inputs are what differs.
 
-What is the same in all scenarios stays a constant that `trace` folds, so a batch computes only
-what varies. A term whose coefficients are zero in some scenarios changes no bit there.
+A row of each array makes a scene, which meets all requirements of a document. What has no effect
+in a row is left out of it, as documents demand: a friction whose coefficients are zero there, the
+gear of a rotor without inertia. In the program what is the same in all scenarios stays a constant
+that `trace` folds, so a batch computes only what varies. A term whose coefficients are zero in some
+scenarios changes no bit there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
@@ -21,18 +25,151 @@ from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
+from sst_ros.host.output import slices
 from sst_ros.integration.events import limit_distances
-from sst_ros.integration.scenarios import Scenarios
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import Scene, SineTorque
-from sst_ros.scene.schema import Place
-from sst_ros.scene.yaml_document import leaves, rebuild
+from sst_ros.scene.scene import LARGEST, SMALLEST, Scene, SineTorque
+from sst_ros.scene.schema import Place, Spec
+from sst_ros.scene.yaml_document import (
+    NO_NUMBER,
+    broken_rows,
+    build,
+    find_fields,
+    leaves,
+    open_values,
+    rebuild,
+    replace_values,
+    values_of,
+)
 from sst_ros.state import Joints
 
 OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
 
 _OF_GEOMETRY = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+
+_MOST_PROBLEMS = 10
+
+
+class Scenarios:
+    """Scenarios of a scene by row.
+
+    Args:
+        scene: the document.
+        parameters: numbers by their keys in the document, as in "star.mass", "springs[0].rest" or
+            "gravity.acceleration": first the row, then what one scene has, so shape (N,), (N, 3) or
+            (N, 3, 3). A list without an index means all of its entries.
+
+    Attributes:
+        document: the scene.
+        rows: the arrays by key.
+        count: number of rows N; None where nothing varies.
+
+    Raises:
+        InputError: a key names no number of the scene, or an array has another shape.
+
+    """
+
+    def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
+        self.document = scene
+        self.count: int | None = None
+        self.rows: dict[str, Array] = {}
+        self._specs: dict[str, Spec] = {}
+        self._values = values_of(scene)
+        problems, taken = [], set[Place]()
+        for key, value in parameters.items():
+            try:
+                for place, _, spec in find_fields(scene, key):
+                    if spec.kind != "number":
+                        raise ValueError(NO_NUMBER)
+                    if place in taken:
+                        raise ValueError("is given twice")
+                    taken.add(place)
+                self._specs[key] = spec
+                self.rows[key] = rows = _rows(value, spec, self.count)
+                self.count = len(rows)
+            except ValueError as error:
+                problems.append(Problem(key, value, str(error)))
+        if problems:
+            raise InputError(scene.name, problems)
+
+    def scene(self, row: int) -> Scene:
+        """Build the scene of a row.
+
+        Raises:
+            InputError: the numbers of this row make no scene; names each and what is allowed.
+
+        """
+        values = {key: rows[row].tolist() for key, rows in self.rows.items()}
+        try:
+            return build(Scene, replace_values(self._values, values), "", of_row=True)
+        except InputError as error:
+            problems_of_row = [
+                replace(fault, key=f"scenario {row}: {fault.key}") for fault in error.problems
+            ]
+            raise InputError(self.document.name, problems_of_row) from None
+
+    def columns(self, chosen: slice | NDArray[np.intp] = slice(None)) -> Any:
+        """Return the document with arrays of the chosen rows for the numbers that vary."""
+        columns = {key: _components(rows[chosen]) for key, rows in self.rows.items()}
+        return open_values(Scene, replace_values(self._values, columns))
+
+    def faults(
+        self, *, progress: bool = False, most: int = _MOST_PROBLEMS
+    ) -> dict[int, InputError]:
+        """Rows that make no scene, and why; no more than `most` rows are looked for."""
+        if self.count is None:
+            return {}
+        unknown, faults = np.flatnonzero(self._doubtful()).tolist(), {}
+        for part in slices(len(unknown), 0, f"{self.document.name}, preparing", progress):
+            for row in unknown[part]:
+                try:
+                    self.scene(row)
+                except InputError as error:
+                    faults[row] = error
+                if len(faults) == most:
+                    return faults
+        return faults
+
+    def _doubtful(self) -> NDArray[np.bool_]:
+        """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
+        doubtful = np.zeros(self.count or 0, dtype=bool)
+        for key, values in self.rows.items():
+            spec, flat = self._specs[key], values.reshape(len(values), -1)
+            least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
+            most = min(spec.most, LARGEST)
+            if not (flat.min() >= least and flat.max() <= most):  # a nan is neither
+                doubtful |= ~np.all((flat >= least) & (flat <= most), axis=1)
+        return np.asarray(doubtful | broken_rows(Scene, self.columns()))
+
+    def check(self, *, progress: bool = False) -> None:
+        """Raise InputError with the first ten problems if rows make no scene."""
+        problems = [
+            problem
+            for error in self.faults(progress=progress).values()
+            for problem in error.problems
+        ]
+        if problems:
+            raise InputError(self.document.name, problems[:_MOST_PROBLEMS])
+
+
+def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Array:
+    words = ", ".join(map(str, (count or "N", *spec.shape))) + ("" if spec.shape else ",")
+    try:
+        rows = np.asarray(value, dtype=float)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
+    number = count or max(1, len(np.atleast_1d(rows)))
+    if rows.shape != (number, *spec.shape):
+        raise ValueError(f"must have the shape ({words}), a row a scenario; it has {rows.shape}")
+    return rows
+
+
+def _components(values: Array) -> Any:
+    """Contiguous columns (N,) of an array (N, ...), nested tuples where it has more dimensions."""
+    if values.ndim == 1:
+        return values
+    return tuple(_components(np.ascontiguousarray(values[:, i])) for i in range(values.shape[1]))
 
 
 class Constants(NamedTuple):
@@ -48,20 +185,6 @@ class Constants(NamedTuple):
     model: kernel.Model
     ends: tuple[tuple[float, float], ...]
     torque: SineTorque | None
-
-
-def constants_of(scene: Scene, columns: Any, geometry: Geometry, *, profile: bool) -> Constants:
-    """Constants of `columns`, an object like `scene` with arrays for what varies."""
-    ends = [limit.end for limit in limits_of(scene, geometry)]
-    pairs = tuple((_plain(np.cos(end)), _plain(np.sin(end))) for end in ends)
-    columns.stroke = _with_damping(columns.stroke)
-    with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
-        model = kernel.model_of(columns, geometry)
-    return Constants(model, pairs, columns.torque if profile else None)
-
-
-def _plain(value: Any) -> Any:
-    return value if value.ndim else float(value)
 
 
 def _with_damping(stroke: Any) -> Any:
@@ -218,9 +341,13 @@ class ParametricModel:
     def _numbers(self, scenarios: Scenarios) -> tuple[Constants, dict[Place, Any]]:
         """Constants of scenarios as a tree, and its numbers or columns by place."""
         geometries, which = _geometries(scenarios)
-        tree = constants_of(
-            self.scene, scenarios.columns(), geometries.of_rows(which), profile=self._profile
-        )
+        columns, geometry = scenarios.columns(), geometries.of_rows(which)
+        columns.stroke = _with_damping(columns.stroke)
+        limits = limits_of(self.scene, geometry)
+        ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
+        with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
+            model = kernel.model_of(columns, geometry)
+        tree = Constants(model, ends, columns.torque if self._profile else None)
         return tree, dict(leaves(tree))
 
     def _refuse_no_lag(self, numbers: dict[Place, Any]) -> None:

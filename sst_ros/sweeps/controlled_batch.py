@@ -37,7 +37,6 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_result import BatchResult
-from sst_ros.integration.batch_run import integrated
 from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.generic_math import axpy, dot, positive
@@ -192,16 +191,7 @@ class ControlledBatch:
                 arrays[3][:] += (first - begin) * step
 
         numbers = rows.astype(np.int64)
-        result = integrated(
-            batch.model,
-            batch.columns,
-            batch.start(gamma, rate),
-            batch.drives((0.0, 0.0, 0.0), count),
-            advance,
-            step=step,
-            count=steps,
-            keep_every=kept,
-        )
+        result = batch.integrate(advance, gamma, rate, step=step, count=steps, keep_every=kept)
         return result, self._tracking(result, memory, result.t)
 
     def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:

@@ -16,8 +16,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_result import BatchResult, BatchStates
-from sst_ros.integration.parametric_model import OUTPUTS
-from sst_ros.integration.scenarios import Scenarios
+from sst_ros.integration.parametric_model import OUTPUTS, Scenarios
 from sst_ros.mechanism.geometry import Array
 from sst_ros.state import DIMENSIONS, QUANTITIES
 from sst_ros.sweeps.controlled_batch import ControlledBatch

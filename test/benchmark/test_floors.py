@@ -39,7 +39,9 @@ def test_a_batch_in_c_has_the_bits_of_numba_where_it_may_not_fuse(tmp_path, monk
     gamma = np.array(scene.initial.gamma) + np.linspace(-0.05, 0.05, number)[:, None]
     y, code = batch.start(gamma, (0.0, 0.0, 0.0))
     given = batch.drives((0.0, 0.0, 0.0), number)
-    text, _ = c_floor.write_batch(batch.program, batch.limit_distances, method, len(batch.state))
+    text, _ = c_floor.write_batch(
+        batch.model.program, batch.model.limit_distances, method, len(batch.model.ode.state)
+    )
     library, vectorised = c_floor.compile_batch(text, tmp_path, "batch", *FLAGS["C SIMD, no fma"])
     assert vectorised > 0
     sets = [

@@ -295,7 +295,7 @@ def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
 
 def test_rates_of_distances_are_their_slopes_over_time(swarm):
     program, state = (
-        compile_program(swarm.batch.limit_distances),
+        compile_program(swarm.batch.model.limit_distances),
         [0.1, -0.2, 0.3, 0.9, 0.5, -0.4, 0.7],
     )
     x, y, z, w, *rate = np.divide(state, [*[np.linalg.norm(state[:4])] * 4, 1.0, 1.0, 1.0])

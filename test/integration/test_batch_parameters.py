@@ -12,9 +12,9 @@ from sst_ros.dynamics.traced_dynamics import compile_program
 from sst_ros.errors import InputError
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.initial_states import NO_RATE
+from sst_ros.integration.batch_result import NO_RATE
 from sst_ros.integration.methods import RK4
-from sst_ros.integration.scenarios import Scenarios
+from sst_ros.integration.parametric_model import Scenarios
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Actuators, Link, Spring
@@ -110,24 +110,24 @@ def test_programs_have_the_bits_of_those_of_each_row(seed):
     for row in range(3):
         own = Batch(batch.scenario(row), RK4, profile=True)
         at, drive = (0.1, *STATE), (*DRIVE, *columns[3:, row])
-        assert compile_program(batch.program)(*at, *drive) == compile_program(own.program)(
-            *at, *DRIVE
-        )
-        inside = compile_program(batch.limit_distances)(*STATE[:7], *columns[3:, row])
-        assert inside == compile_program(own.limit_distances)(*STATE[:7])
+        assert compile_program(batch.model.program)(*at, *drive) == compile_program(
+            own.model.program
+        )(*at, *DRIVE)
+        inside = compile_program(batch.model.limit_distances)(*STATE[:7], *columns[3:, row])
+        assert inside == compile_program(own.model.limit_distances)(*STATE[:7])
 
 
 def test_what_is_the_same_in_all_rows_costs_nothing():
     same = {"star.inertia.zz": [0.3] * 3, "actuators.time_constant": [5e-3] * 3}
     batch = Batch(LOADED, RK4, parameters=same)
-    assert batch.program == Batch(batch.scenario(0), RK4).program
+    assert batch.model.program == Batch(batch.scenario(0), RK4).model.program
 
 
 def test_other_values_are_the_same_code():
     def text(low, high):
         batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [low, high]})
         return batch_source.batch_source(
-            batch.program, batch.limit_distances, RK4, len(batch.state)
+            batch.model.program, batch.model.limit_distances, RK4, len(batch.model.ode.state)
         )
 
     assert text(0.2, 0.3) == text(0.25, 0.4)
@@ -177,8 +177,8 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
     for row in (0, 17, 999):
         own = Batch(together.scenario(row), RK4, profile=True)
         at = (0.1, *STATE[:7])
-        assert compile_program(together.program)(*at, *columns[:, row]) == compile_program(
-            own.program
+        assert compile_program(together.model.program)(*at, *columns[:, row]) == compile_program(
+            own.model.program
         )(*at)
     parameters["torque.amplitude"][500] = 0.0
     built.clear()
