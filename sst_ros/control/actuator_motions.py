@@ -34,7 +34,7 @@ from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import axpy, multiply
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.motions import Sweep, ToAngles
+from sst_ros.scene.loads import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
 
 Path = Callable[[float], tuple[Vector3, Vector3, Vector3]]

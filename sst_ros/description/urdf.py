@@ -42,7 +42,6 @@ from sst_ros.description.tree import (
 )
 from sst_ros.dynamics.limits import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import LARGEST, Friction, Scene
 from sst_ros.state import Vector3
@@ -153,7 +152,7 @@ class Body:
 def bodies(scene: Scene) -> list[Body]:
     """All bodies that have mass or inertia."""
     star, base = scene.star, scene.base
-    found = [_body(STAR, star.mass, star.centre, star.inertia, star.radius)]
+    found = [_body(STAR, star.mass, star.centre, star.tensor, star.radius)]
     if scene.payload is not None:
         own = scene.payload.inertia
         tensor = np.zeros((3, 3)) if own is None else own.matrix
@@ -165,14 +164,13 @@ def bodies(scene: Scene) -> list[Body]:
             (name_intermediate(leg), scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
-                found.append(_body(name, link.mass, link.centre, link.inertia, radius))
+                found.append(_body(name, link.mass, link.centre, link.tensor, radius))
         if scene.actuators is not None and scene.actuators.rotor_inertia:
             found.append(_rotor(scene, leg))
     return found
 
 
-def _body(name: str, mass: float, centre: Vector3, inertia: Inertia | None, radius: float) -> Body:
-    about_o = np.zeros((3, 3)) if inertia is None else inertia.matrix
+def _body(name: str, mass: float, centre: Vector3, about_o: Array, radius: float) -> Body:
     if mass == 0.0:
         return Body(name, name, _mass(about_o, radius), np.zeros(3), about_o, assumed=True)
     c = np.array(centre)

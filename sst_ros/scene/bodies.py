@@ -11,7 +11,7 @@ link k.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -51,12 +51,7 @@ class Inertia(Section):
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The tensor, shape (3, 3) [kg m^2]."""
-        rows = [
-            [self.xx, self.xy, self.xz],
-            [self.xy, self.yy, self.yz],
-            [self.xz, self.yz, self.zz],
-        ]
-        return np.array(rows)
+        return _matrix_of(entries_of(self))
 
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
@@ -64,7 +59,7 @@ class Inertia(Section):
         def refusal(allowed: str) -> Problem:
             return Problem("", np.linalg.eigvalsh(self.matrix).tolist(), allowed)
 
-        tensor = _entries(self)
+        tensor = entries_of(self)
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
         yield (
@@ -135,11 +130,19 @@ class Link(Section):
         default=ABOUT_O,
     )
 
+    @property
+    def tensor(self) -> NDArray[np.float64]:
+        """The inertia, shape (3, 3) [kg m^2], zero without one."""
+        return _matrix_of(entries_of(self.inertia))
+
     def __post_init__(self) -> None:
         """Check, and replace an inertia about the centre of mass by that about O."""
         super().__post_init__()
         if self.inertia_about == ABOUT_CENTRE and self.inertia is not None:
-            about_o = self.inertia.matrix + _of_point(self.mass, self.centre)
+            point = point_inertia(self.mass, self.centre)
+            about_o = (
+                own + part for own, part in zip(entries_of(self.inertia), point, strict=True)
+            )
             object.__setattr__(self, "inertia", _inertia_of(about_o))
             object.__setattr__(self, "inertia_about", ABOUT_O)
 
@@ -152,10 +155,9 @@ class Link(Section):
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, centre, about_o = self.mass, self.centre, _entries(self.inertia)
-        x, y, z = centre
-        point = (y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z)
-        own = [whole - mass * part for whole, part in zip(about_o, point, strict=True)]
+        mass, (x, y, z), about_o = self.mass, self.centre, entries_of(self.inertia)
+        point = point_inertia(mass, self.centre)
+        own = [whole - part for whole, part in zip(about_o, point, strict=True)]
         scale = mass * (x * x + y * y + z * z)
         for part in about_o:
             scale = np.maximum(scale, abs(part))
@@ -163,13 +165,12 @@ class Link(Section):
         fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
 
         def contradiction() -> Problem:
-            xx, yy, zz, xy, xz, yz = own
-            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            moments = np.linalg.eigvalsh(_matrix_of(own))
             allowed = (
                 f"must fit the inertia about O, which leaves {moments} about this centre "
                 f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
             )
-            return Problem("centre", centre, allowed)
+            return Problem("centre", self.centre, allowed)
 
         yield np.greater(mass, 0.0) & np.greater(scale, 0.0) & ~fits, contradiction
 
@@ -213,15 +214,36 @@ class Payload(Section):
     @property
     def about_o(self) -> NDArray[np.float64]:
         """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
-        own = np.zeros((3, 3)) if self.inertia is None else self.inertia.matrix
-        return own + _of_point(self.mass, self.centre)
+        return _matrix_of(entries_of(self.inertia)) + _matrix_of(
+            point_inertia(self.mass, self.centre)
+        )
 
 
-def _entries(inertia: Inertia | None) -> list[Any]:
+PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Rows and columns of the six numbers of an inertia (xx, yy, zz, xy, xz, yz)."""
+
+
+def entries_of(inertia: Inertia | None) -> list[Any]:
     """Return xx, yy, zz, xy, xz and yz, zero without inertia; they may be columns or symbols."""
     if inertia is None:
         return [0.0] * 6
     return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]
+
+
+def point_inertia(mass: Any, centre: Any) -> list[Any]:
+    """Return the six numbers of a point about O, which may be columns or symbols."""
+    square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
+    return [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
+
+
+def _matrix_of(entries: Iterable[Any]) -> NDArray[np.float64]:
+    xx, yy, zz, xy, xz, yz = entries
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _inertia_of(entries: Iterable[float]) -> Inertia:
+    xx, yy, zz, xy, xz, yz = entries
+    return Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz)
 
 
 def _is_positive(entries: Sequence[Any], more: Any) -> Any:
@@ -231,16 +253,6 @@ def _is_positive(entries: Sequence[Any], more: Any) -> Any:
     off = yz - xy * xz / first
     third = zz + more - xz * xz / first - off * off / second
     return np.asarray((first > 0.0) & (second > 0.0) & (third > 0.0))
-
-
-def _inertia_of(tensor: NDArray[np.float64]) -> Inertia:
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
-    return Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz)
-
-
-def _of_point(mass: float, centre: Vector3) -> NDArray[np.float64]:
-    c = np.array(centre)
-    return np.asarray(mass * (c @ c * np.eye(3) - np.outer(c, c)))
 
 
 def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) -> Inertia:
@@ -270,18 +282,12 @@ def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) ->
         problems.append(Problem("begin, end", (begin, end), allowed))
     if problems:
         raise InputError("arc_inertia", problems)
-    u = first / np.linalg.norm(first)
+    u, v = first / np.linalg.norm(first), last / np.linalg.norm(last)
     half = 0.5 * math.atan2(normal, float(first @ last))
-    middle = u * math.cos(half) + _towards(u, last) * math.sin(half)
-    across = _towards(middle, last)
     # Mean of r r^T over the arc: angles from -half to half about its middle.
     ratio = math.sin(2.0 * half) / (2.0 * half)
-    spread = 0.5 * (1.0 + ratio) * np.outer(middle, middle)
-    spread += 0.5 * (1.0 - ratio) * np.outer(across, across)
-    return _inertia_of(np.asarray(mass * radius**2 * (np.eye(3) - spread)))
-
-
-def _towards(axis: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the unit vector across `axis` in the plane of both, on the side of `other`."""
-    across = other - axis * float(axis @ other)
-    return np.asarray(across / np.linalg.norm(across))
+    spread = np.zeros((3, 3))
+    for along, share in ((u + v, 1.0 + ratio), (v - u, 1.0 - ratio)):
+        spread += 0.5 * share * np.outer(along, along) / (along @ along)
+    tensor = mass * radius**2 * (np.eye(3) - spread)
+    return _inertia_of(tensor[place] for place in PLACES)

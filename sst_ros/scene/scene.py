@@ -16,6 +16,7 @@ from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star
 from sst_ros.scene.loads import (
     Actuators,
+    DesiredMotion,
     Friction,
     Gravity,
     Initial,
@@ -26,7 +27,6 @@ from sst_ros.scene.loads import (
     Stroke,
     Workspace,
 )
-from sst_ros.scene.motions import DesiredMotion
 from sst_ros.scene.schema import (
     Rules,
     Section,
@@ -144,7 +144,7 @@ class Scene(Section):
     @property
     def actuated_inertias(self) -> Matrix:
         """Inertias of actuated links and rotors in {1k}, shape (3, 3, 3) [kg m^2]."""
-        inertias = np.stack([_matrix(link) for link in self.actuated_links])
+        inertias = np.stack([link.tensor for link in self.actuated_links])
         if self.actuators is not None:
             inertias[:, 2, 2] += self.actuators.gear_ratio**2 * self.actuators.rotor_inertia
         return inertias
@@ -152,7 +152,7 @@ class Scene(Section):
     @property
     def intermediate_inertias(self) -> Matrix:
         """Inertias of the intermediate links in {2k}, shape (3, 3, 3) [kg m^2]."""
-        return np.stack([_matrix(link) for link in self.intermediate_links])
+        return np.stack([link.tensor for link in self.intermediate_links])
 
     def check(self) -> Iterator[Problem]:
         """Refuse what contradicts itself across sections, and numbers of another unit."""
@@ -218,21 +218,17 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
         return scene
     if isinstance(initial, Initial):
         return replace(scene, initial=initial)
-    names = ("gamma", "gamma_dot", "orientation")
-    if isinstance(initial, Mapping):
-        unknown = [name for name in initial if name not in names]
-        if unknown or "gamma" not in initial:
-            allowed = "must have the key gamma, and may have gamma_dot and orientation"
-            raise InputError("initial", [Problem("initial", list(initial), allowed)])
-        given = dict(initial)
-    else:
+    if not isinstance(initial, Mapping):
         try:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
             allowed = "must be (gamma, gamma_dot), a mapping or Initial"
             raise InputError("initial", [Problem("initial", initial, allowed)]) from None
-        given = {"gamma": gamma, "gamma_dot": gamma_dot}
-    return replace(scene, initial=Initial(**{name: plain(given[name]) for name in given}))
+        initial = {"gamma": gamma, "gamma_dot": gamma_dot}
+    elif "gamma" not in initial or initial.keys() - {"gamma", "gamma_dot", "orientation"}:
+        allowed = "must have the key gamma, and may have gamma_dot and orientation"
+        raise InputError("initial", [Problem("initial", list(initial), allowed)])
+    return replace(scene, initial=Initial(**{name: plain(x) for name, x in initial.items()}))
 
 
 def load(name_or_path: str | Path) -> Scene:
@@ -281,7 +277,3 @@ def share_directory() -> Path:
             if (candidate / "config" / "scenes").is_dir():
                 return candidate
     raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
-
-
-def _matrix(link: Link) -> Matrix:
-    return np.zeros((3, 3)) if link.inertia is None else link.inertia.matrix

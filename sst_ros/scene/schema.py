@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -29,7 +30,6 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 _TEXT = {"type": "string", "pattern": "\\S"}
-
 
 Place = tuple[str | int, ...]
 """Names and indices of a leaf from the root on."""
@@ -61,12 +61,9 @@ class Spec:
         if self.kind == "number":
             size = " x ".join(map(str, self.shape))
             what = f"{size} finite numbers" if size else "a finite number"
-            bounds = [
-                f"> {self.above:g}" if math.isfinite(self.above) else "",
-                f">= {self.least:g}" if math.isfinite(self.least) else "",
-                f"<= {self.most:g}" if math.isfinite(self.most) else "",
-            ]
-            return " ".join(["must be", what, *filter(None, bounds)]) + unit
+            ends = (">", self.above), (">=", self.least), ("<=", self.most)
+            bounds = [f"{sign} {end:g}" for sign, end in ends if math.isfinite(end)]
+            return " ".join(["must be", what, *bounds]) + unit
         return {
             "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
             "flag": "must be true or false",
@@ -82,9 +79,19 @@ class Spec:
         }[self.kind]
 
 
-def number(doc: str, unit: str, *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
-    """Declare a number, or with `shape` a vector or a list of rows."""
-    return _declare(Spec("number", doc, unit, **spec), default)
+def _declare(
+    kind: str, doc: str, unit: str = "", *, default: Any = dataclasses.MISSING, **spec: Any
+) -> Any:
+    """Declare a field of a section; `spec` has more of what `Spec` says."""
+    metadata = {"spec": Spec(kind, doc, unit, **spec)}
+    return dataclasses.field(default=default, metadata=metadata, kw_only=True)
+
+
+number, integer, flag, text, texts = (
+    partial(_declare, kind) for kind in ("number", "integer", "flag", "text", "texts")
+)
+notes = partial(_declare, "notes", default=())
+"""A mapping from keys of this document to text."""
 
 
 def anything(doc: str, **default: Any) -> Any:
@@ -92,59 +99,22 @@ def anything(doc: str, **default: Any) -> Any:
     return dataclasses.field(metadata={"spec": Spec("anything", doc)}, **default)
 
 
-def integer(doc: str, unit: str = "", *, default: Any = dataclasses.MISSING, **spec: Any) -> Any:
-    """Declare a whole number."""
-    return _declare(Spec("integer", doc, unit, **spec), default)
-
-
-def flag(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
-    """Declare a switch."""
-    return _declare(Spec("flag", doc), default)
-
-
-def texts(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
-    """Declare a list of text."""
-    return _declare(Spec("texts", doc), default)
-
-
-def text(doc: str, *, default: Any = dataclasses.MISSING) -> Any:
-    """Declare free text."""
-    return _declare(Spec("text", doc), default)
-
-
-def choice(
-    doc: str, choices: Sequence[str], *, default: Any = dataclasses.MISSING, **spec: Any
-) -> Any:
+def choice(doc: str, choices: Sequence[str], **rest: Any) -> Any:
     """Declare one word out of a list."""
-    return _declare(Spec("choice", doc, choices=tuple(choices), **spec), default)
+    return _declare("choice", doc, choices=tuple(choices), **rest)
 
 
-def section(doc: str, cls: type[Section], *, default: Any = dataclasses.MISSING) -> Any:
+def section(doc: str, cls: type[Section], **default: Any) -> Any:
     """Declare a nested section."""
-    return _declare(Spec("section", doc, section=cls), default)
+    return _declare("section", doc, section=cls, **default)
 
 
-def sections(
-    doc: str,
-    cls: type[Section],
-    lengths: Sequence[int],
-    *,
-    default: Any = dataclasses.MISSING,
-) -> Any:
+def sections(doc: str, cls: type[Section], lengths: Sequence[int] = (), **default: Any) -> Any:
     """Declare a list of sections, of any length where `lengths` is empty.
 
     Otherwise one entry stands for all of the longest allowed list.
     """
-    return _declare(Spec("sections", doc, section=cls, lengths=tuple(lengths)), default)
-
-
-def notes(doc: str) -> Any:
-    """Declare a mapping from keys of this document to text."""
-    return _declare(Spec("notes", doc), ())
-
-
-def _declare(spec: Spec, default: Any) -> Any:
-    return dataclasses.field(default=default, metadata={"spec": spec}, kw_only=True)
+    return _declare("sections", doc, section=cls, lengths=tuple(lengths), **default)
 
 
 Rules: TypeAlias = "Iterator[tuple[Any, Callable[[], Problem]]]"
@@ -243,31 +213,31 @@ def key_of(place: Place) -> str:
 
 def accept(spec: Spec, value: Any) -> Any:
     """Return `value` in its frozen form, or raise ValueError."""
-    if spec.kind == "number":
+    kind, is_list = spec.kind, isinstance(value, (list, tuple))
+    if kind == "number":
         return _numbers(spec, value, spec.shape)
-    if spec.kind == "notes" and isinstance(value, (dict, tuple)):
+    if kind == "text":
+        return frozen_text(value)
+    if kind == "texts" and is_list:
+        return tuple(map(frozen_text, value))
+    if kind == "notes" and isinstance(value, (dict, tuple)):
         pairs = value.items() if isinstance(value, dict) else value
         return tuple((frozen_text(name), frozen_text(note)) for name, note in pairs)
-    if spec.kind == "text":
-        return frozen_text(value)
-    if spec.kind == "anything":
-        return value
-    if spec.kind == "texts" and isinstance(value, (list, tuple)):
-        return tuple(frozen_text(entry) for entry in value)
-    if spec.kind == "flag" and (value is True or value is False):
-        return value
-    if spec.kind == "integer" and type(value) is int and spec.least <= value <= spec.most:
-        return value
-    if spec.kind == "choice" and value in spec.choices:
-        return value
-    if spec.kind == "section" and spec.section and isinstance(value, spec.section):
-        return value
-    if spec.kind == "sections" and spec.section and isinstance(value, (list, tuple)):
+    if kind == "sections" and spec.section and is_list:
         repeated = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
         fits = not spec.lengths or len(value) in spec.lengths
         if fits and all(isinstance(entry, spec.section) for entry in value):
             return tuple(value) * repeated
-    raise ValueError
+    fits = {
+        "anything": True,
+        "flag": value is True or value is False,
+        "integer": type(value) is int and spec.least <= value <= spec.most,
+        "choice": value in spec.choices,
+        "section": spec.section is not None and isinstance(value, spec.section),
+    }.get(kind, False)
+    if not fits:
+        raise ValueError
+    return value
 
 
 def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
@@ -279,9 +249,7 @@ def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
         if not fits:
             raise ValueError
         return tuple(_numbers(spec, entry, shape[1:]) for entry in value)
-    if isinstance(value, bool) or value is None:
-        raise ValueError
-    if isinstance(value, str) and not _NUMBER.fullmatch(value):
+    if isinstance(value, bool) or (isinstance(value, str) and not _NUMBER.fullmatch(value)):
         raise ValueError
     try:
         result = float(value)
@@ -344,9 +312,5 @@ def _number_schema(spec: Spec, shape: tuple[int, ...]) -> dict[str, Any]:
     if shape:
         size = {"minItems": shape[0], "maxItems": shape[0]}
         return {"type": "array", "items": _number_schema(spec, shape[1:]), **size}
-    bounds = {
-        "exclusiveMinimum": spec.above,
-        "minimum": spec.least,
-        "maximum": spec.most,
-    }
+    bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
     return {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)}

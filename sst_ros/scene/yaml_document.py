@@ -30,13 +30,6 @@ LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
 and its time grows with the square of the levels."""
 
 
-class _Refused(Exception):
-    """A document breaks one of the limits; ends its reading at once."""
-
-    def __init__(self, event: yaml.Event, value: object, allowed: str) -> None:
-        self.problem = Problem("", value, allowed, _line(event))
-
-
 class _Loader(yaml.SafeLoader):
     """PyYAML's reader, which ends at the first event that breaks a limit."""
 
@@ -48,20 +41,22 @@ class _Loader(yaml.SafeLoader):
         """Return the next event.
 
         Raises:
-            _Refused: it is an alias, or there is too much in the document.
+            InputError: it is an alias, or there is too much in the document.
 
         """
         event: yaml.Event = super().get_event()  # type: ignore[no-untyped-call]
         self.depth += isinstance(event, yaml.CollectionStartEvent)
         self.depth -= isinstance(event, yaml.CollectionEndEvent)
         self.nodes += isinstance(event, yaml.NodeEvent)
+        fault = None
         if isinstance(event, yaml.AliasEvent):
-            allowed = "aliases are not allowed; write the value out"
-            raise _Refused(event, f"*{event.anchor}", allowed)
-        if self.depth > DEEPEST:
-            raise _Refused(event, "nested", f"no more than {DEEPEST} levels are allowed")
-        if self.nodes > MOST_NODES:
-            raise _Refused(event, "long", f"no more than {MOST_NODES} values are allowed")
+            fault = f"*{event.anchor}", "aliases are not allowed; write the value out"
+        elif self.depth > DEEPEST:
+            fault = "nested", f"no more than {DEEPEST} levels are allowed"
+        elif self.nodes > MOST_NODES:
+            fault = "long", f"no more than {MOST_NODES} values are allowed"
+        if fault:
+            raise InputError("", [Problem("", *fault, _line(event))])
         return event
 
 
@@ -81,8 +76,8 @@ def read(cls: type[S], source: str, origin: str) -> S:
         raise InputError(origin, [Problem("", f"{len(source)} characters", allowed)])
     try:
         node = yaml.compose(source, Loader=_Loader)
-    except _Refused as refused:
-        raise InputError(origin, [refused.problem]) from None
+    except InputError as refused:
+        raise InputError(origin, refused.problems) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = None if mark is None else mark.line + 1

@@ -29,7 +29,7 @@ from sst_ros.mechanism import continuation, kinematics, rates, virtual_work, wor
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import quaternion_product
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.motions import (
+from sst_ros.scene.loads import (
     DesiredMotion,
     Recorded,
     Spiral,

@@ -25,7 +25,7 @@ from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.motions import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
+from sst_ros.scene.loads import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
 from sst_ros.scene.scene import (
     Actuators,
     Friction,

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from sst_ros import Controller, ControllerSettings, load_scene, reference_motion, simulate
-from sst_ros.scene.motions import DesiredMotion, Sweep
+from sst_ros.scene.loads import DesiredMotion, Sweep
 
 PERIOD = 5e-4
 FRICTION = {

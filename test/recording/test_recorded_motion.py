@@ -14,7 +14,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.recording.recording import read, read_run_motion
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.motions import DesiredMotion, Recorded
+from sst_ros.scene.loads import DesiredMotion, Recorded
 
 
 @pytest.fixture

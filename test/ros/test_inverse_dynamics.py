@@ -18,7 +18,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.recording import recording
 from sst_ros.report import tracking
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.motions import DesiredMotion, Spiral, ToAngles
+from sst_ros.scene.loads import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Stroke, Workspace
 
 pytestmark = pytest.mark.ros
