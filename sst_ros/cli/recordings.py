@@ -8,7 +8,7 @@ import argparse
 from sst_ros.cli.commands import free_out
 from sst_ros.host.output import results_folder
 from sst_ros.recording.bag_writer import recover
-from sst_ros.recording.signals import export
+from sst_ros.recording.recording import export
 
 
 def write_tables(options: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from sst_ros.control.law import MODES
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
-from sst_ros.recording import signals
+from sst_ros.recording.recording import read_signals
 from sst_ros.report import accuracy, stability
 from sst_ros.report.reference_solution import EXTENDED, MPMATH
 from sst_ros.report.run import summary_table, summary_text, write_run_report
@@ -52,7 +52,7 @@ def draw_pictures(options: argparse.Namespace) -> int:
     if not bags or (len(bags) > 1 and not options.compare):
         options.parser.error("name one BAG, or several with --compare")
     out = free_out(options, results_folder(bags[0], "plots"))
-    runs = [signals.read(bag) for bag in bags]
+    runs = [read_signals(bag) for bag in bags]
     if options.compare:
         print(compare.difference_text(runs))
         paths, missing = compare.draw_comparison(runs, out, options.only)

@@ -1,20 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of compiled code: numba unpickles its files, so it is for the user alone (mode 700).
-
-No other user may put another folder in its place: as with StrictModes of OpenSSH all folders
-above it belong to the user or to root, and no other user can write into them. One of them may be
-writable where its sticky bit keeps others from replacing what is not theirs, as /tmp is, and a
-group may write whose only member is the user.
-"""
+"""The folder of compiled code, for the user alone (mode 700): numba unpickles what is in it."""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import grp
 import importlib.util
 import os
-import pwd
 import shutil
 import stat
 import sys
@@ -26,12 +18,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sst_ros.host.output import replace_file
+
 
 def cache_folder() -> Path:
     """Return the folder of compiled code, made if it was not there.
 
-    It is SST_ROS_CACHE, or sst_ros in the user's cache folder. Where that is not for the user
-    alone, it is a private temporary folder, and a warning is given.
+    It is SST_ROS_CACHE, or sst_ros in the user's cache folder. Where that is another user's, or
+    open to others, it is a private temporary folder, and a warning is given.
 
     Raises:
         OSError: it cannot be made.
@@ -40,9 +34,13 @@ def cache_folder() -> Path:
     folder = configured_folder()
     if folder is None:
         return _private_folder("there is no home folder")
-    _make(folder)
-    reason = objection(folder)
-    return folder if reason is None else _private_folder(reason)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = folder.stat()
+    if status.st_uid != os.geteuid():
+        return _private_folder(f"{folder} belongs to another user (uid {status.st_uid})")
+    if (mode := stat.S_IMODE(status.st_mode)) & 0o077:
+        return _private_folder(f"{folder} has mode {mode:o} and must have 700")
+    return folder
 
 
 def configured_folder() -> Path | None:
@@ -55,43 +53,6 @@ def configured_folder() -> Path | None:
         return Path.home() / ".cache" / "sst_ros"
     except RuntimeError:
         return None
-
-
-def objection(folder: Path) -> str | None:
-    """Return why code in a folder is not trusted; None where it is."""
-    # The path as it is written may lead through links, which must be safe, too.
-    for whole in {folder.absolute(), folder.resolve()}:
-        for path in (whole, *whole.parents):
-            status = path.lstat()
-            mode = stat.S_IMODE(status.st_mode)
-            if _is_foreign(status):
-                return f"{path} belongs to another user (uid {status.st_uid})"
-            if stat.S_ISLNK(status.st_mode):
-                continue  # its own mode means nothing; what it leads to is looked at, too
-            if path == whole and mode & 0o077:
-                return f"{path} has mode {mode:o} and must have 700"
-            if mode & stat.S_ISVTX:
-                continue
-            if mode & stat.S_IWOTH:
-                return f"{path} can be written by every user"
-            if mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
-                return f"{path} can be written by its group (gid {status.st_gid})"
-    return None
-
-
-def _is_foreign(status: os.stat_result) -> bool:
-    return status.st_uid not in (0, os.geteuid())
-
-
-def _is_private_group(gid: int) -> bool:
-    """Return whether a group is the user's own: it bears his name and has no other member."""
-    try:
-        user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
-    except KeyError:
-        return False
-    return (gid, group.gr_name) == (user.pw_gid, user.pw_name) and {user.pw_name}.issuperset(
-        group.gr_mem
-    )
 
 
 def store(files: Mapping[str, bytes]) -> None:
@@ -110,7 +71,7 @@ def import_text(name: str, text: str) -> ModuleType | None:
         # A folder that was open to others once may have files of theirs.
         for file in (path, *(path.parent / "__pycache__").glob(f"{name}.*.nb[ic]")):
             with contextlib.suppress(FileNotFoundError):
-                if _is_foreign(file.lstat()):
+                if file.lstat().st_uid != os.geteuid():
                     file.unlink()
         if not path.exists() or path.read_bytes() != data:
             _write(path, data)
@@ -161,19 +122,9 @@ def _bear_a_bad_cache(function: Any) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file as a whole: two processes may do so at once, each its own, then a rename."""
-    with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
-        file.write(data)
-    os.utime(file.name, (0, 0))  # numba's stamp is this time: the same for all, as the text is
-    Path(file.name).replace(path)
-
-
-def _make(folder: Path) -> None:
-    """Make a folder, and those above it, for the user alone."""
-    if not folder.is_dir():
-        if folder.parent != folder:
-            _make(folder.parent)
-        folder.mkdir(mode=0o700, exist_ok=True)
+    with replace_file(path) as own:
+        own.write_bytes(data)
+        os.utime(own, (0, 0))  # numba's stamp is this time: the same for all, as the text is
 
 
 @lru_cache(maxsize=1)

@@ -21,7 +21,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import workspace
 from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
 from sst_ros.plot.style import LINES, leg_names, legend, positive, stack, styled
-from sst_ros.recording.signals import Signals
+from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 
 if TYPE_CHECKING:

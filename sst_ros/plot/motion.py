@@ -36,7 +36,7 @@ from sst_ros.plot.style import (
     stack,
     widen,
 )
-from sst_ros.recording.signals import Signals
+from sst_ros.recording.recording import Signals
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 

@@ -31,8 +31,8 @@ from sst_ros.plot.style import (
     stack,
     styled,
 )
-from sst_ros.recording.signals import Integers, Signals
-from sst_ros.recording.topic_tables import SCENE
+from sst_ros.recording.recording import Signals
+from sst_ros.recording.topic_tables import SCENE, Integers
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 

@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.recording.signals import Integers
+from sst_ros.recording.topic_tables import Integers
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"

@@ -25,7 +25,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
 from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
-from sst_ros.recording.signals import Signals
+from sst_ros.recording.recording import Signals
 from sst_ros.scene.scene import Scene
 
 WORST_COND = 10.0

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePath
-from typing import IO, Any, NamedTuple, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import yaml
 from mcap.data_stream import ReadDataStream
@@ -47,21 +47,25 @@ _DATA_END_SIZE = _RECORD_HEAD + 4
 _PIECE = 1 << 20
 
 
-class Topic(NamedTuple):
-    """A topic to look for.
+@dataclass(frozen=True)
+class Topic:
+    """A topic to look for: one whose full name ends in its key.
 
     Attributes:
-        key: short name.
-        ending: end of its full name, or the whole name where `anywhere` is False.
+        key: last word of its name.
         type: message type.
-        anywhere: any namespace and node name may precede the ending.
+        anywhere: any namespace and node name may precede the key.
 
     """
 
     key: str
-    ending: str
     type: str
     anywhere: bool = True
+
+    @property
+    def ending(self) -> str:
+        """End of its full name, or the whole name where it is not `anywhere`."""
+        return f"/{self.key}"
 
     def matches(self, name: str) -> bool:
         """Return whether a full name is that of this topic."""

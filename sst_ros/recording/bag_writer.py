@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -144,10 +144,7 @@ class BagWriter:
     def write(self, connection: Connection, received_ns: int, data: bytes) -> None:
         """Add a serialized message."""
         if self._open:
-            try:
-                self._writer.write(connection, received_ns, data)
-            except OSError as error:
-                raise self._abort(error) from None
+            self._try(self._writer.write, connection, received_ns, data)
             self.messages += 1
 
     def save(self) -> None:
@@ -155,28 +152,25 @@ class BagWriter:
         now = time.monotonic()
         if self._open and now - self._flushed >= FLUSH_PERIOD_S:
             self._flushed = now
-            try:
-                self._writer.flush()
-            except OSError as error:
-                raise self._abort(error) from None
+            self._try(self._writer.flush)
 
     def close(self) -> None:
         """Write the index; does nothing the second time and after an abort."""
         if self._open:
-            try:
-                self._writer.close()
-            except OSError as error:
-                raise self._abort(error) from None
+            self._try(self._writer.close)
             self._open = False
 
-    def _abort(self, error: OSError) -> RecordingAborted:
-        self._open = False
-        with contextlib.suppress(OSError):
-            self._writer.abort()
-        return RecordingAborted(
-            f"{self.path} is cut: {error}. Recording stopped after {self.messages} messages; "
-            f"recover those that were written by: python -m sst_ros recover {self.path}"
-        )
+    def _try(self, act: Callable[..., None], *given: Any) -> None:
+        try:
+            act(*given)
+        except OSError as error:
+            self._open = False
+            with contextlib.suppress(OSError):
+                self._writer.abort()
+            raise RecordingAborted(
+                f"{self.path} is cut: {error}. Recording stopped after {self.messages} messages; "
+                f"recover those that were written by: python -m sst_ros recover {self.path}"
+            ) from None
 
 
 class Recovered(NamedTuple):

@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded run as arrays: what the nodes published between the start and the last sample."""
+"""What a recording holds of a run: all its topics as tables, and a whole run as arrays.
+
+Numbers have the bits of the recording. `read_signals` reads any recording in which some topic of a
+run is found; what it lacks is left out and named. `read` makes a `Recording` of it, which refuses
+what is not a whole run.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
+from sst_ros.host.output import require_free, write_into
+from sst_ros.host.table_file import write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
-from sst_ros.recording import signals
-from sst_ros.recording.bag_reader import refusal
-from sst_ros.recording.signals import Integers, Series, Signals, places
+from sst_ros.recording.bag_reader import Bag, refusal
 from sst_ros.recording.topic_tables import (
     COMMANDS,
     DIAGNOSTICS,
@@ -24,9 +31,21 @@ from sst_ros.recording.topic_tables import (
     ORIENTATION,
     SCENE,
     STAMPED_COMMANDS,
+    TABLES,
     TICKS,
+    TIMES,
+    TOPIC_TABLES,
+    CollectedRows,
+    Column,
+    Integers,
+    InvalidMessage,
+    Series,
     TopicTable,
+    join,
+    places,
 )
+from sst_ros.scene import yaml_document
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS
@@ -34,10 +53,173 @@ from sst_ros.state import NANOSECONDS
 if TYPE_CHECKING:
     import pandas as pd
 
-
-ESSENTIAL = (JOINT_STATES.topic.key, ORIENTATION.topic.key, TICKS.topic.key, SCENE.key)
+ESSENTIAL = (JOINT_STATES.key, ORIENTATION.key, TICKS.key, SCENE.key)
 """Topics without which a recording is not that of a run."""
-OPTIONAL = (EULER.topic.key, DIAGNOSTICS.key, COMMANDS.topic.key)
+OPTIONAL = (EULER.key, DIAGNOSTICS.key, COMMANDS.key)
+
+
+class Status(NamedTuple):
+    """One diagnostic status: when it was received [ns], its name, its values by key."""
+
+    received_ns: int
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """All that a recording holds of a run, as tables.
+
+    Attributes:
+        path: of the recording.
+        scene: what was simulated; None where it was not recorded.
+        start_ns: stamp of the start of the run [ns].
+        topic_series: rows of each topic that was recorded, by its key.
+        idle_states: number of joint states that are no samples of the run.
+        statuses: diagnostics, in order of reception.
+        topics: full names of the topics found, by key.
+        absent: why a topic is missing, by key.
+        damage: what is damaged or lost, a line for each part; empty unless it was asked for.
+        unverified: number of chunks without a checksum.
+
+    """
+
+    path: Path
+    scene: Scene | None
+    start_ns: int
+    topic_series: dict[str, Series]
+    idle_states: int
+    statuses: tuple[Status, ...]
+    topics: dict[str, str]
+    absent: dict[str, Problem]
+    damage: tuple[str, ...] = ()
+    unverified: int = 0
+
+    @cached_property
+    def tables(self) -> dict[str, Series]:
+        """Rows by the names of `TABLES`; only what was recorded."""
+        found = {
+            name: [self.topic_series[t.key] for t in tables if t.key in self.topic_series]
+            for name, tables in TABLES.items()
+        }
+        return {
+            name: join(parts) if len(parts) > 1 else parts[0]
+            for name, parts in found.items()
+            if parts
+        }
+
+    @cached_property
+    def missing(self) -> tuple[str, ...]:
+        """Keys of the topics that are not in the recording, or without a row of the run."""
+        found = [*self.topic_series, *([SCENE.key] if self.scene else [])]
+        return tuple(topic.key for topic in (*TOPIC_TABLES, SCENE) if topic.key not in found)
+
+    def time_ns(self, table: str) -> Integers:
+        """Time of each row since the start of the run [ns].
+
+        Rows without a stamp have that of their reception by the recorder.
+        """
+        series = self.tables[table]
+        stamps = np.where(series.stamp_ns > 0, series.stamp_ns, series.received_ns)
+        return np.asarray(stamps - self.start_ns)
+
+    def seconds(self, table: str = "samples") -> Array:
+        """Time of each row since the start of the run [s]."""
+        return np.asarray(self.time_ns(table) / NANOSECONDS)
+
+    def legs(self, name: str, table: str = "samples") -> Array:
+        """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
+        return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
+
+    def take(self, *names: str, table: str = "samples") -> Array:
+        """Columns of quantities, shape (n, number of names)."""
+        return self.tables[table].take(*names)
+
+    def columns(self, table: str) -> dict[Column, NDArray[Any]]:
+        """Columns of a table, times first, whole numbers where they are in ns.
+
+        Raises:
+            InputError: the recording has no such table.
+
+        """
+        if table not in self.tables:
+            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
+            raise refusal(self.path, "table", table, allowed)
+        series = self.tables[table]
+        times = (self.time_ns(table), series.stamp_ns, series.received_ns)
+        numbers = zip(series.columns, series.values.T, strict=True)
+        return dict(zip(TIMES, times, strict=True)) | {
+            column: values.astype(np.int64) if column.unit == "ns" else values
+            for column, values in numbers
+        }
+
+    def table(self, name: str = "samples") -> pd.DataFrame:
+        """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
+
+        Raises:
+            InputError: the recording has no such table.
+            MissingDependency: pandas is not installed.
+
+        """
+        columns = self.columns(name)
+        numbers = {column.name: values for column, values in columns.items()}
+        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index(TIMES[0].name)
+        result.attrs = {column.name: column.text for column in columns}
+        return result
+
+
+def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
+    """Read a recording in one pass.
+
+    Args:
+        path: a rosbag2 recording, MCAP or sqlite3.
+        damaged: read what is intact of a damaged recording; `Signals.damage` names the rest.
+
+    Raises:
+        InputError: there is no recording, it is damaged, or it has nothing of a run.
+
+    """
+    path, requested = Path(path), [*TOPIC_TABLES, SCENE, DIAGNOSTICS]
+    bag = Bag(path, requested, damaged=damaged)
+    collected = {table.key: CollectedRows(table) for table in TOPIC_TABLES}
+    scenes: set[str] = set()
+    statuses: list[Status] = []
+    for key, received_ns, content in bag.messages():
+        if key == SCENE.key:
+            scenes.add(content.data)
+        elif key == DIAGNOSTICS.key:
+            for status in content.status:
+                values = {pair.key: pair.value for pair in status.values}
+                statuses.append(Status(received_ns, status.name, values))
+        else:
+            try:
+                collected[key].add(received_ns, content)
+            except InvalidMessage as error:
+                raise refusal(path, key, error.value, str(error)) from None
+    idle = collected[JOINT_STATES.key].skipped
+    # Each is let go when it is a series: an hour takes some hundred megabytes.
+    series = {key: collected.pop(key).series(path) for key in list(collected)}
+    found = {key: one for key, one in series.items() if len(one)}
+    if not found:
+        allowed = "must have at least one of " + ", ".join(t.ending for t in TOPIC_TABLES)
+        raise refusal(path, "topics", None, allowed)
+    if len(scenes) > 1:
+        raise refusal(path, SCENE.key, len(scenes), "the recording must hold one scene")
+    stamped = [one.key for one in (*TABLES["samples"], TICKS)]
+    starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
+    origin = f"{path}: {bag.topics.get(SCENE.key)}"
+    return Signals(
+        path=path,
+        scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
+        start_ns=min(starts or [int(one.received_ns[0]) for one in found.values()]),
+        topic_series=found,
+        idle_states=idle,
+        statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
+        topics=bag.topics,
+        absent={one.key: bag.absence(one) for one in requested if one.key not in bag.topics},
+        damage=bag.damage,
+        unverified=bag.unverified,
+    )
 
 
 @dataclass(frozen=True)
@@ -72,7 +254,7 @@ class Recording:
     """A run from its bag. Samples are in order of time; rows belong to samples.
 
     Args:
-        found: all columns of the recording.
+        found: all tables of the recording.
 
     Attributes:
         path: where the bag is.
@@ -219,7 +401,7 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
         InputError: it is no recording of a run, or a damaged one; the error names the fault.
 
     """
-    return Recording(signals.read(Path(path), damaged=damaged))
+    return Recording(read_signals(path, damaged=damaged))
 
 
 def read_run_motion(bag: str | Path) -> Trajectory:
@@ -236,11 +418,36 @@ def read_run_motion(bag: str | Path) -> Trajectory:
     return motion
 
 
+def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> list[Path]:
+    """Write a file for each table of a recording into the folder `out`; return their paths.
+
+    Args:
+        bag: a rosbag2 recording, MCAP or sqlite3.
+        out: folder, made if it is not there.
+        form: csv or parquet.
+        force: replace earlier files.
+
+    Raises:
+        InputError: the recording cannot be read, `out` cannot be written or is not empty.
+        MissingDependency: pandas or pyarrow is not installed.
+
+    """
+    require_free(out, "export", force=force)
+    run = read_signals(bag)
+    paths = {name: out / f"{name}.{form}" for name in run.tables}
+    with write_into(out, "export"):
+        for name, path in paths.items():
+            columns = run.columns(name)
+            about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
+            write_table({one.name: values for one, values in columns.items()}, path, about)
+    return list(paths.values())
+
+
 def _rows(found: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic; none where it was not recorded."""
     none = np.empty(0, dtype=np.int64)
     empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
-    return found.topic_series.get(table.topic.key, empty)
+    return found.topic_series.get(table.key, empty)
 
 
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
@@ -249,7 +456,7 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
     bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refusal(found.path, table.topic.key, row, f"is not finite at stamp {stamp} ns")
+        raise refusal(found.path, table.key, row, f"is not finite at stamp {stamp} ns")
     return series
 
 
@@ -261,7 +468,7 @@ def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
     if overlap.any():
         at = int(starts[1:][overlap][0])
         allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refusal(path, "applied_torques", at, allowed)
+        raise refusal(path, TICKS.key, at, allowed)
     moment = series.values[:, 4:]
     known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
     return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
@@ -270,12 +477,10 @@ def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
 def _commands(found: Signals) -> Series:
     """Put the commands of both topics in order of their reception."""
     parts = [_rows(found, table) for table in (COMMANDS, STAMPED_COMMANDS)]
-    stamps, received, torque = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("stamp_ns", "received_ns", "values")
-    )
-    order = np.argsort(received, kind="stable")
-    return Series(COMMANDS.columns, stamps[order], received[order], torque[order])
+    order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
+    names = ("stamp_ns", "received_ns", "values")
+    columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
+    return Series(COMMANDS.columns, *columns)
 
 
 def _usual(lengths_ns: Integers) -> int:

@@ -22,7 +22,7 @@ from sst_ros.integration.propagator import LONGEST_TICK_NS, TickPropagator, Tick
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.signals import Integers, places
+from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.report import states
 from sst_ros.state import NANOSECONDS
 

@@ -20,7 +20,7 @@ from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.signals import Integers
+from sst_ros.recording.topic_tables import Integers
 from sst_ros.scene.scene import Scene
 
 Places: TypeAlias = "slice | list[int] | Integers"

@@ -24,12 +24,11 @@ from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.signals import Integers, places
-from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR
+from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, Integers, places
 from sst_ros.state import NANOSECONDS
 
 PICTURES, TABLE = ("tracking", "tracking_error", "control_torques"), "tracking.txt"
-KEYS = (REFERENCE.topic.key, TRACKING_ERROR.topic.key)
+KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pytest
 from programs import python
 
 from sst_ros.host import cache_folder as module
-from sst_ros.host.cache_folder import cache_folder, objection
+from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration.codegen import numba_version
 
 OTHER_USER = 65534
@@ -31,60 +31,36 @@ def run(cache, **options):
 
 
 @pytest.fixture
-def folder(tmp_path):
-    result = tmp_path / "above" / "cache"
-    (result / "__pycache__").mkdir(parents=True, mode=0o700)
-    for path in (result, result.parent):
-        path.chmod(0o700)
+def folder(tmp_path, monkeypatch):
+    result = tmp_path / "cache"
+    result.mkdir(mode=0o700)
+    monkeypatch.setenv("SST_ROS_CACHE", str(result))
+    module._private_folder.cache_clear()
     return result
 
 
-@pytest.mark.parametrize(
-    ("place", "mode", "said"),
-    [
-        ("", 0o700, None),
-        ("", 0o777, "mode 777 and must have 700"),
-        ("", 0o1777, "must have 700"),
-        ("", 0o755, "must have 700"),
-        ("", 0o770, "must have 700"),
-        ("..", 0o777, "every user"),
-        ("..", 0o1777, None),
-        ("__pycache__", 0o777, None),  # nobody else gets there
-    ],
-)
-def test_a_folder_is_trusted_where_it_is_for_the_user_alone(place, mode, said, folder):
-    (folder / place).resolve().chmod(mode)
-    reason = objection(folder)
-    assert reason is None if said is None else said in reason
+def check_refused(folder, said):
+    with pytest.warns(RuntimeWarning, match=said):
+        private = cache_folder()
+    assert private != folder
+    assert private.stat().st_mode & 0o777 == 0o700
+    assert cache_folder() == private, "the same folder for the whole process"
 
 
-@pytest.mark.parametrize("private", [True, False])
-def test_a_group_may_write_that_has_no_other_member(private, folder, monkeypatch):
-    folder.parent.chmod(0o770)
-    monkeypatch.setattr(module, "_is_private_group", lambda gid: private)
-    assert (objection(folder) is None) == private
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o755, 0o770, 0o701])
+def test_a_private_folder_takes_the_place_of_one_that_is_open_to_others(mode, folder):
+    assert cache_folder() == folder
+    folder.chmod(mode)
+    check_refused(folder, f"has mode {mode:o} and must have 700")
 
 
-def test_the_group_of_a_user_is_private_only_without_other_members(monkeypatch):
-    user = module.pwd.getpwuid(os.geteuid())
-    for name, members, private in [
-        (user.pw_name, [], True),
-        (user.pw_name, [user.pw_name], True),
-        (user.pw_name, ["somebody"], False),
-        ("users", [], False),
-    ]:
-        group = module.grp.struct_group((name, "x", user.pw_gid, members))
-        monkeypatch.setattr(module.grp, "getgrgid", lambda gid, group=group: group)
-        assert module._is_private_group(user.pw_gid) == private
-        assert not module._is_private_group(user.pw_gid + 1)
-
-
-def test_a_link_is_followed(folder, tmp_path):
+def test_a_link_is_followed(folder, tmp_path, monkeypatch):
     link = tmp_path / "link"
     link.symlink_to(folder)
-    assert objection(link) is None
+    monkeypatch.setenv("SST_ROS_CACHE", str(link))
+    assert cache_folder() == link
     folder.chmod(0o777)
-    assert "must have 700" in objection(link)
+    check_refused(link, "must have 700")
 
 
 def test_what_belongs_to_another_user_is_not_trusted(folder, monkeypatch):
@@ -92,31 +68,15 @@ def test_what_belongs_to_another_user_is_not_trusted(folder, monkeypatch):
         os.chown(folder, OTHER_USER, OTHER_USER)
     else:
         monkeypatch.setattr(module.os, "geteuid", lambda: OTHER_USER)
-    assert "belongs to another user" in objection(folder)
-
-
-def test_a_private_folder_takes_the_place_of_one_that_is_not_trusted(folder, monkeypatch):
-    monkeypatch.setenv("SST_ROS_CACHE", str(folder))
-    assert cache_folder() == folder
-    folder.parent.chmod(0o777)
-    module._private_folder.cache_clear()
-    with pytest.warns(RuntimeWarning, match="can be written by every user"):
-        private = cache_folder()
-    assert private != folder
-    assert private.stat().st_mode & 0o777 == 0o700
-    assert cache_folder() == private, "the same folder for the whole process"
+    check_refused(folder, "belongs to another user")
 
 
 def test_a_new_folder_is_for_the_user_alone(tmp_path, monkeypatch):
-    old = os.umask(0)
-    try:
-        monkeypatch.delenv("SST_ROS_CACHE", raising=False)
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a" / "b"))
-        found = cache_folder()
-    finally:
-        os.umask(old)
+    monkeypatch.delenv("SST_ROS_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a" / "b"))
+    found = cache_folder()
     assert found == tmp_path / "a" / "b" / "sst_ros"
-    assert all(path.stat().st_mode & 0o077 == 0 for path in (found, *found.parents[:2]))
+    assert found.stat().st_mode & 0o077 == 0
 
 
 class Planted:

@@ -11,7 +11,7 @@ from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.plot import compare
 from sst_ros.plot.compare import PICTURES, differences, draw_comparison
-from sst_ros.recording import signals
+from sst_ros.recording.recording import read_signals
 
 
 def shifted(bags, entries, by_ns, turn=0.0, keep=lambda sample: True):
@@ -43,7 +43,7 @@ def pair(tmp_path_factory, bags, example2):
     folder = tmp_path_factory.mktemp("pair")
     first = bags.write(folder / "first", example2)
     changed = shifted(bags, example2, 5 * 10**9, 0.02, lambda k: not 20 <= k < 30)
-    return [signals.read(bag) for bag in (first, bags.write(folder / "second", changed))]
+    return [read_signals(bag) for bag in (first, bags.write(folder / "second", changed))]
 
 
 def test_the_differences_are_those_that_were_made(pair):
@@ -64,7 +64,7 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
         for entry in example2
         if entry.topic != bags.APPLIED
     ]
-    other = signals.read(bags.write(tmp_path / "bag", late))
+    other = read_signals(bags.write(tmp_path / "bag", late))
     assert other.start_ns == pair[0].start_ns
     assert differences([pair[0], other]).iloc[0].tolist()[:2] == [1, 151]
 
@@ -83,7 +83,7 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
 
 def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(pair, bags, example2, tmp_path):
     poor = bags.write(tmp_path / "poor", [e for e in example2 if e.topic == bags.APPLIED])
-    runs = [*pair, signals.read(poor)]
+    runs = [*pair, read_signals(poor)]
     paths, missing = draw_comparison(runs, tmp_path / "out", ["gamma", "torques"])
     assert [path.stem for path in paths[::2]] == ["compare_gamma", "compare_torques"]
     assert missing == {"gamma": "without poor: no joint_states there"}

@@ -11,7 +11,8 @@ from matplotlib import image
 from sst_ros import __main__ as cli
 from sst_ros.plot import motion, pictures
 from sst_ros.plot.pictures import PICTURES, draw_run
-from sst_ros.recording import recording, signals
+from sst_ros.recording import recording
+from sst_ros.recording.recording import read_signals
 from sst_ros.report import timing
 from sst_ros.scene import scene
 from sst_ros.simulation.simulation import Simulation
@@ -27,7 +28,7 @@ def sway(t):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, bags, example2):
     path = bags.write(tmp_path_factory.mktemp("plot") / "bag", bags.tracked(example2, sway))
-    return signals.read(path)
+    return read_signals(path)
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +111,7 @@ def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
 
 def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
     loaded = scene.load("friction")
-    run = signals.read(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
+    run = read_signals(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
     kinetic, potential = motion.energies(run, loaded)
     left = kinetic + potential - kinetic[0] - potential[0] - motion.work(run).sum(axis=1)
     assert left[-1] < -1e-3 * kinetic.max()
@@ -119,7 +120,7 @@ def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
 
 def test_work_is_not_known_beyond_a_lost_torque(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.APPLIED, 80)]
-    run = signals.read(bags.write(tmp_path / "bag", kept))
+    run = read_signals(bags.write(tmp_path / "bag", kept))
     known = np.isfinite(motion.work(run)).all(axis=1)
     assert known[:80].all() and not known[80:].any()
 
@@ -135,7 +136,7 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
 
 
 def whole(bag):
-    run = signals.read(bag)
+    run = read_signals(bag)
     return run, run.scene
 
 

@@ -15,7 +15,7 @@ from sst_ros.errors import InputError
 from sst_ros.recording import bag_writer, recording
 from sst_ros.recording.bag_reader import McapFile
 from sst_ros.recording.bag_writer import BagWriter, recover
-from sst_ros.recording.signals import export
+from sst_ros.recording.recording import export
 from sst_ros.scene import scene
 
 CHUNK = 40

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.extras import MissingDependency
-from sst_ros.recording.signals import export, frame
+from sst_ros.recording.recording import export, read_signals
 from sst_ros.recording.topic_tables import TABLES, TIMES
 
 pytest.importorskip("pandas")
@@ -109,7 +109,7 @@ def read_rows(form, bag, folder, table):
     if form == "parquet":
         rows = parquet.read_table(folder / f"{table}.parquet").to_pylist()
     else:
-        rows = frame(bag, table).reset_index().to_dict("records")
+        rows = read_signals(bag).table(table).reset_index().to_dict("records")
     return [{key: None if x != x else x for key, x in row.items()} for row in rows]
 
 
@@ -132,14 +132,14 @@ def test_tables_hold_the_bits_of_the_bag(form, lossy, bags, tmp_path):
 
 
 def test_columns_say_what_they_are(lossy, tmp_path):
-    samples, text = frame(lossy), "rate of gamma [rad/s], from joint_states"
+    samples, text = read_signals(lossy).table(), "rate of gamma [rad/s], from joint_states"
     name = "gamma_dot_1_rad_per_s"
     assert set(samples.attrs) == {samples.index.name, *samples.columns}
     assert samples.attrs[name] == text
     field = parquet.read_schema(export(lossy, tmp_path, "parquet")[0]).field(name)
     assert field.metadata == {b"unit": b"rad/s", b"description": text.encode()}
     with pytest.raises(InputError, match="must be one of those in the bag: samples, ticks"):
-        frame(lossy, "moments")
+        read_signals(lossy).table("moments")
 
 
 def test_a_bag_of_one_topic_is_enough(written, bags, example2, tmp_path, capsys):
@@ -169,7 +169,7 @@ def test_a_moment_over_a_tick_is_a_column(written, bags, example2):
         object.__setattr__(fresh.content, "joint_names", names)
         return fresh
 
-    table = frame(written([moved(entry) for entry in example2]), "ticks")
+    table = read_signals(written([moved(entry) for entry in example2])).table("ticks")
     assert {name: table[name].unique().tolist() for name in moment} == {
         name: [value] for name, value in moment.items()
     }
