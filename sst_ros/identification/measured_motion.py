@@ -151,7 +151,7 @@ def _average(law: TorqueProfile, t: Array) -> Array:
     """Means over the intervals of t of a torque that is constant between its breaks, (n - 1, 3)."""
     if len(t) < 2:
         return np.empty((0, 3))
-    breaks = law.breaks()
+    breaks = law.kinks()
     edges = np.union1d(t, breaks[(breaks > t[0]) & (breaks < t[-1])])
     middle = 0.5 * (edges[1:] + edges[:-1])
     areas = law.values(middle) * np.diff(edges)[:, None]

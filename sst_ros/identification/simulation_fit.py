@@ -248,7 +248,7 @@ class Sensitivities:
             return np.concatenate([derivative[0], (flow + into * (chain * scale)).ravel()])
 
         tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
-        breaks = torque.breaks()
+        breaks = torque.kinks()
         inside = breaks[(breaks > 0.0) & (breaks < t[-1])]
         ends = np.unique(np.concatenate([inside, [t[-1]]]))
         rows, begin = np.empty((len(t), len(y))), 0.0

@@ -26,7 +26,8 @@ from sst_ros.integration.compiled_method import Method
 from sst_ros.integration.methods import DORMAND_PRINCE, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulate import GAUSS, simulate
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulate_gauss import GAUSS
 
 LONGEST_S, WHOLE_RUN_S = 10.0, 1.0
 """The advice is for a run of the scene's duration, but not of more than LONGEST_S [s]; of

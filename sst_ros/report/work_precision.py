@@ -37,8 +37,8 @@ from sst_ros.report.reference_solution import (
 from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulate import GAUSS, simulate
-from sst_ros.simulation.simulate_gauss import GaussMotion, NotSmooth
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulate_gauss import GAUSS, GaussMotion, NotSmooth
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series

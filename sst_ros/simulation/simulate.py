@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,20 +15,20 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import InputError, Problem
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
-from sst_ros.simulation.simulate_gauss import CollocatedMotion, NotSmooth
+from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
 from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
-from sst_ros.simulation.simulation import AUTO, INTEGRATORS, NANOSECONDS
+from sst_ros.simulation.simulation import AUTO, INTEGRATORS
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
+    FeedbackTorque,
     FunctionTorque,
-    SineProfile,
     TorqueFunction,
     TorqueProfile,
     profile_of,
 )
-from sst_ros.simulation.trajectory import Array, Trajectory
+from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.state import NANOSECONDS, Array
 
-GAUSS = "gauss"
 METHODS = (*INTEGRATORS, GAUSS)
 
 TorqueInput: TypeAlias = (
@@ -123,26 +124,37 @@ def prepare(
 
     """
     given = with_initial(scene_of(scene), initial)
-    profile = _profile(given, torque)
-    span = _span(given, duration)
+    if torque is None:
+        torque = (0.0, 0.0, 0.0) if given.torque is None else given.torque
+    profile = profile_of(torque)
+    length = given.duration if duration is None else duration
+    if length is None:
+        _refuse("duration", None, "must be given: the scene has none")
+    span = _nanoseconds("duration", length)
     period = _checked_period(control_period, profile, span)
     times = _times(t_eval, span)
-    _refuse_bad_options(method, tolerance)
-    jumps, longest = _breaks(breaks, span), _longest(max_step)
+    if method not in METHODS:
+        _refuse("method", method, "must be one of " + ", ".join(METHODS))
+    if not (isinstance(tolerance, (int, float)) and 0.0 < tolerance < math.inf):
+        _refuse("tolerance", tolerance, "must be a number > 0 [rad]")
+    jumps = _ascending(breaks)
+    if jumps is None:
+        _refuse("breaks", breaks, "must be ascending times [s]")
+    numeric = isinstance(max_step, (int, float)) and not isinstance(max_step, bool)
+    if max_step is not None and not (numeric and max_step > 0.0):
+        _refuse("max_step", max_step, "must be a number > 0 [s]")
+    inside = jumps[(jumps > 0.0) & (jumps < span / NANOSECONDS)]
+    longest = math.inf if max_step is None else float(max_step)
+    task = Task(given, profile, span, period, method, tolerance, inside, longest, times)
     reason = ""
     if method in (AUTO, GAUSS):
         try:
-            if len(jumps) or longest < span / NANOSECONDS:
-                raise NotSmooth("collocation takes no breaks and no max_step")
-            motion = CollocatedMotion(given, profile, span, period, tolerance, method == GAUSS)
+            return PreparedRun(CollocatedMotion(task).run)
         except NotSmooth as error:
             if method == GAUSS:
-                raise InputError("simulate", [Problem("method", method, str(error))]) from None
+                _refuse("method", method, str(error))
             reason = f" (auto: {error})"
-        else:
-            return PreparedRun(lambda _: motion.trajectory(times))
-    task = Task(given, profile, span, period, method, tolerance, jumps, longest)
-    return PreparedRun(lambda progress: integrate(task, reason, times, progress))
+    return PreparedRun(partial(integrate, task, reason))
 
 
 class PreparedRun:
@@ -159,19 +171,8 @@ class PreparedRun:
         return self._run(progress)
 
 
-def _profile(scene: Scene, torque: TorqueInput) -> TorqueProfile | FeedbackFunction:
-    if torque is not None:
-        return profile_of(torque)
-    return profile_of((0.0, 0.0, 0.0)) if scene.torque is None else SineProfile(scene.torque)
-
-
-def _span(scene: Scene, duration: float | None) -> int:
-    """Length of the motion [ns]."""
-    length = scene.duration if duration is None else duration
-    if length is None:
-        allowed = "must be given: the scene has none"
-        raise InputError("simulate", [Problem("duration", None, allowed)])
-    return _nanoseconds("duration", length)
+def _refuse(name: str, value: object, allowed: str) -> NoReturn:
+    raise InputError("simulate", [Problem(name, value, allowed)]) from None
 
 
 def _nanoseconds(name: str, value: Any) -> int:
@@ -180,21 +181,19 @@ def _nanoseconds(name: str, value: Any) -> int:
     except (TypeError, ValueError):
         seconds = math.nan
     if not (math.isfinite(seconds) and 1e-9 <= seconds <= 9e9):
-        allowed = "must be a number from 1e-9 to 9e9 [s]"
-        raise InputError("simulate", [Problem(name, value, allowed)])
+        _refuse(name, value, "must be a number from 1e-9 to 9e9 [s]")
     return round(seconds * NANOSECONDS)
 
 
-def _checked_period(period: float | None, profile: Any, span: int) -> int | None:
+def _checked_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
     if period is None:
         return None
-    if isinstance(profile, TorqueProfile) and not isinstance(profile, FunctionTorque):
-        allowed = "is for a function; give none for numbers and profiles"
-        raise InputError("simulate", [Problem("control_period", period, allowed)])
+    if not isinstance(profile, (FunctionTorque, FeedbackTorque)):
+        _refuse("control_period", period, "is for a function; give none for numbers and profiles")
     found = _nanoseconds("control_period", period)
     if span > MOST_PERIODS * found:
-        allowed = f"must be at least {span / NANOSECONDS / MOST_PERIODS:.3g} s for this duration"
-        raise InputError("simulate", [Problem("control_period", period, allowed)])
+        least = span / NANOSECONDS / MOST_PERIODS
+        _refuse("control_period", period, f"must be at least {least:.3g} s for this duration")
     return found
 
 
@@ -208,22 +207,6 @@ def _ascending(values: ArrayLike) -> Array | None:
     return numbers if fits else None
 
 
-def _breaks(breaks: ArrayLike, span: int) -> Array:
-    """Return the times of jumps inside the motion [s]."""
-    times = _ascending(breaks)
-    if times is None:
-        raise InputError("simulate", [Problem("breaks", breaks, "must be ascending times [s]")])
-    return times[(times > 0.0) & (times < span / NANOSECONDS)]
-
-
-def _longest(max_step: float | None) -> float:
-    if max_step is None:
-        return math.inf
-    if isinstance(max_step, (int, float)) and not isinstance(max_step, bool) and max_step > 0.0:
-        return float(max_step)
-    raise InputError("simulate", [Problem("max_step", max_step, "must be a number > 0 [s]")])
-
-
 def _times(t_eval: ArrayLike | None, span: int) -> np.ndarray | None:
     """Return the times of the samples [ns]."""
     if t_eval is None:
@@ -234,14 +217,4 @@ def _times(t_eval: ArrayLike | None, span: int) -> np.ndarray | None:
         if rounded[0] >= 0 and rounded[-1] <= span and np.all(np.diff(rounded) > 0):
             return rounded
     allowed = f"must be ascending times from 0 to {span / NANOSECONDS:g} s, a nanosecond apart"
-    raise InputError("simulate", [Problem("t_eval", t_eval, allowed)])
-
-
-def _refuse_bad_options(method: str, tolerance: float) -> None:
-    problems = []
-    if method not in METHODS:
-        problems.append(Problem("method", method, "must be one of " + ", ".join(METHODS)))
-    if not (isinstance(tolerance, (int, float)) and 0.0 < tolerance < math.inf):
-        problems.append(Problem("tolerance", tolerance, "must be a number > 0 [rad]"))
-    if problems:
-        raise InputError("simulate", problems)
+    _refuse("t_eval", t_eval, allowed)

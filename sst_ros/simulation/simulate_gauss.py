@@ -17,13 +17,16 @@ from sst_ros.dynamics.limits import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event, limit_distances
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, tables
-from sst_ros.integration.global_error import orientation_distance
+from sst_ros.integration.propagator import orientation_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.simulation.simulate_steps import Task
 from sst_ros.simulation.simulation import start_of
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamp
+
+GAUSS = "gauss"
 
 NEAR = 0.05
 """Distance above which no limit is met between nodes that resolve the motion to the tolerance."""
@@ -89,6 +92,7 @@ class GaussMotion:
         self.count, self.iterations, self.error = self._settings(tolerance)
         self.h = duration / self.count
         self._motion = self._prepared(self.count, self.iterations)
+        self._single = self._prepared(1, self.iterations + 1)
         self._lock = threading.Lock()
         self.samples = self.run()
 
@@ -151,10 +155,6 @@ class GaussMotion:
             return self._torque.values(times)
         return np.tile(self._torque, (len(times), 1))
 
-    @cached_property
-    def _single(self) -> PreparedMotion:
-        return self._prepared(1, self.iterations + 1)
-
     def _inside(self, k: int, x: float) -> Sequence[float]:
         """State x [s] after step k began."""
         begin: list[float] = self.samples[k].tolist()
@@ -176,25 +176,21 @@ class GaussMotion:
     def _settings(self, tolerance: float) -> tuple[int, int, float]:
         """Choose steps and iterations that reach the tolerance at the least cost; their error."""
         fine = max(_ROUNDING, 0.01 * tolerance)
-        count, end = self._converged(fine)
-        if not end:
-            raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
-        best: tuple[int, int, int, float] | None = None
+        count, end = self._converge(tolerance, fine)
+        cost, best = math.inf, (count, _MOST_ITERATIONS, fine)
         for iterations in _ITERATIONS:
             steps = count
             while steps > 0:
-                if best is None or steps * iterations < best[0]:
-                    error = self._error(steps, iterations, end)
+                if steps * iterations < cost:
+                    error = _apart(self._end(steps, iterations), end)
                     if not error <= 0.5 * max(tolerance, 2.0 * _ROUNDING):
                         break
-                    best = steps * iterations, steps, iterations, error
+                    cost, best = steps * iterations, (steps, iterations, max(error, _ROUNDING))
                 steps = min(steps - 1, int(0.82 * steps))
-        if best is None:
-            return count, _MOST_ITERATIONS, fine
-        return best[1], best[2], max(best[3], _ROUNDING)
+        return best
 
-    def _converged(self, fine: float) -> tuple[int, list[float]]:
-        """Double the steps until two ends are the same to `fine`; no end where they never are."""
+    def _converge(self, tolerance: float, fine: float) -> tuple[int, list[float]]:
+        """Double the steps until two ends are the same to `fine`; return them and the last end."""
         count, before, distance = 1, [math.nan] * 7, math.inf
         while count <= self._finest:
             end = self._end(count, _MOST_ITERATIONS)
@@ -204,10 +200,7 @@ class GaussMotion:
             if count > _HOPELESS and not _SLOW * apart < distance:
                 break
             count, before, distance = 2 * count, end, apart
-        return count, []
-
-    def _error(self, count: int, iterations: int, reference: Sequence[float]) -> float:
-        return _apart(self._end(count, iterations), reference)
+        raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
 
     def _end(self, count: int, iterations: int) -> list[float]:
         """State at the end by so many steps and iterations, nan where it is not finite."""
@@ -242,33 +235,25 @@ def _collocation(
 
 
 class CollocatedMotion:
-    """A motion by collocation, prepared once.
+    """The motion of a task by collocation, prepared once.
 
-    Args:
-        scene: what moves.
-        law: torques that act.
-        span: length of the motion [ns].
-        period: control period [ns]; None where torques are not held.
-        tolerance: largest error estimate at the end [rad].
-        asked: the caller has chosen this method: compile it, and try hard.
+    Where the caller has chosen this method it is compiled, and tries hard.
 
     Raises:
         NotSmooth: the motion is not one for collocation; gives the reason.
 
     """
 
-    def __init__(
-        self, scene: Scene, law: Any, span: int, period: int | None, tolerance: float, asked: bool
-    ) -> None:
-        torque = _traced(scene, law, period)
-        lag = scene.lags
-        start = [*start_of(scene), *((0.0,) * 3 if lag else ())]
-        duration = span / NANOSECONDS
+    def __init__(self, task: Task) -> None:
+        torque = _traced(task)
+        self._task, asked = task, task.method == GAUSS
+        start = [*start_of(task.scene), *((0.0,) * 3 if task.scene.lags else ())]
+        duration = task.span / NANOSECONDS
         finest = _FINEST if asked else min(_FINEST, round(16 + _FINEST_PER_SECOND * duration))
+        how: Any = {"compiled": asked or None, "finest": finest}
         self._motion = motion = GaussMotion(
-            scene, torque, start, duration, tolerance, compiled=asked or None, finest=finest
+            task.scene, torque, start, duration, task.tolerance, **how
         )
-        self._scene, self._lag = scene, lag
         self._end, status, message = duration, 0, "reached the end"
         if motion.ending is not None:
             self._end, limit = motion.ending
@@ -282,16 +267,15 @@ class CollocatedMotion:
             "error_estimate": motion.error,
             "evaluations": motion.evaluations,
             "step": motion.h,
-            "law": law,
+            "law": task.torque,
             "energy_residual": partial(motion.energy_residual, self._end),
             "dense": motion.at,
         }
-        self._whole = None
-        if not status:
-            self._whole = self._trajectory(motion.grid, motion.samples)
+        self._whole = None if status else self._trajectory(motion.grid, motion.samples)
 
-    def trajectory(self, times: np.ndarray | None) -> Trajectory:
-        """Compute the motion; times [ns] of the samples, None for the ends of the steps."""
+    def run(self, _progress: bool) -> Trajectory:
+        """Compute the motion; it is too short for a bar."""
+        times = self._task.times
         if times is None and self._whole is not None:
             y = self._motion.run()
             y.flags.writeable = False
@@ -302,22 +286,24 @@ class CollocatedMotion:
         return self._trajectory(t, self._motion.at(t))
 
     def _trajectory(self, t: Array, y: Array) -> Trajectory:
-        torque = y[:, 7:10] if self._lag else self._motion.torque(t)
-        return Trajectory(self._scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
+        torque = y[:, 7:10] if self._task.scene.lags else self._motion.torque(t)
+        return Trajectory(self._task.scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
 
 
-def _traced(scene: Scene, law: Any, period: int | None) -> SineTorque | tuple[float, float, float]:
+def _traced(task: Task) -> SineTorque | tuple[float, float, float]:
     """Return the torque that is traced into the code, or three that are constant.
 
     Raises:
         NotSmooth: there is none, or the scene has jumps.
 
     """
-    limit = scene.torque_limit
-    if period is not None or not isinstance(law, (SineProfile, ConstantTorque)):
+    law, stroke, limit = task.torque, task.scene.stroke.at_end, task.scene.torque_limit
+    if len(task.breaks) or task.max_step < task.span / NANOSECONDS:
+        raise NotSmooth("collocation takes no breaks and no max_step")
+    if task.period is not None or not isinstance(law, (SineProfile, ConstantTorque)):
         raise NotSmooth("collocation takes constant torques and sines only")
-    if scene.stroke.at_end not in ("stop", "ignore"):
-        raise NotSmooth(f"collocation does not take a stroke with at_end: {scene.stroke.at_end}")
+    if stroke not in ("stop", "ignore"):
+        raise NotSmooth(f"collocation does not take a stroke with at_end: {stroke}")
     if isinstance(law, ConstantTorque):
         return clamp(law.torque, limit)
     if limit is not None and max(map(abs, law.sine.amplitude)) > limit:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import csv
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,17 +36,23 @@ class TorqueProfile:
         """Torques [N m] at times [s], shape (n,) -> (n, 3)."""
         raise NotImplementedError
 
-    def breaks(self) -> Array:
-        """Return the times [s] at which the torques or their derivatives jump, ascending."""
-        return np.empty(0)
+    def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
+        """Return the times [s] at which torques, or their derivatives, jump or pass a limit [N m].
 
-    def crossings(self, limit: float | None, end: float) -> Array:
-        """Return the times from 0 to `end` [s] at which a torque passes the limit [N m], if any."""
+        Those of a limit are the ones from 0 to `end` [s].
+        """
         return np.empty(0)
 
     def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
-        """Torques [N m] on [begin, end], between which no break lies; ends belong to it."""
+        """Torques [N m] on [begin, end], between which no kink lies; ends belong to it."""
         return self
+
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+        """Return what acts there as a `Propagator` takes it, by the dynamics of the scene."""
+        piece = self.between(begin, end)
+        if isinstance(piece, ConstantTorque):
+            return piece.torque
+        return piece.sine if isinstance(piece, SineProfile) else piece
 
     def record(self) -> dict[str, Any]:
         """Numbers from which `profile_from` builds the same profile."""
@@ -87,7 +93,7 @@ class SineProfile(TorqueProfile):
         """See `TorqueProfile`."""
         return self.sine.values(t)
 
-    def crossings(self, limit: float | None, end: float) -> Array:
+    def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
         found = [np.empty(0)]
         rows = zip(self.sine.amplitude, self.sine.frequency, self.sine.phase, strict=True)
@@ -145,21 +151,16 @@ class PolynomialTorque(TorqueProfile):
         total[(t < self.x[0]) | (t > self.x[-1])] = 0.0
         return total
 
-    def breaks(self) -> Array:
+    def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
-        return self.x
-
-    def crossings(self, limit: float | None, end: float) -> Array:
-        """See `TorqueProfile`."""
-        found = []
-        for piece in range(0 if limit is None else self.c.shape[1]):
-            length = self.x[piece + 1] - self.x[piece]
+        found, bounds = [self.x], () if limit is None else (limit, -limit)
+        for piece, length in enumerate(np.diff(self.x)):
             for coefficients in self.c[:, piece].T:
-                for bound in (limit, -limit) if limit is not None else ():
+                for bound in bounds:
                     roots = np.roots([*coefficients[:-1], coefficients[-1] - bound])
                     real = roots.real[abs(roots.imag) <= 1e-9 * length]
                     found.append(self.x[piece] + real[(real > 0.0) & (real < length)])
-        return np.unique(np.concatenate(found)) if found else np.empty(0)
+        return np.unique(np.concatenate(found))
 
     def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
         """See `TorqueProfile`."""
@@ -195,6 +196,21 @@ class FunctionTorque(TorqueProfile):
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
+
+
+class FeedbackTorque(TorqueProfile):
+    """A function f(t, state) of the time [s] and the `State` -> three torques [N m]."""
+
+    def __init__(self, function: FeedbackFunction) -> None:
+        self._function = function
+
+    def __call__(self, t: float, state: Any = None) -> Vector3:
+        """Torques [N m] at a time [s] and a state."""
+        return three(self._function(t, state), f"torque({t:g})")
+
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+        """See `TorqueProfile`."""
+        return StateFeedback(self, dynamics)
 
 
 class LostTorque(TorqueProfile):
@@ -252,14 +268,44 @@ class TorqueTable(TorqueProfile):
             InputError: the file cannot be read; lists every bad row with its line.
 
         """
-        return cls(*_csv_table(Path(path)))
+        origin, header = str(path), ["time", "tau_1", "tau_2", "tau_3"]
+        try:
+            with Path(path).open(newline="", encoding="utf-8") as file:
+                reader = csv.reader(file)
+                found = next(reader, None)
+                lines = [(reader.line_num, row) for row in reader]
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            problem = Problem("csv", origin, f"must be readable ({error})")
+            raise InputError(origin, [problem]) from None
+        names = None if found is None else [name.strip() for name in found]
+        if names != header:
+            raise InputError(origin, [Problem("header", names, "must be " + ", ".join(header), 1)])
+        rows: list[list[float]] = []
+        problems: list[Problem] = []
+        for line, entries in lines:
+            try:
+                row = [float(entry) for entry in entries]
+            except ValueError:
+                row = []
+            if len(row) != 4 or not np.all(np.isfinite(row)):
+                problems.append(Problem("row", entries, "must be four finite numbers", line))
+            elif rows and row[0] <= rows[-1][0]:
+                allowed = f"must be > {rows[-1][0]:g} s, the last"
+                problems.append(Problem("time", row[0], allowed, line))
+            else:
+                rows.append(row)
+        if not (problems or rows):
+            problems.append(Problem("rows", 0, "must be one or more"))
+        if problems:
+            raise InputError(origin, problems)
+        return cls([row[0] for row in rows], [row[1:] for row in rows])
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         rows = np.vstack([np.zeros(3), self.torques])
         return np.asarray(rows[np.searchsorted(self.times, t, side="right")])
 
-    def breaks(self) -> Array:
+    def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
         return self.times
 
@@ -272,8 +318,8 @@ class TorqueTable(TorqueProfile):
         return {"kind": "table", "times": self.times.tolist(), "torques": self.torques.tolist()}
 
 
-def profile_of(torque: Any) -> TorqueProfile | FeedbackFunction:
-    """Turn what a user gives into a profile, or leave a function of time and state as it is.
+def profile_of(torque: Any) -> TorqueProfile:
+    """Turn what a user gives into a profile.
 
     Raises:
         InputError: it is none of the kinds that `simulate` allows.
@@ -286,59 +332,22 @@ def profile_of(torque: Any) -> TorqueProfile | FeedbackFunction:
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
         return PolynomialTorque(torque.c, torque.x)  # scipy.interpolate.PPoly, CubicSpline
     if callable(torque):
-        function: FeedbackFunction = torque
-        return function if _arguments(torque) == 2 else FunctionTorque(torque)
+        return FeedbackTorque(torque) if _arguments(torque) == 2 else FunctionTorque(torque)
     return ConstantTorque(three(torque, "torque"))
-
-
-def smooth_pieces(
-    law: TorqueProfile | FeedbackFunction, dynamics: Dynamics, ends: Sequence[float]
-) -> Iterator[tuple[float, float, Torque]]:
-    """Yield begin and end [s] of pieces of a motion, and what acts there, without a kink inside.
-
-    Args:
-        law: torques that are asked for.
-        dynamics: of the scene.
-        ends: those of the pieces, ascending, see `kinks_of`.
-
-    """
-    for begin, end in pairwise(ends):
-        if not isinstance(law, TorqueProfile):
-            yield begin, end, StateFeedback(refusing(law), dynamics)
-            continue
-        piece = law.between(begin, end)
-        if isinstance(piece, SineProfile):
-            yield begin, end, piece.sine
-        else:
-            yield begin, end, piece.torque if isinstance(piece, ConstantTorque) else piece
-
-
-def kinks_of(law: TorqueProfile | FeedbackFunction, limit: float | None, end: float) -> Array:
-    """Return the times from 0 to `end` [s] at which a law has kinks, or passes the limit [N m]."""
-    if not isinstance(law, TorqueProfile):
-        return np.empty(0)
-    return np.concatenate([law.breaks(), law.crossings(limit, end)])
-
-
-def refusing(function: FeedbackFunction) -> Callable[[float, State], Vector3]:
-    """Refuse anything but three finite torques by the time of the call."""
-    return lambda t, state: three(function(t, state), f"torque({t:g})")
 
 
 def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
     """Build the profile that `TorqueProfile.record` has described."""
     if record is None:
         return None
-    more = {name: value for name, value in record.items() if name != "kind"}
-    if record["kind"] == "function":
+    kind, given = record["kind"], {name: x for name, x in record.items() if name != "kind"}
+    if kind == "function":
         return LostTorque()
-    if record["kind"] == "constant":
-        return ConstantTorque(three(more["torque"], "torque"))
-    if record["kind"] == "sine":
-        return SineProfile(SineTorque(**more))
-    if record["kind"] == "table":
-        return TorqueTable(more["times"], more["torques"])
-    return PolynomialTorque(more["c"], more["x"])
+    if kind == "constant":
+        return ConstantTorque(three(given["torque"], "torque"))
+    if kind == "sine":
+        return SineProfile(SineTorque(**given))
+    return TorqueTable(**given) if kind == "table" else PolynomialTorque(given["c"], given["x"])
 
 
 def _arguments(function: Callable[..., Any]) -> int:
@@ -358,39 +367,3 @@ def _arguments(function: Callable[..., Any]) -> int:
         allowed = "must be a function f(t) or f(t, state)"
         raise InputError("simulate", [Problem("torque", function, allowed)])
     return 2 if len(needed) == 2 else 1
-
-
-def _csv_table(path: Path) -> tuple[list[float], list[list[float]]]:
-    origin = str(path)
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            lines = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(origin, [Problem("csv", origin, f"must be readable ({error})")]) from None
-    header = ["time", "tau_1", "tau_2", "tau_3"]
-    found = [name.strip() for name in lines[0][1]] if lines else None
-    if found != header:
-        raise InputError(origin, [Problem("header", found, "must be " + ", ".join(header), 1)])
-    rows: list[list[float]] = []
-    problems = list(_bad_rows(lines[1:], rows))
-    if not problems and not rows:
-        problems.append(Problem("rows", 0, "must be one or more"))
-    if problems:
-        raise InputError(origin, problems)
-    return [row[0] for row in rows], [row[1:] for row in rows]
-
-
-def _bad_rows(lines: list[tuple[int, list[str]]], rows: list[list[float]]) -> Iterator[Problem]:
-    """Yield the faults of a table, and append what is right to `rows`."""
-    for line, entries in lines:
-        try:
-            row = [float(entry) for entry in entries]
-        except ValueError:
-            row = []
-        if len(row) != 4 or not np.all(np.isfinite(row)):
-            yield Problem("row", entries, "must be four finite numbers", line)
-        elif rows and row[0] <= rows[-1][0]:
-            yield Problem("time", row[0], f"must be > {rows[-1][0]:g} s, the last", line)
-        else:
-            rows.append(row)

@@ -10,10 +10,11 @@ import contextlib
 import html
 import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,24 +32,13 @@ from sst_ros.mechanism import frames, kinematics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.torque_profile import (
-    FeedbackFunction,
-    LostTorque,
-    TorqueProfile,
-    kinks_of,
-    profile_from,
-    smooth_pieces,
-)
+from sst_ros.simulation.torque_profile import LostTorque, TorqueProfile, profile_from, profile_of
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
-
-__all__ = ["Array", "Law", "Trajectory"]
-
-Law: TypeAlias = TorqueProfile | FeedbackFunction
 
 _KEY, _FORMAT = "sst_ros", 1
 _JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
@@ -90,8 +80,8 @@ class Trajectory:
             number, or a function that computes it when it is asked for.
         evaluations: how often the derivative was evaluated.
         step: mean length of the steps of the integrator [s], nan if unknown.
-        law: torques that act between the samples, for `at`; by default each is held over the
-            interval that ends at its sample.
+        law: torques that act between the samples, for `at`, as `simulate` takes them; by default
+            each is held over the interval that ends at its sample.
         dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
 
     Raises:
@@ -115,7 +105,7 @@ class Trajectory:
         energy_residual: float | Callable[[], float] = float("nan"),
         evaluations: int = 0,
         step: float = float("nan"),
-        law: Law | None = None,
+        law: Any = None,
         dense: Callable[[Array], Array] | None = None,
     ) -> None:
         self.scene = scene
@@ -127,7 +117,8 @@ class Trajectory:
         self.status, self.message, self.method = status, message, method
         self.error_estimate, self._residual = error_estimate, energy_residual
         self.evaluations, self.step = evaluations, step
-        self.law, self.dense = law, dense
+        self.law: TorqueProfile | None = None if law is None else profile_of(law)
+        self.dense = dense
 
     def _refuse_misfits(self) -> None:
         t, problems = self.t, []
@@ -270,11 +261,10 @@ class Trajectory:
         if path.exists() and not overwrite:
             allowed = "exists; overwrite=True replaces it"
             raise InputError("save", [Problem("path", str(path), allowed)])
-        known = self.law.record() if isinstance(self.law, TorqueProfile) else {"kind": "function"}
         about = self._figures() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
-            "torque": None if self.law is None else known,
+            "torque": None if self.law is None else self.law.record(),
         }
         units = {name: {"unit": unit} for name, unit in UNITS.items()}
         try:
@@ -384,53 +374,34 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
     """States (quaternion, body rate, acting torque) at times [s] inside, shape (m, 10)."""
     if trajectory.dense is not None:
         states = trajectory.dense(times)
-        if states.shape[1] > 7 or not isinstance(trajectory.law, TorqueProfile):
+        if states.shape[1] > 7 or trajectory.law is None:
             return states
         limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
+    t, law, size = trajectory.t, trajectory.law, len(trajectory._dynamics.state)
     samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
-    before = np.searchsorted(trajectory.t, times, side="right") - 1
-    found = samples[before]
-    gap = _Gap(trajectory)
-    for k in np.unique(before[times > trajectory.t[before]]):
-        rows = np.flatnonzero((before == k) & (times > trajectory.t[k]))
-        order = rows[np.argsort(times[rows], kind="stable")]
-        found[order] = gap.states(int(k), samples[k], times[order])
+    before = np.searchsorted(t, times, side="right") - 1
+    found, kinks = samples[before], np.empty(0)
+    if law is not None:
+        kinks = np.unique(law.kinks(trajectory.scene.torque_limit, float(t[-1])))
+    propagator = Propagator(
+        trajectory.scene, DOP853.name, _ACCURACY,
+        compiled=False, budget=EvaluationBudget(), limits=False,
+    )  # fmt: skip
+    moment = (0.0,) * (len(propagator.dynamics.drive) - 3)
+    for k in np.unique(before[times > t[before]]):
+        rows = np.flatnonzero((before == k) & (times > t[k]))
+        asked, reached = np.unique(times[rows]), dict[float, tuple[float, ...]]()
+        at, now, last = propagator.begin(samples[k, :size].tolist()), float(t[k]), asked[-1]
+        inside = kinks[(kinks > now) & (kinks < last)].tolist()
+        for begin, end in pairwise([now, *inside, float(last)]):
+            torque: Torque = tuple(trajectory.torque[k + 1].tolist())
+            if law is not None:
+                torque = law.acting(begin, end, propagator.dynamics)
+            torque = propagator.torque.acting(torque)
+            for time in (*asked[(asked > begin) & (asked < end)].tolist(), end):
+                at, _ = propagator.advance(at, now, time - now, 1, torque, moment)
+                now = time
+                reached[time] = (*at.y[:7], *propagator.acting(torque, time, at))
+        found[rows] = [reached[time] for time in times[rows].tolist()]
     return found
-
-
-class _Gap:
-    """Propagates from a sample towards the next one."""
-
-    def __init__(self, trajectory: Trajectory) -> None:
-        self._propagator = Propagator(
-            trajectory.scene, DOP853.name, _ACCURACY,
-            compiled=False, budget=EvaluationBudget(), limits=False,
-        )  # fmt: skip
-        self._t, self._torque, self._law = trajectory.t, trajectory.torque, trajectory.law
-        if self._law is not None:
-            limit, end = trajectory.scene.torque_limit, float(self._t[-1])
-            self._kinks = np.unique(kinks_of(self._law, limit, end))
-
-    def states(self, k: int, sample: Array, times: Array) -> Array:
-        """States at ascending times between sample k and the next, shape (m, 10)."""
-        propagator, dynamics = self._propagator, self._propagator.dynamics
-        moment = (0.0,) * (len(dynamics.drive) - 3)
-        at, t = propagator.begin(sample[: len(dynamics.state)].tolist()), float(self._t[k])
-        found = []
-        for _, end, asked in self._pieces(k, t, float(times[-1])):
-            torque = propagator.torque.acting(asked)
-            for time in (*times[(times > t) & (times < end)].tolist(), end):
-                if time > t:
-                    at, _ = propagator.advance(at, t, time - t, 1, torque, moment)
-                    t = time
-                    found.append((t, *at.y[:7], *propagator.acting(torque, t, at)))
-        states = np.array(found)
-        return np.asarray(states[np.searchsorted(states[:, 0], times), 1:])
-
-    def _pieces(self, k: int, begin: float, end: float) -> Iterable[tuple[float, float, Torque]]:
-        if self._law is None:
-            first, second, third = self._torque[k + 1].tolist()
-            return [(begin, end, (first, second, third))]
-        inside = self._kinks[(self._kinks > begin) & (self._kinks < end)].tolist()
-        return smooth_pieces(self._law, self._propagator.dynamics, [begin, *inside, end])
