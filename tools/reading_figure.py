@@ -55,11 +55,8 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     found = take_readings(data, scene)
     motion = Sensitivities(scene, names, found.torque)
     values = np.array([value_of(scene, key) for key in names], dtype=float)
-    states, slopes = motion.run(values, t)
-    _, by_pose = found.residual(scene, states)
-    poses = slopes[found.times_of_residuals][:, :4]
-    matrix = np.einsum("ri,rip->rp", by_pose, poses) * values
-    _, singular, rows = np.linalg.svd(matrix)
+    _, slopes = motion.compare(values, found)
+    _, singular, rows = np.linalg.svd(slopes * values)
     relative = 1.0 / np.maximum(singular, 1e-9)
     labels = (describe_combination(row, tuple(words.values())) for row in rows)
     powers = [re.sub(r"(\S+)\^([+-][\d.]+)", r"$\1^{\2}$", label) for label in labels]

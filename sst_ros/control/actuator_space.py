@@ -14,6 +14,8 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import trace
@@ -38,7 +40,7 @@ from sst_ros.mechanism.generic_math import (
     sin,
     sqrt,
 )
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.state import Quaternion, Vector3
 
 ROUNDING = 4e-16
@@ -51,7 +53,7 @@ _STEPS = 20
 
 _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
 
-_CARRIAGES = tuple(f"r{k}{axis}" for k in range(3) for axis in "xyz")
+_POSE = (*QUATERNION, *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 
 class ActuatorSpaceMap:
@@ -69,7 +71,7 @@ class ActuatorSpaceMap:
         )
         self._star = compile_program(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
         self._posture = compile_program(trace(self._of_posture, QUATERNION))
-        self._newton = compile_program(trace(self.newton_step, (*QUATERNION, *_CARRIAGES)))
+        self._newton = compile_program(trace(self.newton_step, _POSE))
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
@@ -147,6 +149,28 @@ class ActuatorSpaceMap:
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:
         """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
         return compile_for_arrays(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
+
+    @cached_property
+    def postures(self) -> Callable[..., tuple[Any, ...]]:
+        """See `posture`: seven arrays (n,) of a quaternion, four arrays (n,)."""
+        return compile_for_arrays(trace(self._of_posture, QUATERNION))
+
+    def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
+        """Quaternions (n, 4) at gamma (n, 3) by some steps of Newton's method from `near` (n, 4).
+
+        A singularity leaves numbers that are not finite, and a warning of NumPy.
+        """
+        newton, carriages = self._newton_of_arrays, self.carriages(gamma.T)
+        q: Any = near.T
+        for _ in range(steps):
+            *q, first, second, third = newton(*q, *carriages)
+            if np.abs((first, second, third)).max(initial=0.0) < 1e-9:
+                break  # quadratic: the next step would be rounding
+        return np.stack(q, axis=1)
+
+    @cached_property
+    def _newton_of_arrays(self) -> Callable[..., tuple[Any, ...]]:
+        return compile_for_arrays(trace(self.newton_step, _POSE))
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]

@@ -33,7 +33,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from sst_ros.identification.parameters import STANDARD, bodies_of
-from sst_ros.identification.regressor import BaseParameters
 from sst_ros.mechanism.geometry import Array
 
 EXACT = 1e-12
@@ -135,15 +134,21 @@ class Cone(NamedTuple):
 
 
 def find_consistent_values(
-    names: Sequence[str], given: Array, base: BaseParameters, fit: LinearFit, reach: float
+    names: Sequence[str],
+    given: Array,
+    transform: Array,
+    estimate: Array,
+    root: Array,
+    reach: float,
 ) -> tuple[Array, float]:
     """Values of all parameters that fit the base parameters, those of bodies that can exist.
 
     Args:
         names: of the parameters, length p.
         given: their values in the scene, shape (p,).
-        base: the combinations that were estimated.
-        fit: their estimates.
+        transform: the combinations that were estimated, shape (b, p).
+        estimate: of the combinations, shape (b,).
+        root: R of its covariance (R^T R)^-1, shape (b, b).
         reach: distance from O within which centres of mass lie [m].
 
     Returns:
@@ -151,9 +156,9 @@ def find_consistent_values(
         are fitted than without the constraints.
 
     """
-    cones = list(cones_of(tuple(names), reach))
-    rows = np.vstack([fit.root @ base.transform, np.diag(1.0 / scales(names, given))])
-    right = np.concatenate([fit.root @ fit.estimate, given / scales(names, given)])
+    cones, sizes = list(cones_of(tuple(names), reach)), scales(names, given)
+    rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
+    right = np.concatenate([root @ estimate, given / sizes])
     values = _lift_into_interior(cones, given)
     for barrier in BARRIERS:
         for _ in range(_NEWTON_STEPS):
@@ -167,7 +172,7 @@ def find_consistent_values(
                 if size < 1e-12:  # rounding: the step cannot get better
                     break
             values = values + size * step
-    off = fit.root @ (base.transform @ values - fit.estimate)
+    off = root @ (transform @ values - estimate)
     return values, float(off @ off)
 
 
@@ -179,15 +184,9 @@ def scales(names: Sequence[str], given: Array) -> Array:
         body, _, part = name.partition(".")
         trace = sum(abs(values.get(f"{body}.inertia.{axis}", 0.0)) for axis in ("xx", "yy", "zz"))
         mass = abs(values.get(f"{body}.mass", 0.0)) or 1.0
-        size = abs(values[name])
-        if part.startswith("inertia"):
-            size = trace
-        elif part.startswith("moment"):
-            size = float(np.sqrt(mass * trace))
-        elif part == "mass":
-            size = mass
-        sizes.append(size or 1.0)
-    return np.array(sizes)
+        of_body = {"mass": mass, "moment": np.sqrt(mass * trace), "inertia": trace}
+        sizes.append(of_body.get(part.partition(".")[0], abs(values[name])) or 1.0)
+    return np.array(sizes, dtype=float)
 
 
 def _cost(cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float) -> float:
@@ -231,14 +230,16 @@ def _newton_step(
 def cones_of(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
     """Yield what must be positive semidefinite."""
     index = {name: i for i, name in enumerate(names)}
+    # [[m r 1, h], [h^T, m r]] of m and h.
+    centre = np.stack([reach * np.eye(4), *_PSEUDO[1:4]])
     for body in bodies_of(names):
+        inertia = [index[f"{body}.{part}"] for part in STANDARD[4:]]
         if f"{body}.mass" in index:
-            places = [index[f"{body}.{part}"] for part in STANDARD]
-            yield Cone(places, _PSEUDO)
-            yield Cone(places[:4], _centre(reach))
+            moment = [index[f"{body}.{part}"] for part in STANDARD[:4]]
+            yield Cone(moment + inertia, _PSEUDO)
+            yield Cone(moment, centre)
         else:
-            places = [index[f"{body}.{part}"] for part in STANDARD[4:]]
-            yield Cone(places, _PSEUDO[4:, :3, :3])
+            yield Cone(inertia, _PSEUDO[4:, :3, :3])
     for name, place in index.items():
         if name.startswith(("friction", "springs", "actuators")):
             yield Cone([place], np.ones((1, 1, 1)))
@@ -270,13 +271,6 @@ def _pseudo_basis() -> Array:
         inertia[i, j] = inertia[j, i] = 1.0
         result[row, :3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     return np.asarray(result)
-
-
-def _centre(reach: float) -> Array:
-    """Basis of [[m r 1, h], [h^T, m r]] for m and h, shape (4, 4, 4)."""
-    basis = _PSEUDO[:4].copy()
-    basis[0] = reach * np.eye(4)
-    return np.asarray(basis)
 
 
 _PSEUDO = _pseudo_basis()

@@ -31,10 +31,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, MotionRefused, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.regressor import BaseParameters, Regressor, find_base_parameters
-from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kinematics import rotate
 from sst_ros.scene.scene import Scene
 
 POINTS = 12
@@ -110,51 +107,51 @@ def design(
         problems.append(Problem("harmonics", harmonics, "must be from 3 to 30"))
     if problems:
         raise InputError("identify design", problems)
-    series = FourierSeries(duration, harmonics, np.array(scene.initial.gamma))
+    series = _Series(duration, harmonics, np.array(scene.initial.gamma))
     cost = _Cost(scene, parameters.select_names(scene, requested), series)
     free = np.random.default_rng(seed).normal(size=series.size)
-    free *= _FIRST / np.abs(series.at(free, series.times)[0] - series.centre).max()
+    free *= _FIRST / np.abs(series.at(free)[0] - series.centre).max()
     found = minimize(cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
     for _ in range(40):
         designed = _write_scene(scene, series, found)
         plan = examine_motion(reference_motion(designed), designed)
-        if not plan.problems and cost.violation(found) <= 0.0:
-            return cost.result(designed, found)
+        columns, excess = cost.evaluate(found)
+        if not plan.problems and excess.max() <= 0.0:
+            # Of 1000 samples a second.
+            information = columns.T @ columns * (1000.0 * duration / len(series.times))
+            deviation = np.sqrt(np.diag(np.linalg.inv(information)))
+            return ExcitingMotion(designed, cost.base, _condition(columns), deviation)
         found = 0.95 * found
     room = Problem("initial.gamma", scene.initial.gamma, "leaves no room for a motion about it")
     raise MotionRefused("identify design", plan.problems or [room])
 
 
-class FourierSeries:
-    """Angles of three actuators as functions of free numbers.
-
-    Args:
-        duration: of the motion [s].
-        harmonics: of the series.
-        centre: angles at both ends [rad], shape (3,).
+class _Series:
+    """Angles of three actuators as a Fourier series of free numbers.
 
     Attributes:
+        centre: angles at both ends [rad], shape (3,).
         size: number of the free numbers.
         times: samples [s], POINTS in a period of the highest harmonic, shape (n,).
 
     """
 
     def __init__(self, duration: float, harmonics: int, centre: Array) -> None:
-        self.duration, self.centre = duration, centre
+        self.centre = centre
         n = np.arange(1, harmonics + 1)
-        self._frequency = 2.0 * np.pi * n / duration
         rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
         rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
         self._basis = null_space(rest)
         self.size = 3 * self._basis.shape[1]
         count = POINTS * harmonics
         self.times = np.arange(1, count + 1) * duration / count
+        self._w = 2.0 * np.pi * n / duration
+        self._s, self._c = (f(np.outer(self.times, self._w)) for f in (np.sin, np.cos))
 
-    def at(self, free: Array, t: Array) -> tuple[Array, Array, Array]:
-        """Angles [rad] and two derivatives at the times t [s], each shape (len(t), 3)."""
+    def at(self, free: Array) -> tuple[Array, Array, Array]:
+        """Angles [rad] and two derivatives at the samples, each shape (n, 3)."""
         sine, cosine = np.split(self._basis @ free.reshape(-1, 3), 2)
-        w = self._frequency
-        s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
+        s, c, w = self._s, self._c, self._w
         return (
             self.centre + s @ sine + c @ cosine,
             (c * w) @ sine - (s * w) @ cosine,
@@ -162,111 +159,88 @@ class FourierSeries:
         )
 
 
-class _Cost:
-    """What the optimisation minimises."""
+def _condition(columns: Array) -> float:
+    """Condition number with columns of length one, 1e15 at most."""
+    lengths = np.linalg.norm(columns, axis=0)
+    return min(float(np.linalg.cond(columns / np.maximum(lengths, 1e-300))), 1e15)
 
-    def __init__(self, scene: Scene, names: tuple[str, ...], series: FourierSeries) -> None:
+
+class _Cost:
+    """What the optimisation minimises, of the free numbers of a series."""
+
+    def __init__(self, scene: Scene, names: tuple[str, ...], series: _Series) -> None:
         self._scene, self._series = scene, series
         self._regressor = Regressor(scene, names)
-        self._base = find_base_parameters(self._regressor)
+        self.base = find_base_parameters(self._regressor)
         self._values = parameters.values(scene, names)
         self._geometry = Geometry.of(scene)
-        self._rates = ActuatorSpaceMap(self._geometry).star_rates
-        x, y, z, w = initial_state(scene, self._geometry)[:4]
-        self._start = rotation_matrix((x, y, z, w))
-        if not self._base.chosen:
+        self._coordinates = ActuatorSpaceMap(self._geometry)
+        self._start = np.array(initial_state(scene, self._geometry)[:4])
+        if not self.base.chosen:
             allowed = "must determine something: no torque depends on these parameters"
             raise InputError("identify design", [Problem("parameters", list(names), allowed)])
 
     def __call__(self, free: Array) -> float:
-        """Cost of free numbers of the series."""
-        columns, excess = self._states(free)
-        values = self._spread(columns)
-        log_deviation = -0.5 * float(np.mean(np.log(np.maximum(values[1], 1e-300))))
-        return float(np.log(values[0])) + log_deviation + _PENALTY * float(np.sum(excess**2))
+        columns, excess = self.evaluate(free)
+        information = np.linalg.svd(columns, compute_uv=False) ** 2
+        log_deviation = -0.5 * float(np.mean(np.log(np.maximum(information, 1e-300))))
+        penalty = _PENALTY * float(np.sum(excess**2))
+        return float(np.log(_condition(columns))) + log_deviation + penalty
 
-    def violation(self, free: Array) -> float:
-        """Return the largest excess over a limit, as a share of its range."""
-        return float(self._states(free)[1].max())
-
-    def result(self, designed: Scene, free: Array) -> ExcitingMotion:
-        """Return the design with its condition and standard deviations."""
-        columns, _ = self._states(free)
-        matrix = columns.reshape(-1, columns.shape[-1])
-        samples = 1000.0 * self._series.duration / len(columns)
-        covariance = np.linalg.inv(matrix.T @ matrix * samples)
-        condition = self._spread(columns)[0]
-        return ExcitingMotion(designed, self._base, condition, np.sqrt(np.diag(covariance)))
-
-    def _spread(self, columns: Array) -> tuple[float, Array]:
-        """Condition with columns of length one, and the eigenvalues of the information."""
-        matrix = columns.reshape(-1, columns.shape[-1])
-        lengths = np.linalg.norm(matrix, axis=0)
-        condition = min(float(np.linalg.cond(matrix / np.maximum(lengths, 1e-300))), 1e15)
-        return condition, np.asarray(np.linalg.svd(matrix, compute_uv=False) ** 2)
-
-    def _states(self, free: Array) -> tuple[Array, Array]:
-        """Regressor of the base parameters, and excesses over the limits where positive."""
-        gamma, rate, acceleration = self._series.at(free, self._series.times)
-        rotation = self._rotations(gamma)
-        quaternion = np.asarray(quaternion_of(rotation))
+    def evaluate(self, free: Array) -> tuple[Array, Array]:
+        """Return the regressor of b base parameters, shape (3 n, b), and excesses over limits."""
+        gamma, rate, acceleration = self._series.at(free)
         with np.errstate(all="ignore"):
-            star = np.stack(self._rates(*quaternion.T, *rate.T, *acceleration.T), axis=1)
-            known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])
-        torque = known + columns @ self._values
-        excess = np.concatenate(list(self._excesses(gamma, rate, acceleration, rotation, torque)))
+            quaternion = self._orientations(gamma)
+            star = self._coordinates.star_rates(*quaternion.T, *rate.T, *acceleration.T)
+            body = np.stack(star, axis=1)
+            known, columns = self._regressor(quaternion, body[:, :3], body[:, 3:])
+            torque = known + columns @ self._values
+            posture = np.stack(self._coordinates.postures(*quaternion.T), axis=1)
+        excess = np.concatenate(list(self._excesses(gamma, rate, acceleration, torque, posture)))
+        columns = self.base.of_columns(columns).reshape(-1, len(self.base.chosen))
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(excess))):
-            return np.ones_like(self._base.of_columns(columns)), np.array([1e3])
-        return self._base.of_columns(columns), np.maximum(excess, 0.0)
+            return np.ones_like(columns), np.array([1e3])
+        return columns, np.maximum(excess, 0.0)
 
     def _excesses(
-        self, gamma: Array, rate: Array, acceleration: Array, rotation: Array, torque: Array
+        self, gamma: Array, rate: Array, acceleration: Array, torque: Array, posture: Array
     ) -> Iterable[Array]:
         """Yield how far numbers lie beyond SHARE of their range, over the range."""
         geometry, actuators = self._geometry, self._scene.actuators
-        r = kinematics.carriage_directions(geometry, gamma)
-        mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotation)
-        for values, high in ((gamma, geometry.arc), (beta, np.full(3, geometry.beta_max))):
+        sines, beta, det_j2 = posture[:, :3], posture[:, 3:6], posture[:, 6:]
+        for values, high in ((gamma, geometry.arc), (beta, geometry.beta_max)):
             yield (np.abs(values / high - 0.5) - 0.5 * SHARE).ravel()
-        yield (LEAST_SINE - np.sin(mu)).ravel()
-        yield LEAST_SINE - np.abs(det_j2)
-        if actuators is not None:
-            for values, limit in (
-                (torque, actuators.torque_limit),
-                (rate, actuators.velocity_limit),
-                (acceleration, actuators.acceleration_limit),
-            ):
-                if limit is not None:
-                    yield (np.abs(values) / limit - SHARE).ravel()
+        yield LEAST_SINE - np.hstack([sines, np.abs(det_j2)]).ravel()
+        for values, name in (
+            (torque, "torque"),
+            (rate, "velocity"),
+            (acceleration, "acceleration"),
+        ):
+            if (limit := getattr(actuators, f"{name}_limit", None)) is not None:
+                yield (np.abs(values) / limit - SHARE).ravel()
 
-    def _rotations(self, gamma: Array) -> Array:
-        """R at each sample, followed from the centre along straight lines, all at once."""
-        rotation = np.broadcast_to(self._start, (len(gamma), 3, 3))
+    def _orientations(self, gamma: Array) -> Array:
+        """Quaternion at each sample, followed from the centre along straight lines, all at once."""
+        found, centre = np.tile(self._start, (len(gamma), 1)), self._series.centre
         for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
-            here = self._series.centre + part * (gamma - self._series.centre)
-            r = kinematics.carriage_directions(self._geometry, here)
-            for _ in range(5 if part == 1.0 else 2):
-                t = self._geometry.e @ np.swapaxes(rotation, -1, -2)
-                slope = cross(t, r) + 1e-12 * np.eye(3)  # no exception at a singularity
-                step = np.linalg.solve(slope, -np.sum(r * t, axis=-1)[..., None])[..., 0]
-                rotation = rotate(rotation, np.clip(step, -0.5, 0.5))
-        return np.asarray(rotation)
+            here = centre + part * (gamma - centre)
+            found = self._coordinates.orientations(found, here, 5 if part == 1.0 else 2)
+        return found
 
 
-def _write_scene(scene: Scene, series: FourierSeries, free: Array) -> Scene:
+def _write_scene(scene: Scene, series: _Series, free: Array) -> Scene:
     """Return the scene with the motion as waypoints, quintic between them."""
-    names = ("gamma", "gamma_dot", "gamma_ddot")
-    points = [
-        {"time": time, **dict(zip(names, row, strict=True))}
-        for time, *row in zip(series.times, *series.at(free, series.times), strict=True)
-    ]
-    points[-1] |= dict.fromkeys(names[1:], (0.0, 0.0, 0.0))
+    names = ("time", "gamma", "gamma_dot", "gamma_ddot")
+    rows = zip(series.times, *series.at(free), strict=True)
+    points = [dict(zip(names, row, strict=True)) for row in rows]
+    points[-1] |= dict.fromkeys(names[2:], (0.0, 0.0, 0.0))
     return scene.with_values(
         {
             "initial.gamma_dot": 0.0,
             "torque": None,
             "motion": {"waypoints": points},
-            "duration": series.duration,
+            "duration": series.times[-1],
             "provenance.motion": "designed to identify parameters: Fourier series",
         }
     )

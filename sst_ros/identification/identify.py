@@ -9,7 +9,7 @@ from typing import Any, Literal, overload
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.identification import Identification
-from sst_ros.identification.measured_motion import Measured
+from sst_ros.identification.measured_motion import Measured, open_data
 from sst_ros.identification.simulation_fit import SimulationFit, fit_simulation
 from sst_ros.identification.torque_fit import TorqueFit, fit_torques
 from sst_ros.scene.scene import Scene, scene_of
@@ -86,10 +86,7 @@ def identify(
     if method not in (INVERSE_DYNAMICS, SIMULATION):
         allowed = f"must be {INVERSE_DYNAMICS} or {SIMULATION}"
         raise InputError("identify", [Problem("method", method, allowed)])
-    if isinstance(data, (str, Path)):
-        from sst_ros.recording.recording import read  # needs rosbags, which other data do not
-
-        data = read(data)
+    data = open_data(data)
     known = scene if scene is not None else getattr(data, "scene", None)
     if known is None:
         raise InputError("identify", [Problem("scene", None, "must be given with arrays")])

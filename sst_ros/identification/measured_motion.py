@@ -90,61 +90,61 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
             too few samples.
 
     """
-    if isinstance(data, (str, Path)):
-        from sst_ros.recording.recording import read  # needs rosbags, which other data do not
-
-        data = read(data)
-    if isinstance(data, Mapping):
-        given = dict(data)
-    elif isinstance(data, Trajectory):
-        given = _take_trajectory(data)
-    elif hasattr(data, "ticks"):
-        given = _take_recording(data)
-    else:
-        allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
-        raise InputError("identify", [Problem("data", data, allowed)])
-    t, gamma, torque, gamma_dot = _check(given)
-    quaternion = given.get("quaternion")
-    held = bool(given.get("held", False))
+    data = open_data(data)
+    given = data if isinstance(data, Mapping) else _take_samples(data)
+    allowed = f"must be one of {', '.join(KEYS)}"
+    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
+    arrays, held = _read_arrays(given, problems), bool(given.get("held", False))
+    if not problems:
+        problems += _find_misfits(arrays, held)
+    if problems:
+        raise InputError("identify", problems)
+    t, torque = arrays["t"], arrays["torque"]
     if held and len(torque) == len(t):
         torque = torque[:-1]
     if delay:
         torque = _shift(t, torque, held, delay)
     limit = None if scene is None else scene.torque_limit
     saturated = np.abs(torque).max(axis=1) >= (np.inf if limit is None else limit * (1.0 - 1e-9))
-    start = None if quaternion is None else np.asarray(quaternion, dtype=float)
-    return MeasuredMotion(t, gamma, gamma_dot, torque, start, saturated)
+    rates, start = arrays.get("gamma_dot"), arrays.get("quaternion")
+    return MeasuredMotion(t, arrays["gamma"], rates, torque, start, saturated)
 
 
-def _take(motion: Trajectory, rows: Any = slice(None)) -> dict[str, Any]:
-    return {
+def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
+    """Read a recording if a path is given; return other data as they are."""
+    if not isinstance(data, (str, Path)):
+        return data
+    from sst_ros.recording.recording import read  # needs rosbags, which other data do not
+
+    return read(data)
+
+
+def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
+    """Take a simulated motion, or a recorded run while it has torques."""
+    law: Any
+    if isinstance(data, Trajectory):
+        motion, law, rows = data, data.law, np.full(len(data.t), True)
+    elif hasattr(data, "ticks"):
+        motion, ticks = data.trajectory, data.ticks
+        begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
+        rows = (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12)
+        # With a lag the recorded effort is the torque at the joint, behind that of the tick.
+        law = "sampled" if data.scene.lags else TorqueTable(begins, ticks.torque)
+    else:
+        allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
+        raise InputError("identify", [Problem("data", data, allowed)])
+    given = {
         "t": motion.t[rows],
         "gamma": np.unwrap(motion.gamma[rows], axis=0),
         "gamma_dot": motion.gamma_dot[rows],
         "torque": motion.torque[rows],
         "quaternion": next(iter(motion.quaternion[rows]), None),
     }
-
-
-def _take_trajectory(motion: Trajectory) -> dict[str, Any]:
-    """Take a simulated motion; torques without a law are held to their sample, see `Trajectory`."""
-    given = _take(motion)
-    if isinstance(motion.law, (TorqueTable, ConstantTorque)):
-        given |= {"torque": _average(motion.law, motion.t), "held": True}
-    elif motion.law is None:
-        given |= {"torque": motion.torque[1:], "held": True}
+    if isinstance(law, (TorqueTable, ConstantTorque)):
+        given |= {"torque": _average(law, given["t"]), "held": True}
+    elif law is None:  # torques are held to their sample, see `Trajectory`
+        given |= {"torque": given["torque"][1:], "held": True}
     return given
-
-
-def _take_recording(recording: Recording) -> dict[str, Any]:
-    """Take a recorded run from the first sample that has an orientation and a torque after it."""
-    ticks, motion = recording.ticks, recording.trajectory
-    begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
-    given = _take(motion, (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12))
-    if recording.scene.lags:
-        # The lag is between the tick's torque and the joint; the recorded effort is behind it.
-        return given
-    return given | {"torque": _average(TorqueTable(begins, ticks.torque), given["t"]), "held": True}
 
 
 def _average(law: TorqueProfile, t: Array) -> Array:
@@ -153,34 +153,22 @@ def _average(law: TorqueProfile, t: Array) -> Array:
         return np.empty((0, 3))
     breaks = law.kinks()
     edges = np.union1d(t, breaks[(breaks > t[0]) & (breaks < t[-1])])
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    areas = law.values(middle) * np.diff(edges)[:, None]
-    total = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
-    at = np.searchsorted(edges, t)
+    areas = law.values(0.5 * (edges[1:] + edges[:-1])) * np.diff(edges)[:, None]
     # Sums over one interval each: a difference of long sums would lose digits.
-    if len(edges) == len(t):
-        return np.asarray(areas / np.diff(edges)[:, None])
-    return np.asarray(np.diff(total[at], axis=0) / np.diff(t)[:, None])
+    total = np.add.reduceat(areas, np.searchsorted(edges, t[:-1]), axis=0)
+    return np.asarray(total / np.diff(t)[:, None])
 
 
 def _shift(t: Array, torque: Array, held: bool, delay: float) -> Array:
     """Torques as they acted, `delay` earlier than they were measured; the last ones are held."""
     if held:
         total = np.vstack([np.zeros(3), np.cumsum(torque * np.diff(t)[:, None], axis=0)])
-        late = np.stack([np.interp(t + delay, t, column) for column in total.T], axis=1)
-        return np.asarray(np.diff(late, axis=0) / np.diff(t)[:, None])
+        return np.diff(_shift(t, total, False, delay), axis=0) / np.diff(t)[:, None]
     return np.stack([np.interp(t + delay, t, column) for column in torque.T], axis=1)
 
 
-def _check(given: Mapping[str, Any]) -> tuple[Array, Array, Array, Array | None]:
-    """Arrays of a mapping.
-
-    Raises:
-        InputError: lists every fault.
-
-    """
-    allowed = f"must be one of {', '.join(KEYS)}"
-    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
+def _read_arrays(given: Mapping[str, Any], problems: list[Problem]) -> dict[str, Array]:
+    """Arrays of a mapping; what is wrong joins the problems."""
     arrays: dict[str, Array] = {}
     for key in ("t", "gamma", "torque", "gamma_dot", "quaternion"):
         value = given.get(key)
@@ -193,14 +181,9 @@ def _check(given: Mapping[str, Any]) -> tuple[Array, Array, Array, Array | None]
         except (TypeError, ValueError):
             problems.append(Problem(key, value, "must be numbers"))
             continue
-        if not np.all(np.isfinite(arrays[key])):
-            bad = np.argwhere(~np.isfinite(arrays[key]))[0]
-            problems.append(Problem(f"{key}{bad.tolist()}", "not finite", "must be finite numbers"))
-    if not problems:
-        problems += _find_misfits(arrays, bool(given.get("held", False)))
-    if problems:
-        raise InputError("identify", problems)
-    return arrays["t"], arrays["gamma"], arrays["torque"], arrays.get("gamma_dot")
+        for bad in np.argwhere(~np.isfinite(arrays[key]))[:1].tolist():
+            problems.append(Problem(f"{key}{bad}", "not finite", "must be finite numbers"))
+    return arrays
 
 
 def _find_misfits(arrays: Mapping[str, Array], held: bool) -> Iterator[Problem]:
@@ -237,30 +220,30 @@ class Readings:
     deviation: Array | None
     torque: TorqueProfile
 
-    def residual(self, scene: Scene, states: Array) -> tuple[Array, Array]:
-        """Return computed less read numbers in standard deviations, and slopes by the quaternion.
+    def residual(self, scene: Scene, states: Array, slopes: Array) -> tuple[Array, Array]:
+        """Return computed less read numbers, in standard deviations, and how they change.
+
+        Args:
+            scene: the manipulator.
+            states: at the times, shape (n, m).
+            slopes: derivatives of the states by p parameters, shape (n, m, p).
 
         Returns:
-            Residuals of the r readings, shape (r,), and slopes, shape (r, 4), in order of time;
-            those of a time follow each other.
+            Residuals of the r readings, shape (r,), and their derivatives, shape (r, p), in order
+            of time; those of a time follow each other.
 
         """
+        count = len(self.t)
         found = compile_observables(scene)(*states[:, :4].T)
-        rows = np.stack([np.broadcast_to(row, len(self.t)) for row in found]).reshape(
-            5, -1, len(self.t)
-        )
-        off = rows[0, list(self.columns)].T - self.values
+        rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
+        value, *by_pose = rows[:, list(self.columns)]
+        off = value.T - self.values
         angle = np.array(self.columns) < 6
         off[:, angle] = np.angle(np.exp(1j * off[:, angle]))
         deviation = np.ones_like(off) if self.deviation is None else self.deviation
-        slopes = np.moveaxis(rows[1:, list(self.columns)], 0, -1).swapaxes(0, 1)
+        changes = np.einsum("qcn,nqp->ncp", np.stack(by_pose), slopes[:, :4])
         there = np.isfinite(self.values)
-        return (off / deviation)[there], (slopes / deviation[:, :, None])[there]
-
-    @property
-    def times_of_residuals(self) -> NDArray[np.intp]:
-        """Rows of `t` of the residuals, shape (r,)."""
-        return np.nonzero(np.isfinite(self.values))[0]
+        return (off / deviation)[there], (changes / deviation[:, :, None])[there]
 
 
 def take_readings(data: Measured, scene: Scene) -> Readings:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, Program, with_jacobian
+from sst_ros.dynamics.expression import Expression, with_jacobian
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
@@ -58,14 +58,6 @@ class Regressor:
         self._geometry = Geometry.of(scene)
         self._traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
 
-    @cached_property
-    def program(self) -> Program:
-        """Three torques, then their derivatives by each parameter of the dynamics."""
-        symbols = tuple(f"p{i}" for i in range(len(self._traced)))
-        return with_jacobian(
-            self._torques, (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols), symbols
-        )
-
     def __call__(self, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
         """Evaluate at n states.
 
@@ -79,24 +71,24 @@ class Regressor:
 
         """
         count = len(quaternion)
-        states = (*quaternion.T, *rate.T, *acceleration.T)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
         at = [float(name.startswith("springs")) for name in self._traced]
-        found = self._function(*states, *at)
-        rows = [np.broadcast_to(row, (count,)) for row in found]
+        found = self._function(*quaternion.T, *rate.T, *acceleration.T, *at)
+        rows = np.stack([np.broadcast_to(row, (count,)) for row in found]).reshape(-1, 3, count)
         columns = np.zeros((count, 3, len(self.names)))
-        for i, name in enumerate(self._traced):
-            part = np.stack(rows[3 * i + 3 : 3 * i + 6], axis=1)
-            columns[:, :, self.names.index(name)] = part
+        columns[:, :, [self.names.index(name) for name in self._traced]] = rows[1:].T
         for i, name in enumerate(self.names):
             if name.startswith("offset"):
                 columns[:, int(name[7]), i] = 1.0
         springs = [name.startswith("springs") for name in self.names]
-        return np.stack(rows[:3], axis=1) - columns[:, :, springs].sum(axis=2), columns
+        return rows[0].T - columns[:, :, springs].sum(axis=2), columns
 
     @cached_property
     def _function(self) -> Any:
-        return compile_for_arrays(self.program)
+        """Three torques, then their derivatives by each parameter of the dynamics."""
+        symbols = tuple(f"p{i}" for i in range(len(self._traced)))
+        inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
+        return compile_for_arrays(with_jacobian(self._torques, inputs, symbols))
 
     def _torques(self, *inputs: Any) -> tuple[Any, ...]:
         varied = [mark_present(symbol) for symbol in inputs[10:]]

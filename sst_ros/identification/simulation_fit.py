@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,11 +38,11 @@ from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compile_program
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.consistency import LinearFit, find_consistent_values, scales
+from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
 from sst_ros.identification.parameters import STANDARD, value_of
-from sst_ros.identification.regressor import BaseParameters, mark_present
+from sst_ros.identification.regressor import mark_present
 from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -96,27 +96,21 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     given = np.array([value_of(scene, name) for name in names], dtype=float)
     size = np.abs(given) + (given == 0.0)
 
-    last: dict[bytes, tuple[Array, Array]] = {}
-
-    def compare(x: Array) -> tuple[Array, Array]:
-        """Residuals and slopes at x times size; SciPy asks for them one after the other."""
-        key = x.tobytes()
-        if key not in last:
-            last.clear()
-            last[key] = _compare(motion, read, x * size)
-        return last[key]
+    @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
+    def compare(*x: float) -> tuple[Array, Array]:
+        return motion.compare(np.array(x) * size, read)
 
     found = least_squares(
-        lambda x: compare(x)[0],
+        lambda x: compare(*x)[0],
         given / size,
-        lambda x: compare(x)[1] * size,
+        lambda x: compare(*x)[1] * size,
         bounds=(np.where([_is_positive(name) for name in names], 1e-3, -np.inf), np.inf),
         xtol=1e-13,
         ftol=1e-13,
         gtol=None,
         max_nfev=100,
     )
-    off, slopes = compare(found.x)
+    off, slopes = compare(*found.x)
     fitted = found.x * size
     scale = np.where(fitted == 0.0, 1.0, fitted)  # changes of logarithms
     error = float(np.sqrt(np.mean(off**2)))
@@ -129,9 +123,7 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     relative[: len(singular)][some] = 1.0 / singular[some]
     finite = np.minimum(relative, 1e9)
     spread = (rows.T * finite**2) @ rows * np.outer(scale, scale)
-    adjusted, values, warnings = make_possible_scene(
-        scene, names, fitted, "identified by simulation"
-    )
+    adjusted, values, warnings = _make_possible_scene(scene, names, fitted)
     return SimulationFit(
         scene=adjusted,
         given=scene,
@@ -161,16 +153,6 @@ def describe_combination(row: Array, names: tuple[str, ...]) -> str:
     )
 
 
-def _compare(motion: Sensitivities, read: Readings, values: Array) -> tuple[Array, Array]:
-    """Residuals, shape (r,), and their derivatives by the parameters, shape (r, p)."""
-    begin = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
-    states, slopes = motion.run(values, begin)
-    count = len(read.t)
-    off, by_pose = read.residual(motion.scene, states[:count])
-    poses = slopes[:count][read.times_of_residuals][:, :4]
-    return off, np.einsum("ri,rip->rp", by_pose, poses)
-
-
 def _is_positive(name: str) -> bool:
     last = name.rpartition(".")[2]
     if name.startswith(("friction", "actuators", "stroke", "springs")):
@@ -197,18 +179,22 @@ class Sensitivities:
         self._torque, self._geometry = torque, Geometry.of(scene)
         problems = []
         for name in self.names:
-            allowed = ""
             if value_of(scene, name) is None:
                 allowed = "must be the key of a number that the scene has"
+                problems.append(Problem("parameters", name, allowed))
             elif name.startswith(GEOMETRY):
                 allowed = "is geometry, which is taken as known"
-            if allowed:
                 problems.append(Problem("parameters", name, allowed))
         if problems:
             raise InputError("identify", problems)
         self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]
-        lag = scene.lags
-        self._state = (*QUATERNION, *RATE, *(LAG if lag else ()))
+        self._state = (*QUATERNION, *RATE, *(LAG if scene.lags else ()))
+
+    def compare(self, values: Array, read: Readings) -> tuple[Array, Array]:
+        """Return the residuals of r readings, shape (r,), and their slopes, shape (r, p)."""
+        times = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
+        states, slopes = self.run(values, times)
+        return read.residual(self.scene, states[: len(read.t)], slopes[: len(read.t)])
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
         """Integrate the motion and its sensitivities.
@@ -339,10 +325,10 @@ def differentiate_damping(scene: Scene) -> float:
     return float((-4.0 / ((1.0 + e) ** 2 * slope) - d) / ((1.0 + e) * v))
 
 
-def make_possible_scene(
-    scene: Scene, names: Sequence[str], numbers: Array, note: str
+def _make_possible_scene(
+    scene: Scene, names: Sequence[str], numbers: Array
 ) -> tuple[Scene, Array, tuple[str, ...]]:
-    """Scene with other numbers by key; where its bodies cannot exist, that with the nearest ones.
+    """Scene with fitted numbers by key; where its bodies cannot exist, that with the nearest ones.
 
     Returns:
         The scene, the values in it, and a warning where they are others.
@@ -353,7 +339,7 @@ def make_possible_scene(
     """
     values = dict(zip(names, numbers.tolist(), strict=True))
     sections = sorted({re.split(r"[.\[]", name)[0] for name in names})
-    notes = {f"provenance.{section}": note for section in sections}
+    notes = {f"provenance.{section}": "identified by simulation" for section in sections}
     try:
         return scene.with_values({**values, **notes}), numbers, ()
     except InputError:
@@ -361,28 +347,14 @@ def make_possible_scene(
         if not inertias:
             raise
     changed = scene.with_values(values)
-    found = _find_nearest_inertias(changed, list(inertias), np.array(list(inertias.values())))
-    adjusted = changed.with_values({**found, **notes})
+    # All entries of the inertias to which those that were fitted belong.
+    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in inertias)
+    entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
+    chosen, given = [entries.index(name) for name in inertias], parameters.values(changed, entries)
+    root = np.diag(1e6 / scales(entries, given)[chosen])
+    kept, estimate = np.eye(len(entries))[chosen], np.array(list(inertias.values()))
+    found, _ = find_consistent_values(entries, given, kept, estimate, root, 1.0)
+    nearest = dict(zip(entries, found.tolist(), strict=True))
+    adjusted = changed.with_values({**nearest, **notes})
     warning = "no bodies have the inertias that fit best: the scene has the nearest"
     return adjusted, np.array([value_of(adjusted, name) for name in names], dtype=float), (warning,)
-
-
-def _find_nearest_inertias(scene: Scene, names: Sequence[str], numbers: Array) -> dict[str, float]:
-    """All entries of the inertias that some entries belong to, of bodies that can exist.
-
-    Args:
-        scene: the manipulator.
-        names: entries by key, as "star.inertia.zz".
-        numbers: their values [kg m^2], which are kept where that is possible.
-
-    """
-    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in names)
-    entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
-    given = parameters.values(scene, entries)
-    chosen = tuple(entries.index(name) for name in names)
-    base = BaseParameters(entries, chosen, np.eye(len(entries))[list(chosen)])
-    root = np.diag(1e6 / scales(entries, given)[list(chosen)])
-    covariance = np.asarray(np.linalg.inv(root) ** 2)
-    fit = LinearFit(numbers, covariance, root, np.ones(3), np.zeros((0, 3)), 1.0)
-    values, _ = find_consistent_values(entries, given, base, fit, 1.0)
-    return dict(zip(entries, values.tolist(), strict=True))

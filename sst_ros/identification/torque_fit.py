@@ -34,7 +34,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,10 +58,9 @@ from sst_ros.identification.regressor import (
     find_base_parameters,
     find_independent,
 )
-from sst_ros.mechanism import continuation, kinematics
-from sst_ros.mechanism.frames import cross, quaternion_of, rotation_matrix
+from sst_ros.mechanism import continuation
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kinematics import rotate
 from sst_ros.scene.scene import Scene
 
 STILL = 1e-6
@@ -82,7 +80,6 @@ MARGIN = 10.0
 STEP = 0.03
 """Length of gamma [rad] between poses that continuation follows; Newton's method takes the rest."""
 
-_NEWTON_STEPS = 8
 _EDGE = 8
 """Samples at both ends at which an interpolating quintic spline has not its full order."""
 
@@ -127,10 +124,8 @@ class TorqueFit(Identification):
 
         """
         measured = read_motion(data, self.given)
-        states, rows, group, _ = pose_equations(measured, Geometry.of(self.given), cutoff)
-        known, columns = self.regressor(*states)
-        torque = known + self.base.of_columns(columns) @ self.estimate
-        return torque.reshape(-1, group, 3).mean(axis=1), measured.torque[rows]
+        known, columns, rows, _ = form_equations(measured, self.regressor, cutoff)
+        return known + self.base.of_columns(columns) @ self.estimate, measured.torque[rows]
 
     def _notes(self) -> Iterator[str]:
         noise = ", ".join(f"{value:.3g}" for value in self.fit.noise)
@@ -169,10 +164,7 @@ def fit_torques(
         allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
         raise InputError("identify", [Problem("gamma", reached, allowed)])
     regressor = Regressor(scene, names)
-    states, rows, group, band = pose_equations(measured, Geometry.of(scene), cutoff)
-    known, columns = regressor(*states)
-    known = known.reshape(-1, group, 3).mean(axis=1)
-    columns = columns.reshape(-1, group, 3, len(names)).mean(axis=1)
+    known, columns, rows, band = form_equations(measured, regressor, cutoff)
     sound = ~measured.saturated[rows]
     warnings = []
     if not sound.all():
@@ -187,8 +179,9 @@ def fit_torques(
     samples = len(torque)
     if band is not None:
         period = float(np.median(np.diff(measured.t)))
+        sines = max(int(np.ceil(2.0 * band * period * samples)), len(names))
         torque, columns = (
-            project_on_sines(one, band, period, len(names)) for one in (torque, columns)
+            np.asarray(dst(one, type=1, norm="ortho", axis=0)[:sines]) for one in (torque, columns)
         )
     base = find_independent(columns, names)
     if not base.chosen:
@@ -199,7 +192,9 @@ def fit_torques(
     )
     given = parameters.values(scene, names)
     reach = max(scene.base.radius, scene.star.radius)
-    values, excess = find_consistent_values(names, given, base, fit, reach)
+    values, excess = find_consistent_values(
+        names, given, base.transform, fit.estimate, fit.root, reach
+    )
     whole = find_base_parameters(regressor)
     vague = fit.deviation > scales(names, given)[list(base.chosen)]
     return TorqueFit(
@@ -237,34 +232,21 @@ def _check_deviations(noise: Iterable[float]) -> Array:
     return numbers
 
 
-class Equations(NamedTuple):
-    """Where the equation of motion is asked for.
-
-    Attributes:
-        states: g m quaternions (n, 4), W (n, 3) and W_dot (n, 3) in {E}; those of a row of torques
-            follow each other, and its equation is their mean.
-        rows: of the torques that they belong to, shape (m,).
-        group: g.
-        band: frequency up to which the equations are sound where angles were filtered [Hz].
-
-    """
-
-    states: tuple[Array, Array, Array]
-    rows: NDArray[np.intp]
-    group: int
-    band: float | None
-
-
-def pose_equations(
-    measured: MeasuredMotion, geometry: Geometry, cutoff: float | None = None
-) -> Equations:
-    """States and the rows of torques that belong to them.
+def form_equations(
+    measured: MeasuredMotion, regressor: Regressor, cutoff: float | None
+) -> tuple[Array, Array, NDArray[np.intp], float | None]:
+    """Evaluate the equation of motion at the samples, or its means where torques are held.
 
     Args:
         measured: the motion.
-        geometry: base triangle and star.
-        cutoff: of the filter [Hz]; by default none where rates were measured, else MARGIN times
-            the bandwidth of the motion.
+        regressor: of the torques, p parameters.
+        cutoff: of the filter [Hz]; None for no filter where rates were measured, else for MARGIN
+            times the bandwidth of the motion.
+
+    Returns:
+        The known torques [N m], shape (m, 3); the regressor, shape (m, 3, p); the rows of the
+        measured torques that they belong to, shape (m,); and the frequency [Hz] up to which they
+        are sound where angles were filtered, else None.
 
     Raises:
         InputError: no assembly of the manipulator has these angles, or samples are not evenly
@@ -273,54 +255,39 @@ def pose_equations(
     """
     t = measured.t
     path, unsettled = _interpolate(measured, cutoff)
-    if measured.held:
+    times = t[:, None]
+    if measured.held:  # two Gauss points in each interval
         middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
         times = np.stack([middle - half, middle + half], axis=1)
-    else:
-        times = t[:, None]
     rows = np.arange(unsettled, len(times) - unsettled)
     gamma, rate, acceleration = path(times[rows].ravel())
-    quaternion = follow_orientations(geometry, gamma, measured.quaternion, measured.gamma[0])
-    found = ActuatorSpaceMap(geometry).star_rates(*quaternion.T, *rate.T, *acceleration.T)
-    star = np.stack(found, axis=1)
-    band = None
-    if cutoff is not None or measured.gamma_dot is None:
-        band = min(
-            BAND * find_bandwidth(float(np.median(np.diff(t))), measured.gamma), cutoff or np.inf
-        )
-    states = quaternion, star[:, :3], star[:, 3:]
-    return Equations(states, rows, int(times.shape[1]), band)
+    coordinates = ActuatorSpaceMap(Geometry.of(regressor.scene))
+    quaternion = _follow_orientations(coordinates, gamma, measured)
+    star = np.stack(coordinates.star_rates(*quaternion.T, *rate.T, *acceleration.T), axis=1)
+    found = regressor(quaternion, star[:, :3], star[:, 3:])
+    known, columns = (part.reshape(len(rows), -1, *part.shape[1:]).mean(axis=1) for part in found)
+    if cutoff is None and measured.gamma_dot is not None:
+        return known, columns, rows, None
+    bandwidth = find_bandwidth(float(np.median(np.diff(t))), measured.gamma)
+    return known, columns, rows, min(BAND * bandwidth, cutoff or np.inf)
 
 
-def follow_orientations(
-    geometry: Geometry, gamma: Array, quaternion: Array | None, first: Array
+def _follow_orientations(
+    coordinates: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion
 ) -> Array:
-    """Quaternions (n, 4) of the assembly mode at gamma (n, 3) that has `quaternion` at `first`.
-
-    Raises:
-        InputError: the angles are not those of this manipulator.
-
-    """
-    start = None if quaternion is None else rotation_matrix(quaternion)
-    points = np.vstack([first, gamma])
-    length = np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample."""
+    begin, first = measured.quaternion, measured.gamma[:1]
+    start = None if begin is None else rotation_matrix(begin)
+    length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
     known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
-    known = known[known < len(gamma)]
+    points = np.vstack([first, gamma[known[known < len(gamma)]]])
     try:
-        coarse = continuation.follow(geometry, np.vstack([first, gamma[known]]), start).rotation
+        coarse = continuation.follow(coordinates.geometry, points, start).rotation
     except (AssemblyError, continuation.BranchEnds) as error:
         allowed = f"must be angles of this manipulator ({error})"
-        raise InputError("identify", [Problem("gamma", first.tolist(), allowed)]) from None
+        raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
-    rotation, r = coarse[nearest], kinematics.carriage_directions(geometry, gamma)
-    for _ in range(_NEWTON_STEPS):
-        t = geometry.e @ np.swapaxes(rotation, -1, -2)
-        residual = np.sum(r * t, axis=-1)
-        step = np.linalg.solve(cross(t, r), -residual[..., None])[..., 0]
-        rotation = rotate(rotation, step)
-        if np.abs(step).max(initial=0.0) < 1e-9:  # quadratic: the next would be rounding
-            break
-    return np.asarray(quaternion_of(rotation))
+    return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
 
 
 def _interpolate(
@@ -373,20 +340,3 @@ def find_bandwidth(period: float, gamma: Array) -> float:
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
     frequencies = np.fft.rfftfreq(len(gamma), period)
     return float(frequencies[max(int(np.searchsorted(share, 1.0 - 1e-4)), 1)])
-
-
-def project_on_sines(rows: Array, highest: float, period: float, least: int) -> Array:
-    """Project rows of evenly spaced samples on the sines of low frequency.
-
-    Args:
-        rows: shape (n, ...).
-        highest: frequency of the sines [Hz].
-        period: of the samples [s].
-        least: number of sines, however low their frequency.
-
-    Returns:
-        Their components, shape (m, ...).
-
-    """
-    count = max(int(np.ceil(2.0 * highest * period * len(rows))), least)
-    return np.asarray(dst(rows, type=1, norm="ortho", axis=0)[:count])

@@ -14,7 +14,6 @@ from sst_ros.identification.consistency import (
     scales,
 )
 from sst_ros.identification.parameters import STANDARD
-from sst_ros.identification.regressor import BaseParameters
 
 NAMES = tuple(f"star.{part}" for part in STANDARD)
 
@@ -34,13 +33,16 @@ def of_points(rng, count=6):
     return np.array([masses.sum(), *(masses @ places), *six])
 
 
-def direct(names, noise=1e-3, rows=40, target=None, seed=0):
-    """Base parameters that are the parameters themselves, and their estimates."""
-    rng = np.random.default_rng(seed)
-    columns = rng.normal(size=(rows, 3, len(names)))
-    torque = columns @ target
-    base = BaseParameters(tuple(names), tuple(range(len(names))), np.eye(len(names)))
-    return base, fit_weighted(columns, torque, np.full(3, noise))
+def fitted(target, noise):
+    """Estimates of parameters that are base parameters themselves."""
+    columns = np.random.default_rng(0).normal(size=(40, 3, len(target)))
+    return fit_weighted(columns, columns @ target, np.full(3, noise))
+
+
+def consistent(names, given, fit, reach):
+    """The nearest values of bodies that can exist, and their chi^2."""
+    whole = np.eye(len(names))
+    return find_consistent_values(names, given, whole, fit.estimate, fit.root, reach)
 
 
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
@@ -55,8 +57,7 @@ def test_estimates_of_a_body_that_exists_are_not_changed(points):
     """Flat bodies, rods and points, which lie on the boundary, are reached too."""
     rng = np.random.default_rng(points)
     target, given = of_points(rng, points), of_points(rng)
-    base, fit = direct(NAMES, 1e-9, target=target)
-    values, excess = find_consistent_values(NAMES, given, base, fit, 1.0)
+    values, excess = consistent(NAMES, given, fitted(target, 1e-9), 1.0)
     assert np.abs(values - target).max() < 1e-9 * np.abs(target).max()
     assert excess < 1e-2
 
@@ -66,8 +67,8 @@ def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
     names = tuple(f"star.{part}" for part in STANDARD[4:])
     given = np.array([0.3, 0.3, 0.2, 0.0, 0.0, 0.0])
     target = np.array([0.1, 0.1, 0.4, 0.02, 0.0, 0.01])  # zz > xx + yy
-    base, fit = direct(names, 1e-2, target=target)
-    values, excess = find_consistent_values(names, given, base, fit, 1.0)
+    fit = fitted(target, 1e-2)
+    values, excess = consistent(names, given, fit, 1.0)
     assert excess > 25.0
     size = scales(names, given)
 
@@ -96,8 +97,7 @@ def test_a_centre_stays_within_reach_and_friction_is_not_negative():
     target = given.copy()
     target[1] = 0.5 * target[0]
     target[-1] = -0.1
-    base, fit = direct(names, 1e-1, target=target)
-    values, _ = find_consistent_values(names, given, base, fit, 0.3)
+    values, _ = consistent(names, given, fitted(target, 1e-1), 0.3)
     assert np.linalg.norm(values[1:4]) <= 0.3 * values[0]
     assert 0.0 < values[-1] < 1e-6
     assert np.linalg.eigvalsh(next(cones_of(NAMES, 0.3)).matrix(values))[0] > 0.0
