@@ -261,6 +261,10 @@ class Observer:
             if status.name.endswith(name)
         ]
 
+    def said(self, key):
+        """All values of a key; nodes have keys of their own, and one may say more often."""
+        return [status[key] for status in self.diagnostics() if key in status]
+
     def told(self, key, value, timeout=40.0):
         """Wait until the last status with this key says so; return all that it says then."""
         meets = value if callable(value) else lambda said: said == str(value)

@@ -4,6 +4,7 @@
 import math
 
 import pytest
+from rcl_interfaces.msg import Log
 from ros.conftest import NAMES, NODE
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -13,7 +14,9 @@ pytestmark = pytest.mark.ros
 
 def test_pause_step_and_resume(nodes, observer):
     """Over the services; test_run_loop.py has the state machine itself."""
-    nodes.run("simulator", scene="example1", real_time_factor=0.1)
+    # A tick a sample: where a busy machine ends the wait within one, that is a sample, too.
+    rates = {"rate": 500, "publish_rate": 500, "real_time_factor": 0.1}
+    nodes.run("simulator", scene="example1", **rates)
     observer.until(observer.samples, "samples")
     assert "running" in observer.call(Trigger, f"{NODE}/step").message
     assert observer.pause(True).success
@@ -31,6 +34,7 @@ def test_pause_step_and_resume(nodes, observer):
 
 
 def test_reset_set_state_and_what_is_refused(nodes, observer):
+    logged = observer.listen(Log, "/rosout")
     process = nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
     put = observer.publisher(JointState, f"{NODE}/set_state")
     start = list(observer.preview().position)
@@ -52,6 +56,8 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
     observer.command(0.1, 0.0, 0.0)
     observer.until(observer.samples, "samples")
     put.publish(JointState(name=NAMES, position=[0.7, 0.7, 0.7]))  # refused: it runs
+    running = "set_state: refused: pause or reset first"
+    observer.until(lambda: any(log.msg.startswith(running) for log in logged), "the refusal")
     last = observer.stamps()[-1]
     reply = observer.call(Trigger, f"{NODE}/reset")
     assert (reply.success, reply.message) == (True, "at the initial state, waiting")
@@ -67,10 +73,11 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
 
 
 def test_a_fault_is_held_still_until_a_reset(nodes, observer):
-    process = nodes.run("simulator", scene="example2_heavy")
+    process = nodes.run("simulator", scene="example2_heavy", command_timeout=0.0)
     observer.preview()
     observer.command(50.0, 0.0, 0.0)
     observer.phase("fault: ")
+    observer.until(observer.samples, "samples")
     observer.until(lambda: observer.stamp(observer.states[-1]) == 0, "the held state")
     held, sample = observer.states[-1], observer.samples()[-1]
     assert list(held.position) == list(sample.position)

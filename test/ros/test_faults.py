@@ -81,8 +81,8 @@ def test_bad_commands_are_dropped_whole_and_counted(nodes, observer, good, bad, 
     assert observer.torques()[-1] == GOOD
     status, _, err = nodes.stop(process)
     warnings = [line for line in err.splitlines() if "command dropped" in line]
-    # One a second, however many commands: a busy machine may have sent them in two seconds.
-    assert status == 0 and 1 <= len(warnings) <= 2
+    # One for each report that finds new ones, however many commands.
+    assert status == 0 and len(warnings) == len({*observer.said("commands_dropped")} - {"0"})
     assert said in warnings[-1] and f"({len(bad)} in all)" in warnings[-1]
 
 
@@ -98,7 +98,7 @@ def test_the_messages_of_ros2_control_are_commands(nodes, observer):
 
 
 def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
-    process = nodes.run("simulator")
+    process = nodes.run("simulator", command_timeout=2.0)
     assert "no command yet: zero torque" in observer.told("phase", "running")["said"]
     observer.preview()
     commands = observer.publisher(Float64MultiArray, COMMANDS)
@@ -106,17 +106,18 @@ def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
     commands.publish(torques(0.1, 0.1, 0.1))
     observer.until(lambda: (0.1, 0.1, 0.1) in observer.torques(), "the command")
     observer.until(lambda: observer.torques()[-1] == ZERO, "its end")
-    assert time.monotonic() - sent > 0.45
+    assert time.monotonic() - sent > 1.9
     said = observer.told("command_timeouts", 1)
-    assert said["level"] == b"\x01" and float(said["command_age_s"]) > 0.5
-    observer.command(0.2, 0.1, 0.1)
-    observer.until(lambda: observer.torques()[-1] == (0.2, 0.1, 0.1), "a fresh command")
+    assert said["level"] == b"\x01" and float(said["command_age_s"]) > 2.0
+    again = lambda: (0.2, 0.1, 0.1) in observer.torques()  # noqa: E731
+    observer.publish_until(commands, torques(0.2, 0.1, 0.1), again, "a fresh command")
     _, _, err = nodes.stop(process)
     assert "no command within command_timeout" in err
 
 
 def test_beyond_the_limit_of_the_scene_is_clamped_and_told(nodes, observer, variant):
-    nodes.run("simulator", scene=variant(actuators="actuators: {torque_limit: 0.5}\n"))
+    limited = variant(actuators="actuators: {torque_limit: 0.5}\n")
+    nodes.run("simulator", scene=limited, command_timeout=0.0)
     observer.preview()
     observer.command(7.0, -7.0, 0.1)
     observer.until(lambda: (0.5, -0.5, 0.1) in observer.torques(), "the clamped command")
@@ -126,7 +127,7 @@ def test_beyond_the_limit_of_the_scene_is_clamped_and_told(nodes, observer, vari
 
 def test_an_external_moment_where_the_scene_takes_one(nodes, observer, variant):
     applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", scene=variant(moment="moment: {topic: true}\n"))
+    nodes.run("simulator", scene=variant(moment="moment: {topic: true}\n"), command_timeout=0.0)
     moments = observer.publisher(WrenchStamped, f"{NODE}/external_moment")
     message = WrenchStamped()
     message.wrench.torque.z = 0.25
@@ -183,8 +184,8 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
     assert said["phase"] == "running" and said["fault"] == ""
     assert _memory(process.pid) - before < 20_000  # kB
     status, _, err = nodes.stop(process)
-    told = err.count("command dropped")
-    assert status == 0 and 1 <= told <= time.monotonic() - start + 1.0
+    warnings = err.count("command dropped")
+    assert status == 0 and warnings == len({*observer.said("commands_dropped")} - {"0"})
 
 
 def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
@@ -194,7 +195,7 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     client = observer.node.create_client(SetBool, f"{NODE}/pause", qos_profile=qos)
     observer.until(client.service_is_ready, "the service")
     calls = [client.call_async(SetBool.Request(data=True)) for _ in range(CALLS)]
-    observer.until(lambda: all(call.done() for call in calls), f"replies to {CALLS} calls", 10.0)
+    observer.until(lambda: all(call.done() for call in calls), "replies")
     assert all(call.result().success for call in calls)
 
 

@@ -38,7 +38,8 @@ class Client:
         self.kind, self.tolerance, self.observer = FollowJointTrajectory, JointTolerance, observer
         self.reference = observer.listen(JointState, f"{NODE}/reference")
         path = written(folder, motion=None)
-        nodes.run("simulator", scene=path, sync="lockstep")
+        # A check of a goal takes long on a busy machine.
+        nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
         given = {"mode": "computed_torque", "stamped": True, "motion": "topic", "scene": path}
         self.controller = nodes.start("inverse_dynamics", env=env, **given)
         self.client = ActionClient(
@@ -126,7 +127,7 @@ def test_what_cannot_be_followed_is_refused_with_a_reason(client):
 def test_a_cancelled_goal_comes_to_rest_on_its_path(client):
     start = client.rest()
     far = client.far_from(start)
-    handle = client.send((3.0, far))
+    handle = client.send((20.0, far))
     client.moving(8)
     reply = client.observer.result(handle.cancel_goal_async(), "the answer to the cancellation")
     assert len(reply.goals_canceling) == 1
@@ -154,9 +155,9 @@ def test_a_tolerance_aborts_a_goal(client, given, code, reason):
 
 def test_a_new_goal_and_a_trajectory_of_the_topic_preempt_a_goal(client):
     client.rest()
-    first = client.send((3.0, AWAY))
+    first = client.send((20.0, AWAY))
     client.moving()
-    second = client.send((3.0, HOME))
+    second = client.send((20.0, HOME))
     assert client.result(first) == (PREEMPTED, "preempted by a new goal")
     client.moving()
     topic = client.observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
@@ -174,8 +175,8 @@ def test_a_new_goal_and_a_trajectory_of_the_topic_preempt_a_goal(client):
 
 def test_the_end_of_the_controller_delivers_a_result(client, nodes_of_module):
     client.rest()
-    handle = client.send((5.0, AWAY))
+    handle = client.send((20.0, AWAY))
     client.moving()
     client.controller.send_signal(signal.SIGINT)
     assert client.result(handle) == (PREEMPTED, "the controller ends")
-    assert nodes_of_module.ended(client.controller, 20)[0] == 0
+    assert nodes_of_module.ended(client.controller)[0] == 0

@@ -114,7 +114,8 @@ def deaf(tmp_path_factory, nodes_of_module, observer_of_module):
     nodes, observer = nodes_of_module, observer_of_module
     path = written(tmp_path_factory.mktemp("deaf"), actuators=Actuators(torque_limit=8.0))
     commands = observer.listen(Float64MultiArray, COMMANDS)
-    controller = nodes.run("inverse_dynamics", scene=path, motion="topic")
+    # Its states come with the cases, which take long on a busy machine.
+    controller = nodes.run("inverse_dynamics", scene=path, motion="topic", timeout=1000.0)
     states = observer.publisher(JointState, "/joint_states")
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     refusals, reason = 0, ""
@@ -150,7 +151,8 @@ def test_a_bad_trajectory_is_refused_before_any_torque(deaf, case):
 def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, observer, tmp_path):
     path = written(tmp_path, motion=None)
     reference = observer.listen(JointState, f"{NODE}/reference")
-    nodes.run("simulator", scene=path, sync="lockstep")
+    # A check of a trajectory takes long on a busy machine.
+    nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
     given = {"mode": "computed_torque", "feedforward_at": "middle", "stamped": True}
     controller = nodes.run("inverse_dynamics", scene=path, motion="topic", **given)
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
@@ -224,7 +226,7 @@ def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
     motion = reference_motion(scene.load(str(path)))
     observer.listen(Float64MultiArray, COMMANDS)
     reference = observer.listen(JointState, f"{NODE}/reference")
-    nodes.run("inverse_dynamics", scene=path, mode="pd")
+    nodes.run("inverse_dynamics", scene=path, mode="pd", timeout=1000.0)
     states = observer.publisher(JointState, "/joint_states")
     observer.publish_until(states, idle(2_000_000), lambda: reference, "an answer")
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -58,7 +58,7 @@ def closed_loop(nodes, observer, tmp_path):
             publisher.publish(named(torque, state.header.stamp))
 
         observer.node.create_subscription(JointState, "/joint_states", answer, 10)
-        observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=60.0)
+        observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=100.0)
         assert simulator.returncode == 0
         assert nodes.stop(recorder)[0] == 0
         return recording.read(tmp_path / "bag")
@@ -112,9 +112,9 @@ def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
     simulator = nodes.run("simulator", **given, **AT_ONCE)
     observer.preview()
     nodes.run("torque_player", scene=name, stamped=True)
-    observer.until(lambda: simulator.poll() is not None, "end of the run")
+    observer.until(lambda: len(observer.samples()) >= 26, "samples")
     samples = observer.samples()
-    assert simulator.returncode == 0 and len(samples) == 26
+    assert nodes.ended(simulator)[0] == 0 and len(samples) == 26
     simulation, profile = Simulation(name), load_scene(name).torque.at
     for k, sample in enumerate(samples):
         joints = simulation.state.joints
@@ -134,8 +134,8 @@ def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
                 and observer.states[-1].position[:3] == pytest.approx(GOAL, abs=0.02)
             ),
             "angles at the goal",
-            30.0,
+            90.0,
         )
     finally:
         controller.terminate()
-        controller.wait(10.0)
+        controller.wait(40.0)

@@ -49,7 +49,7 @@ while publisher.get_subscription_count() == 0 and time.monotonic() < end:
 SPEAK = """
 for _ in range(4):
     publisher.publish(String(data="a word"))
-    print(publisher.wait_for_all_acked(Duration(seconds=1.0)), flush=True)
+    print(publisher.wait_for_all_acked(Duration(seconds=2.5)), flush=True)
 """
 
 
@@ -119,7 +119,7 @@ def speak(words):
 
 
 def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
-    """By default they are asked every 3 s: the second of waiting would pass in vain."""
+    """By default they are asked every 3 s: 2.5 s of waiting would pass in vain."""
     spoken = speak(SPEAK)
     assert spoken.stdout.split() == ["True"] * 4
     assert spoken.stderr == ""

@@ -16,7 +16,8 @@ from sst_ros.nodes.simulation_interfaces import FEATURES
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 SCENE = "gravity_payload"
 UNSUPPORTED, OK, NOT_FOUND, FAILED, INVALID_POSE = 0, 1, 2, 4, 101
-STOPPED, PLAYING, PAUSED, QUITTING = range(4)
+STOPPED, PLAYING, PAUSED, QUITTING, NO_WORLD = range(5)
+ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
 
 
 class Client:
@@ -65,13 +66,18 @@ def test_features_states_and_scopes(client):
     assert list(features.features) == list(FEATURES)
     client.observer.until(lambda: client.state() == PLAYING, "the run")
     assert client.code("StepSimulation", steps=1)[0] == FAILED
-    assert client.to(PAUSED) == OK and client.state() == PAUSED
-    assert client.code("ResetSimulation", scope=1)[0] == UNSUPPORTED
-    assert client.state() == PAUSED
-    assert client.code("ResetSimulation", scope=2)[0] == OK
-    assert client.state() == STOPPED
-    assert client.to(PLAYING) == OK and client.state() == PLAYING
-    assert client.to(STOPPED) == OK and client.state() == STOPPED
+    assert (client.to(PAUSED), client.state(), client.to(PAUSED)) == (OK, PAUSED, ALREADY_THERE)
+
+    def reset(scope):
+        return client.code("ResetSimulation", scope=scope)[0]
+
+    assert (reset(1), client.state()) == (UNSUPPORTED, PAUSED)  # time is never reset
+    assert (reset(2), client.state()) == (OK, STOPPED)
+    assert (reset(3), reset(6), reset(255)) == (UNSUPPORTED, OK, OK)
+    assert client.to(PAUSED) == INCORRECT_TRANSITION
+    assert client.to(NO_WORLD) == UNSUPPORTED
+    assert (client.to(PLAYING), client.state()) == (OK, PLAYING)
+    assert (client.to(STOPPED), client.state()) == (OK, STOPPED)
 
 
 def test_steps_by_count_and_by_the_action(client):
@@ -183,4 +189,4 @@ def test_spawning_is_refused_by_name_and_the_node_quits(client, nodes_of_module)
     code, words = client.code("SpawnEntity", name="table")
     assert code == UNSUPPORTED and "table is not spawned" in words
     assert client.to(QUITTING) == OK
-    assert nodes_of_module.ended(client.process, 20)[0] == 0
+    assert nodes_of_module.ended(client.process)[0] == 0

@@ -21,7 +21,7 @@ SHARED = {"/diagnostics", "/rosout", "/parameter_events", "/clock"}
 
 
 def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
-    nodes.run("simulator", wait_for_command=True, duration=0.2)
+    nodes.run("simulator", wait_for_command=True, duration=0.2, command_timeout=0.0)
     first = observer.preview()
     assert (first.header.frame_id, first.header.stamp.sec > 1e9) == ("idle", True)
     observer.command(0.1, 0.2, 0.3)
@@ -90,13 +90,14 @@ def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, obser
     process = nodes.run("simulator")
     observer.phase("running")
     assert nodes.stop(process, number)[0] == 0
-    observer.until(lambda: not observer.node.count_publishers(f"{NODE}/phase"), "end of it", 5.0)
+    observer.until(lambda: not observer.node.count_publishers(f"{NODE}/phase"), "end of it", 15.0)
 
 
 def test_two_simulators_do_not_hear_each_other(nodes, observer):
     places = ("/left", "/right")
+    given = {"wait_for_command": True, "command_timeout": 0.0}
     started = {
-        place: nodes.run("simulator", "--ros-args", "-r", f"__ns:={place}", wait_for_command=True)
+        place: nodes.run("simulator", "--ros-args", "-r", f"__ns:={place}", **given)
         for place in places
     }
     states = {place: observer.listen(JointState, f"{place}/joint_states") for place in places}

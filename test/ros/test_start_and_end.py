@@ -50,7 +50,9 @@ def test_an_unknown_parameter_of_a_file_is_refused(run_here, tmp_path):
 
 def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(nodes, observer):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
-    process = nodes.start("simulator", "--scene", "fast_spin", "--real-time-factor", "0.1")
+    words = ["--scene", "fast_spin", "--real-time-factor", "0.1"]
+    words += ["--wait-for-subscribers", "/diagnostics,~/scene"]
+    process = nodes.start("simulator", *words)
     observer.until(lambda: scene, "the scene")
     assert "name: fast_spin" in scene[0].data
     assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
@@ -58,7 +60,7 @@ def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(node
 
 
 def test_a_fault_ends_a_run_with_a_duration(nodes, observer):
-    process = nodes.run("simulator", scene="example2_heavy", duration=100.0)
+    process = nodes.run("simulator", scene="example2_heavy", duration=100.0, command_timeout=0.0)
     observer.command(50.0, 0.0, 0.0)
     status, _, err = nodes.ended(process)
     assert status == 1

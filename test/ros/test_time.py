@@ -4,6 +4,7 @@
 import pytest
 from ros.conftest import NODE
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 
 from sst_ros.state import nanoseconds
 
@@ -18,32 +19,31 @@ def clock(time_ns):
 
 @pytest.mark.parametrize("speed", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_other_speeds_are_kept_and_lose_no_sample(nodes, observer, speed):
-    process = nodes.run(
-        "simulator", real_time_factor=speed, duration=2.0, publish_rate=100, wait_for_command=True
-    )
-    observer.preview()
-    observer.command(0.0, 0.0, 0.0)
+    heard = "[joint_states, /diagnostics]"  # by this process before the run, which is short
+    given = {"duration": 2.0, "publish_rate": 100, "wait_for_subscribers": heard}
+    observer.listen(JointState, "/joint_states")
+    process = nodes.run("simulator", real_time_factor=speed, **given)
     said = observer.told("phase", "finished")
-    if speed:
-        assert 1.5 < float(said["real_time_factor"]) <= speed
+    if speed:  # a tick that a busy machine has dropped took its time, too
+        passed_s = (int(said["ticks"]) + int(said["ticks_missed"])) / 1000.0
+        assert 0.5 * speed < passed_s / float(said["wall_time_s"]) <= speed
     else:  # no tick waits, none can be late
         assert (float(said["late_max_us"]), said["ticks_missed"]) == (0.0, "0")
     observer.until(lambda: len(observer.stamps()) >= 201, "the 201 samples")
     stamps = observer.stamps()
     assert stamps == [stamps[0] + 10_000_000 * k for k in range(201)]
-    assert process.wait(timeout=10) == 0
+    assert nodes.ended(process)[0] == 0
 
 
 def test_a_clock_is_given_and_a_second_one_refused(nodes, observer):
-    clocks, states = observer.listen(Clock, "/clock"), observer.states
-    nodes.run("simulator", publish_clock=True)
-    observer.until(lambda: len(clocks) > 20 and len(states) > 20, "time")
+    clocks = observer.listen(Clock, "/clock")
 
     def times():
         return [nanoseconds(message.clock) for message in clocks]
 
-    last = {observer.stamp(state) for state in states[-5:]}
-    observer.until(lambda: last <= set(times()), "the time of the last states", 5.0)
+    # Not each: a reader that was held up finds the last time only.
+    nodes.run("simulator", publish_clock=True)
+    observer.until(lambda: len({*times()} & {*observer.stamps()}) > 20, "the time of the states")
     assert times() == sorted(times()) and times()[0] > 0
     assert observer.pause(True).success
     observer.until(lambda: clocks[-1] == clocks[-2], "the time of the pause, repeated")
@@ -70,13 +70,17 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
     at = [100 * 10**9]
 
     def run(samples, what):
-        """Publish time, 10 ms further each time, until there are so many samples."""
+        """Publish time, 10 ms further each time, until there are so many samples more."""
+        begin, before = at[0], len(observer.stamps())
 
         def condition():
-            at[0] += 10_000_000
+            new = len(observer.stamps()) - before
+            # A busy simulator is waited for: from 200 ms on it would drop the time.
+            if at[0] - begin - 2_000_000 * new < 100_000_000:
+                at[0] += 10_000_000
             publisher.publish(clock(at[0]))
             observer.executor.spin_once(timeout_sec=0.002)
-            return len(observer.stamps()) > samples
+            return new > samples
 
         observer.until(condition, what)
 
@@ -87,27 +91,25 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
     observer.told("ticks_missed", 0)
 
     publisher.publish(clock(at[0]))  # the clock stands still, and so do the ticks
-    count = len(observer.diagnostics())
+    count = len(observer.said("ticks"))
 
-    def last(key):
-        return [said[key] for said in observer.diagnostics()]
+    def stands():
+        _, *told = observer.said("ticks")[count - 1 :]
+        return len(told) > 1 and told[-1] == told[-2]
 
-    observer.until(
-        lambda: len(last("ticks")) > count + 1 and last("ticks")[-1] == last("ticks")[-2],
-        "a standstill",
-    )
-    settled = int(last("ticks")[-1])
+    observer.until(stands, "a standstill")
+    settled = int(observer.said("ticks")[-1])
 
     at[0] += 3600 * 10**9  # a leap: dropped, no burst
     observer.publish_until(  # /clock is best effort
         publisher,
         clock(at[0]),
-        lambda: int(last("ticks_missed")[-1]) > 3_000_000,
+        lambda: int(observer.said("ticks_missed")[-1]) > 3_000_000,
         "the dropped ticks",
     )
-    assert int(observer.told("ticks", lambda _: True)["ticks"]) < settled + 1000
+    assert int(observer.said("ticks")[-1]) < settled + 1000
 
     at[0] -= 1800 * 10**9  # back: stamps never are
-    run(len(observer.stamps()) + 20, "samples after the return")
+    run(20, "samples after the return")
     assert observer.told("clock_jumps", 1)["fault"] == ""
     assert observer.stamps() == sorted(set(observer.stamps()))

@@ -36,7 +36,7 @@ def test_plays_a_table_against_the_stamps_it_hears(nodes, observer, profile):
     *before, second, last = (list(message.data) for message in heard)
     assert len(before) >= 3 and all(torque == [0.1, 0.2, 0.3] for torque in before)
     assert (second, last) == ([0.4, 0.5, 0.6], [0.0, 0.0, 0.0])
-    assert player.wait(timeout=10) == 0
+    assert nodes.ended(player)[0] == 0
 
 
 def test_answers_with_the_torque_of_the_middle_of_the_hold(nodes, observer):
@@ -67,7 +67,7 @@ def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, pro
     observer.node.destroy_subscription(other)
     states.publish(sample(100_000_500))
     observer.until(lambda: not any(heard[-1].data), "end of the profile")
-    assert player.wait(timeout=10) == 0
+    assert nodes.ended(player)[0] == 0
 
 
 def test_a_player_that_was_held_up_counts_from_the_first_sample(nodes, observer, profile):
@@ -77,4 +77,4 @@ def test_a_player_that_was_held_up_counts_from_the_first_sample(nodes, observer,
     for number in range(101):
         states.publish(sample(500 + 2_000_000 * number))
     player.send_signal(signal.SIGCONT)
-    assert player.wait(timeout=10) == 0
+    assert nodes.ended(player)[0] == 0

@@ -3,10 +3,10 @@
 
 import dataclasses
 import tracemalloc
-from types import SimpleNamespace as Message
 
 import numpy as np
 import pytest
+from runtime.bench import Message, duration
 
 from sst_ros.control import tracking
 from sst_ros.control.controller import ControlStopped, Measurement
@@ -184,17 +184,12 @@ def test_a_stop_before_the_run_forgets_the_trajectory():
 DEFAULTS = ControllerNodeParameters(motion="topic", path_tolerance=0.1, goal_tolerance=0.01)
 
 
-def duration(seconds):
-    sec, nanosec = divmod(round(seconds * 1e9), 10**9)
-    return Message(sec=sec, nanosec=nanosec)
-
-
 def tolerance(name="gamma_2", position=0.0, velocity=0.0, acceleration=0.0):
     return Message(name=name, position=position, velocity=velocity, acceleration=acceleration)
 
 
 def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0):
-    points = [Message(time_from_start=duration(time)) for time in times]
+    points = [Message(time_from_start=duration(time * 1e9)) for time in times]
     return Message(
         trajectory=Message(points=points),
         multi_dof_trajectory=Message(joint_names=[], points=[]),
@@ -202,7 +197,7 @@ def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0):
         goal_tolerance=goal,
         component_path_tolerance=[],
         component_goal_tolerance=[],
-        goal_time_tolerance=duration(goal_time),
+        goal_time_tolerance=duration(goal_time * 1e9),
     )
 
 
