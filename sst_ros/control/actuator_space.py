@@ -19,7 +19,6 @@ import numpy as np
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import trace
-from sst_ros.dynamics.model import Leg, joint_angle
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     QUATERNION,
@@ -32,8 +31,8 @@ from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
     cos,
-    cross,
-    dot,
+    cross3,
+    dot3,
     multiply,
     rotate_back,
     rotation_rows,
@@ -63,7 +62,7 @@ class ActuatorSpaceMap:
         self.geometry = geometry
         rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
         self._legs = [
-            Leg(tuple(w), tuple(v), cross(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
+            kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
             for w, v, e in rows
         ]
         self._actuators = compile_program(
@@ -176,9 +175,9 @@ class ActuatorSpaceMap:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         legs = [(leg, kernel.leg_motion(leg, rows, rate)) for leg in self._legs]
         return (
-            *(joint_angle(at, 0) for _, at in legs),
+            *(kernel.joint_angle(at, 0) for _, at in legs),
             *(at.gamma_dot for _, at in legs),
-            *(dot(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
+            *(dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
         )
 
     def _of_posture(self, *q: Any) -> tuple[Any, ...]:
@@ -187,11 +186,11 @@ class ActuatorSpaceMap:
         sines = [sqrt(at.u) for _, at in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
         j2 = [
-            multiply(1.0 / sine, cross(at.along, at.p))
+            multiply(1.0 / sine, cross3(at.along, at.p))
             for sine, (_, at) in zip(sines, legs, strict=True)
         ]
-        beta = (joint_angle(at, 2) for _, at in legs)
-        return (*sines, *beta, dot(j2[0], cross(j2[1], j2[2])))
+        beta = (kernel.joint_angle(at, 2) for _, at in legs)
+        return (*sines, *beta, dot3(j2[0], cross3(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
         """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot; numbers of any kind."""
@@ -209,9 +208,9 @@ class ActuatorSpaceMap:
         rows = rotation_rows(q)
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
         local = [rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
-        residual = [dot(r, e) for r, e in zip(local, arcs, strict=True)]
+        residual = [dot3(r, e) for r, e in zip(local, arcs, strict=True)]
         # R exp(turn): the residual changes by turn . (e x r).
-        slope = [cross(e, r) for r, e in zip(local, arcs, strict=True)]
+        slope = [cross3(e, r) for r, e in zip(local, arcs, strict=True)]
         tx, ty, tz = (-0.5 * part for part in _solve(slope, residual))
         x, y, z, w = q
         moved = (
@@ -226,8 +225,8 @@ class ActuatorSpaceMap:
 
 def _solve(rows: list[Any], right: Any) -> tuple[Any, ...]:
     """Solve rows . x = right by Cramer's rule."""
-    others = (cross(rows[1], rows[2]), cross(rows[2], rows[0]), cross(rows[0], rows[1]))
-    determinant = dot(rows[0], others[0])
+    others = (cross3(rows[1], rows[2]), cross3(rows[2], rows[0]), cross3(rows[0], rows[1]))
+    determinant = dot3(rows[0], others[0])
     total = [
         sum(number * other[i] for number, other in zip(right, others, strict=True))
         for i in range(3)
@@ -304,8 +303,8 @@ class OrientationObserver:
         normals, largest = [], 0.0
         for k, (x, y, z) in enumerate(self._arcs):
             r = (carriages[3 * k], carriages[3 * k + 1], carriages[3 * k + 2])
-            t = dot(rows[0], (x, y, z)), dot(rows[1], (x, y, z)), dot(rows[2], (x, y, z))
-            normals.append(cross(t, r))
-            largest = max(largest, abs(dot(r, t)))
-        determinant = dot(normals[0], cross(normals[1], normals[2]))
+            t = dot3(rows[0], (x, y, z)), dot3(rows[1], (x, y, z)), dot3(rows[2], (x, y, z))
+            normals.append(cross3(t, r))
+            largest = max(largest, abs(dot3(r, t)))
+        determinant = dot3(normals[0], cross3(normals[1], normals[2]))
         return 2.0 / 3.0 * abs(determinant), largest

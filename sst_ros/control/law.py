@@ -43,8 +43,8 @@ from sst_ros.mechanism.generic_math import (
     add,
     atan2,
     axpy,
-    cross,
-    dot,
+    cross3,
+    dot3,
     positive,
     relative_quaternion,
     rotation_rows,
@@ -307,7 +307,7 @@ class ControlLaw(NamedTuple):
         weight: Scalar = 1.0
         if self.limit is not None:
             torque = bound(total, self.limit)
-            weight = 1.0 - is_above(dot(axpy(1.0, total, -1.0, torque), error))
+            weight = 1.0 - is_above(dot3(axpy(1.0, total, -1.0, torque), error))
         integral = at.integral and axpy(1.0, at.integral, weight * self.period, summed)
         return Command(torque, feedforward, feedback, at.desired, error, rates, integral)
 
@@ -319,10 +319,10 @@ class ControlLaw(NamedTuple):
             between = relative_quaternion(at.observed, at.desired.quaternion)
             turn = rotation_rows(between)
             rate, forward = (
-                (dot(turn[0], vector), dot(turn[1], vector), dot(turn[2], vector))
+                (dot3(turn[0], vector), dot3(turn[1], vector), dot3(turn[2], vector))
                 for vector in (at.desired.body_rate, at.desired.body_acceleration)
             )
-            moving = axpy(1.0, forward, -1.0, cross(body_rate, rate))
+            moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
             error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
             body_acceleration = add(moving, self._correct(at.integral, error, rates))
         return self.torque(at.observed, body_rate, body_acceleration), error

@@ -38,28 +38,18 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
     meant = None if initial.orientation is None else rotation_matrix(initial.orientation)
     assembly = kinematics.admissible(geometry, gamma, meant)
-    rate = body_rate(geometry, gamma, np.array(initial.gamma_dot), assembly.rotation)
+    rate, gamma_dot = np.zeros(3), np.array(initial.gamma_dot)
+    if gamma_dot.any():  # rest needs no Jacobian, which a singular posture has not
+        at = virtual_work.posture(geometry, gamma, assembly.rotation)
+        determinant = float(np.linalg.det(at.j2))
+        if abs(determinant) < SINGULAR:
+            message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
+            raise SingularConfiguration(message, determinant)
+        rate = assembly.rotation.T @ at.j @ gamma_dot
     return (*quaternion_of(assembly.rotation).tolist(), *rate.tolist())
 
 
-def body_rate(geometry: Geometry, gamma: Array, gamma_dot: Array, rotation: Array) -> Array:
-    """Body rate [rad/s] of a posture; rest needs no Jacobian, which a singular one has not.
-
-    Raises:
-        SingularConfiguration: gamma_dot does not determine it.
-
-    """
-    if not gamma_dot.any():
-        return np.zeros(3)
-    at = virtual_work.posture(geometry, gamma, rotation)
-    determinant = float(np.linalg.det(at.j2))
-    if abs(determinant) < SINGULAR:
-        message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
-        raise SingularConfiguration(message, determinant)
-    return np.asarray(rotation.T @ at.j @ gamma_dot)
-
-
-def body_acceleration(
+def accelerate_by_paper(
     mechanism: virtual_work.Mechanism,
     state: ArrayLike,
     torque: ArrayLike,
@@ -125,7 +115,9 @@ class VirtualWorkDerivative:
         torque = np.array(inputs[8:11])
         moment = self._moment + inputs[11:14] if len(inputs) > 11 else self._moment
         try:
-            acceleration, gamma_dot = body_acceleration(self._mechanism, inputs[:7], torque, moment)
+            acceleration, gamma_dot = accelerate_by_paper(
+                self._mechanism, inputs[:7], torque, moment
+            )
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
         omega = rotation_matrix(np.array(inputs[:4])) @ rate

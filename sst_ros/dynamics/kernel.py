@@ -13,26 +13,15 @@ energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces act on the star
 only a serial singularity (t_k = +-w_k) has no dynamics.
 
 The inertial part uses + - * / and, for a link with products of inertia xz or yz, one square root;
-loads may need angles (`model`). The functions run on floats, complex numbers, NumPy columns,
-mpmath numbers and expressions alike; the simulation runs what `trace` leaves of them for a scene.
+loads may need angles. The functions run on floats, complex numbers, NumPy columns, mpmath numbers
+and expressions alike; the simulation runs what `trace` leaves of them for a scene.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from sst_ros.dynamics.model import (
-    PLACES,
-    Leg,
-    LegMotion,
-    Model,
-    dissipation,
-    joint_angle,
-    joint_rate,
-    joint_torques,
-    model_of,
-    spring_and_weight_energy,
-)
+from sst_ros.dynamics.model import ElasticStops, Leg, LegLoads, Model, model_of
 from sst_ros.mechanism.generic_math import (
     ZERO,
     Quadruple,
@@ -41,47 +30,53 @@ from sst_ros.mechanism.generic_math import (
     Symmetric,
     Triple,
     add,
+    atan2,
     axpy,
-    cross,
-    dot,
+    cross3,
+    dot3,
+    exp,
     multiply,
+    positive,
     quaternion_rate,
     rotate_back,
     rotation_rows,
     solve_symmetric,
     sqrt,
     symmetric_rows,
+    tanh,
     triple,
 )
+from sst_ros.scene.bodies import PLACES
+from sst_ros.scene.loads import Friction
 from sst_ros.state import Joints
 
-__all__ = [
-    "Balance",
-    "Joints",
-    "Leg",
-    "Model",
-    "actuator_torque",
-    "balance",
-    "body_acceleration",
-    "derivative",
-    "joints",
-    "model_of",
-]
+__all__ = ["Leg", "Model", "model_of"]
 
 
-class Balance(NamedTuple):
-    """M W_dot = force in {E}, everything reduced to the star by virtual work.
+class LegMotion(NamedTuple):
+    """One leg at one instant, vectors in {E}; for the letters see above.
 
     Attributes:
-        inertia: M (xx, yy, zz, xy, xz, yz) [kg m^2].
-        force: moment of all that acts at W_dot = 0, velocity products included [N m].
-        jacobian: rows g_k; gamma_dot_k = g_k.W, and a torque at gamma_k acts as tau_k g_k.
+        leg: its constants.
+        axis: w_k.
+        along: t_k = (e0, e1, 0).
+        outward: p in {B}, which points along r_k.
+        b: beta_dot = b.W.
 
     """
 
-    inertia: Symmetric
-    force: Triple
-    jacobian: Rows
+    leg: Leg
+    axis: Triple
+    along: Triple
+    a: Scalar
+    p: Triple
+    u: Scalar
+    g: Triple
+    b: Triple
+    outward: Triple
+    gamma_dot: Scalar
+    a_dot: Scalar
+    beta_dot: Scalar
 
 
 def derivative(
@@ -104,16 +99,9 @@ def derivative(
             (asked - has) / model.time_constant for asked, has in zip(torque, given, strict=True)
         )
         torque = (given[0], given[1], given[2])
-    acceleration = body_acceleration(model, (x, y, z, w), (wx, wy, wz), torque, moment)
+    inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
+    acceleration = solve_symmetric(inertia, force)
     return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *more)
-
-
-def body_acceleration(
-    model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
-) -> Triple:
-    """W_dot [rad/s^2] in {E} of the direct dynamics; arguments as for `derivative`."""
-    at = balance(model, q, rate, torque, moment)
-    return solve_symmetric(at.inertia, at.force)
 
 
 def actuator_torque(
@@ -124,19 +112,27 @@ def actuator_torque(
     The torques do the work tau_k g_k.W on the star: M W_dot = force + sum tau_k g_k. With
     g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel singularity.
     """
-    at = balance(model, q, rate, ZERO, moment)
-    rows = zip(symmetric_rows(at.inertia), at.force, strict=True)
-    missing = triple(dot(row, acceleration) - force for row, force in rows)
-    first, second, third = at.jacobian
-    others = (cross(second, third), cross(third, first), cross(first, second))
-    determinant = dot(first, others[0])
-    return triple(dot(missing, other) / determinant for other in others), determinant
+    inertia, acting, (first, second, third) = balance(model, q, rate, ZERO, moment)
+    rows = zip(symmetric_rows(inertia), acting, strict=True)
+    missing = triple(dot3(row, acceleration) - force for row, force in rows)
+    others = (cross3(second, third), cross3(third, first), cross3(first, second))
+    determinant = dot3(first, others[0])
+    return triple(dot3(missing, other) / determinant for other in others), determinant
 
 
 def balance(
     model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
-) -> Balance:
-    """Collect all that acts on the star; arguments as for `derivative`."""
+) -> tuple[Symmetric, Triple, Rows]:
+    """Reduce everything to the star by virtual work: M W_dot = force in {E}.
+
+    Arguments are those of `derivative`.
+
+    Returns:
+        M (xx, yy, zz, xy, xz, yz) [kg m^2]; the moment of all that acts at W_dot = 0, velocity
+        products included [N m]; and the rows g_k: gamma_dot_k = g_k.W, and a torque at gamma_k
+        acts as tau_k g_k.
+
+    """
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star
     force = _on_star(model, rows, rate, moment)
@@ -164,8 +160,8 @@ def balance(
         if leg.loads is not None:
             at_gamma, at_mu, at_beta = joint_torques(at, field)
             force_gamma = force_gamma - at_gamma
-            # mu_dot = -a_dot / sqrt(u)
-            force_a = force_a + _quotient(at_mu, u)
+            if not (type(at_mu) is float and at_mu == 0.0):
+                force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
             force = triple(f + at_beta * b for f, b in zip(force, at.b, strict=True))
         force = triple(
             f - force_a * along - force_gamma * across
@@ -176,7 +172,7 @@ def balance(
             for m, (i, j) in zip(inertia, PLACES, strict=True)
         )
     xx, yy, zz, xy, xz, yz = inertia
-    return Balance((xx, yy, zz, xy, xz, yz), force, (jacobian[0], jacobian[1], jacobian[2]))
+    return (xx, yy, zz, xy, xz, yz), force, (jacobian[0], jacobian[1], jacobian[2])
 
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
@@ -206,7 +202,7 @@ def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     u = across * across + z * z
     g = ((x - a * e0) / u, (y - a * e1) / u, z / u)
     b = ((a * x - e0) / u, (a * y - e1) / u, a * z / u)
-    outward = triple(dot(row, p) for row in rows)
+    outward = triple(dot3(row, p) for row in rows)
     return LegMotion(
         leg=leg,
         axis=(x, y, z),
@@ -217,24 +213,24 @@ def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
         g=g,
         b=b,
         outward=outward,
-        gamma_dot=dot(g, rate),
-        a_dot=dot(p, rate),
-        beta_dot=dot(b, rate),
+        gamma_dot=dot3(g, rate),
+        a_dot=dot3(p, rate),
+        beta_dot=dot3(b, rate),
     )
 
 
 def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     """Accelerations of the coordinates a and gamma of a leg at W_dot = 0."""
-    along = dot(at.along, rate)
-    a_rest = dot(at.axis, rate) * along - at.a * dot(rate, rate)
+    along = dot3(at.along, rate)
+    a_rest = dot3(at.axis, rate) * along - at.a * dot3(rate, rate)
     return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
 
 
 def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> Triple:
     """Moments on the star in {E}: gyroscopic, weight, external."""
-    total = cross(triple(dot(row, rate) for row in symmetric_rows(model.star)), rate)
+    total = cross3(triple(dot3(row, rate) for row in symmetric_rows(model.star)), rate)
     if model.gravity is not None:
-        total = add(total, cross(model.weight, field_of(model, rows)))
+        total = add(total, cross3(model.weight, field_of(model, rows)))
     for external in (model.moment, moment):
         if external is not None:
             total = add(total, rotate_back(rows, external))
@@ -244,10 +240,6 @@ def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> T
 def field_of(model: Model, rows: Rows) -> Triple:
     """Gravity in {E}."""
     return ZERO if model.gravity is None else rotate_back(rows, model.gravity)
-
-
-def _quotient(torque: Scalar, u: Scalar) -> Scalar:
-    return 0.0 if type(torque) is float and torque == 0.0 else torque / sqrt(u)
 
 
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
@@ -273,7 +265,7 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     x, y, z, w, wx, wy, wz = state[:7]
     rows = rotation_rows((x, y, z, w))
     field = field_of(model, rows)
-    total: Scalar = 0.0 if model.gravity is None else -dot(model.weight, field)
+    total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
     for leg in model.legs:
         if leg.loads is not None:
             at = leg_motion(leg, rows, (wx, wy, wz))
@@ -299,5 +291,128 @@ def power(
             total = total - dissipation(at)
     for external in (model.moment, moment):
         if external is not None:
-            total = total + dot(external, triple(dot(row, (wx, wy, wz)) for row in rows))
+            total = total + dot3(external, triple(dot3(row, (wx, wy, wz)) for row in rows))
     return total
+
+
+# Loads of one leg: gravity, friction, springs and elastic stops. What the scene does not have is
+# Python's 0.0, which leaves nothing behind in a traced program.
+
+
+def joint_torques(at: LegMotion, field: Triple) -> Triple:
+    """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
+    loads = at.leg.loads
+    if loads is None:
+        return ZERO
+    friction = triple(
+        0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
+        for kind, one in enumerate(loads.friction)
+    )
+    springs = triple(
+        0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
+        for kind, spring in enumerate(loads.springs)
+    )
+    at_gamma, at_mu = _weight(loads, at, field)
+    if loads.stops is not None:
+        at_gamma = at_gamma + stop_torque(loads.stops, joint_angle(at, 0), at.gamma_dot)
+    return (
+        friction[0] + springs[0] + at_gamma,
+        friction[1] + springs[1] + at_mu,
+        friction[2] + springs[2],
+    )
+
+
+def spring_and_weight_energy(at: LegMotion, field: Triple) -> Scalar:
+    """Energy [J] in springs, elastic stops and the weight of the links."""
+    loads, total = at.leg.loads, 0.0
+    if loads is None:
+        return total
+    for kind, spring in enumerate(loads.springs):
+        if spring is not None:
+            stretch = joint_angle(at, kind) - spring.rest
+            total = total + 0.5 * spring.stiffness * stretch * stretch
+    if loads.stops is not None:
+        gamma = joint_angle(at, 0)
+        for depth in (positive(-gamma), positive(gamma - loads.stops.arc)):
+            total = total + 0.5 * loads.stops.stiffness * depth * depth
+    if any(loads.drive) or any(loads.link):
+        first, second = _directions(at)
+        total = total - dot3(_combine(loads.drive, *first), field)
+        total = total - dot3(_combine(loads.link, *second), field)
+    return total
+
+
+def dissipation(at: LegMotion) -> Scalar:
+    """Power [W] that friction and the damping of elastic stops take out."""
+    loads, total = at.leg.loads, 0.0
+    if loads is None:
+        return total
+    for kind, friction in enumerate(loads.friction):
+        if friction is not None:
+            total = total + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
+    if loads.stops is not None and loads.stops.damping:
+        gamma, speed = joint_angle(at, 0), at.gamma_dot
+        elastic = loads.stops._replace(damping=0.0)
+        excess = stop_torque(elastic, gamma, speed) - stop_torque(loads.stops, gamma, speed)
+        total = total + excess * speed
+    return total
+
+
+def friction_torque(friction: Friction, v: Scalar) -> Scalar:
+    """Friction torque [N m] against the rate v [rad/s]."""
+    torque = friction.viscous * v
+    if friction.coulomb or friction.static:
+        level: Scalar = friction.coulomb
+        if friction.static:
+            slow = v / friction.stribeck
+            level = level + (friction.static - friction.coulomb) * exp(-(slow * slow))
+        torque = torque + level * tanh(v / friction.smoothing)
+    return torque
+
+
+def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
+    """Torque of elastic stops; the damping grows from zero with the depth (Hunt-Crossley)."""
+    low, high = positive(-gamma), positive(gamma - stops.arc)
+    if not stops.damping:
+        return stops.stiffness * (low - high)
+    inward = stops.damping * gamma_dot
+    return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
+
+
+def joint_rate(at: LegMotion, kind: int) -> Scalar:
+    """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
+    if kind == 0:
+        return at.gamma_dot
+    return -at.a_dot / sqrt(at.u) if kind == 1 else at.beta_dot
+
+
+def joint_angle(at: LegMotion, kind: int) -> Scalar:
+    """Angle of gamma (0), mu (1) or beta (2) [rad]."""
+    if kind == 0:
+        return atan2(dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v))
+    if kind == 1:
+        return atan2(sqrt(at.u), at.a)
+    # r.(t x s) and r.s with s = (0, 0, 1), both times sqrt(u).
+    return atan2(at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2])
+
+
+def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
+    """Torques of the links' weight at gamma and mu: moments about w_k and -r_k."""
+    if not (any(loads.drive) or any(loads.link)):
+        return 0.0, 0.0
+    first, second = _directions(leg)
+    on_link = cross3(_combine(loads.link, *second), field)
+    on_both = cross3(_combine(loads.drive, *first), field)
+    total = (on_link[0] + on_both[0], on_link[1] + on_both[1], on_link[2] + on_both[2])
+    return dot3(total, leg.axis), -dot3(on_link, first[0])
+
+
+def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
+    """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
+    root = sqrt(leg.u)
+    r = (leg.p[0] / root, leg.p[1] / root, leg.p[2] / root)
+    return (r, cross3(leg.axis, r), leg.axis), (r, cross3(leg.along, r), leg.along)
+
+
+def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
+    return triple(c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))

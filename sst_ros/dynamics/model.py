@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The constants of a scene that the kernel computes with, and the torques of its loads at joints.
-
-Loads are gravity, friction, springs and elastic stops. Every function of them is for one leg and
-returns Python's 0.0 for what the scene does not have, which leaves nothing behind in a traced
-program (`trace`).
-"""
+"""The constants of a scene that the kernel computes with: inertias by leg, loads of its joints."""
 
 from __future__ import annotations
 
@@ -13,23 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.mechanism.generic_math import (
-    ZERO,
-    Rows,
-    Scalar,
-    Symmetric,
-    Triple,
-    atan2,
-    cross,
-    dot,
-    exp,
-    positive,
-    sqrt,
-    tanh,
-    triple,
-)
+from sst_ros.mechanism.generic_math import ZERO, Symmetric, Triple, cross3, multiply
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Friction, Inertia, Link, Payload, Scene, Star, Stroke
+from sst_ros.scene.bodies import PLACES, Payload, Star, entries_of, point_inertia
+from sst_ros.scene.loads import Friction, Stroke
+from sst_ros.scene.scene import Scene
 
 
 class Leg(NamedTuple):
@@ -113,26 +96,28 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
 
     The numbers of the scene and its geometry may be columns, of many scenes at once.
     """
-    geometry, star = geometry or Geometry.of(scene), _star(scene)
-    legs = []
+    geometry, star, legs = geometry or Geometry.of(scene), entries_of(scene.star.inertia), []
+    carried: list[Star | Payload] = [scene.star]
+    if scene.payload is not None:
+        load = scene.payload
+        carried.append(load)
+        about_o = zip(entries_of(load.inertia), point_inertia(load.mass, load.centre), strict=True)
+        star = [part + (own + point) for part, (own, point) in zip(star, about_o, strict=True)]
     for k in range(3):
         w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
-        drive_zz = _tensor(scene.actuated_links[k].inertia)[2]
+        drive_zz = entries_of(scene.actuated_links[k].inertia)[2]
         if scene.actuators is not None:
             gear = scene.actuators.gear_ratio
             drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
-        xx, yy, zz, xy, xz, yz = _tensor(scene.intermediate_links[k].inertia)
+        xx, yy, zz, xy, xz, yz = entries_of(scene.intermediate_links[k].inertia)
         constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
         star = [
             part + xx * (float(i == j) - e[i] * e[j])
             for part, (i, j) in zip(star, PLACES, strict=True)
         ]
         legs.append(
-            Leg(w, v, cross(w, v), e[0], e[1], *constants, loads_of_leg(scene, geometry, k))
+            Leg(w, v, cross3(w, v), e[0], e[1], *constants, loads_of_leg(scene, geometry, k))
         )
-    carried: list[Star | Payload] = [scene.star]
-    if scene.payload is not None:
-        carried.append(scene.payload)
     weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
     return Model(
         star=(star[0], star[1], star[2], star[3], star[4], star[5]),
@@ -142,29 +127,6 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
         moment=None if scene.moment is None else scene.moment.value,
         time_constant=None if scene.actuators is None else scene.actuators.time_constant,
     )
-
-
-PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Rows and columns of the six numbers of an inertia (xx, yy, zz, xy, xz, yz)."""
-
-
-def _star(scene: Scene) -> list[Scalar]:
-    """Inertia of star and payload about O in {E}, in the order of `PLACES`."""
-    star, payload = _tensor(scene.star.inertia), scene.payload
-    if payload is None:
-        return star
-    mass, c = payload.mass, payload.centre
-    square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-    return [
-        part + (own + mass * (square * float(i == j) - c[i] * c[j]))
-        for part, own, (i, j) in zip(star, _tensor(payload.inertia), PLACES, strict=True)
-    ]
-
-
-def _tensor(inertia: Inertia | None) -> list[Scalar]:
-    if inertia is None:
-        return [0.0] * 6
-    return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]
 
 
 def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
@@ -177,7 +139,8 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     )
     drive = link = ZERO
     if scene.gravity is not None:
-        drive, link = _moment(scene.actuated_links[k]), _moment(scene.intermediate_links[k])
+        bodies = scene.actuated_links[k], scene.intermediate_links[k]
+        drive, link = (multiply(body.mass, body.centre) for body in bodies)
     stops = None
     if scene.stroke.stiffness is not None:
         damping = damping_of(scene.stroke)
@@ -227,153 +190,3 @@ def _join(springs: list[Any]) -> JointSpring | None:
     if not springs:
         return None
     return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
-
-
-def _moment(link: Link) -> Triple:
-    x, y, z = link.centre
-    return (link.mass * x, link.mass * y, link.mass * z)
-
-
-class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E}: see `kernel` for the letters.
-
-    Attributes:
-        leg: its constants.
-        axis: w_k.
-        along: t_k = (e0, e1, 0).
-        outward: p in {B}, which points along r_k.
-        b: beta_dot = b.W.
-
-    """
-
-    leg: Leg
-    axis: Triple
-    along: Triple
-    a: Scalar
-    p: Triple
-    u: Scalar
-    g: Triple
-    b: Triple
-    outward: Triple
-    gamma_dot: Scalar
-    a_dot: Scalar
-    beta_dot: Scalar
-
-
-def joint_torques(at: LegMotion, field: Triple) -> Triple:
-    """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
-    loads = at.leg.loads
-    if loads is None:
-        return ZERO
-    friction = triple(
-        0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
-        for kind, one in enumerate(loads.friction)
-    )
-    springs = triple(
-        0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
-        for kind, spring in enumerate(loads.springs)
-    )
-    at_gamma, at_mu = _weight(loads, at, field)
-    if loads.stops is not None:
-        at_gamma = at_gamma + stop_torque(loads.stops, joint_angle(at, 0), at.gamma_dot)
-    return (
-        friction[0] + springs[0] + at_gamma,
-        friction[1] + springs[1] + at_mu,
-        friction[2] + springs[2],
-    )
-
-
-def spring_and_weight_energy(at: LegMotion, field: Triple) -> Scalar:
-    """Energy [J] in springs, elastic stops and the weight of the links."""
-    loads, total = at.leg.loads, 0.0
-    if loads is None:
-        return total
-    for kind, spring in enumerate(loads.springs):
-        if spring is not None:
-            stretch = joint_angle(at, kind) - spring.rest
-            total = total + 0.5 * spring.stiffness * stretch * stretch
-    if loads.stops is not None:
-        gamma = joint_angle(at, 0)
-        for depth in (positive(-gamma), positive(gamma - loads.stops.arc)):
-            total = total + 0.5 * loads.stops.stiffness * depth * depth
-    if any(loads.drive) or any(loads.link):
-        first, second = _directions(at)
-        total = total - dot(_combine(loads.drive, *first), field)
-        total = total - dot(_combine(loads.link, *second), field)
-    return total
-
-
-def dissipation(at: LegMotion) -> Scalar:
-    """Power [W] that friction and the damping of elastic stops take out."""
-    loads, total = at.leg.loads, 0.0
-    if loads is None:
-        return total
-    for kind, friction in enumerate(loads.friction):
-        if friction is not None:
-            total = total + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
-    if loads.stops is not None and loads.stops.damping:
-        gamma, speed = joint_angle(at, 0), at.gamma_dot
-        elastic = loads.stops._replace(damping=0.0)
-        excess = stop_torque(elastic, gamma, speed) - stop_torque(loads.stops, gamma, speed)
-        total = total + excess * speed
-    return total
-
-
-def friction_torque(friction: Friction, v: Scalar) -> Scalar:
-    """Friction torque [N m] against the rate v [rad/s]."""
-    torque = friction.viscous * v
-    if friction.coulomb or friction.static:
-        level: Scalar = friction.coulomb
-        if friction.static:
-            slow = v / friction.stribeck
-            level = level + (friction.static - friction.coulomb) * exp(-(slow * slow))
-        torque = torque + level * tanh(v / friction.smoothing)
-    return torque
-
-
-def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
-    """Torque of elastic stops; the damping grows from zero with the depth (Hunt-Crossley)."""
-    low, high = positive(-gamma), positive(gamma - stops.arc)
-    if not stops.damping:
-        return stops.stiffness * (low - high)
-    inward = stops.damping * gamma_dot
-    return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
-
-
-def joint_rate(at: LegMotion, kind: int) -> Scalar:
-    """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
-    if kind == 0:
-        return at.gamma_dot
-    return -at.a_dot / sqrt(at.u) if kind == 1 else at.beta_dot
-
-
-def joint_angle(at: LegMotion, kind: int) -> Scalar:
-    """Angle of gamma (0), mu (1) or beta (2) [rad]."""
-    if kind == 0:
-        return atan2(dot(at.outward, at.leg.across), dot(at.outward, at.leg.v))
-    if kind == 1:
-        return atan2(sqrt(at.u), at.a)
-    # r.(t x s) and r.s with s = (0, 0, 1), both times sqrt(u).
-    return atan2(at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2])
-
-
-def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
-    """Torques of the links' weight at gamma and mu: moments about w_k and -r_k."""
-    if not (any(loads.drive) or any(loads.link)):
-        return 0.0, 0.0
-    first, second = _directions(leg)
-    on_link = cross(_combine(loads.link, *second), field)
-    on_both = cross(_combine(loads.drive, *first), field)
-    total = (on_link[0] + on_both[0], on_link[1] + on_both[1], on_link[2] + on_both[2])
-    return dot(total, leg.axis), -dot(on_link, first[0])
-
-
-def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
-    """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
-    root = sqrt(leg.u)
-    r = (leg.p[0] / root, leg.p[1] / root, leg.p[2] / root)
-    return (r, cross(leg.axis, r), leg.axis), (r, cross(leg.along, r), leg.along)
-
-
-def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
-    return triple(c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))

@@ -58,7 +58,11 @@ class Dynamics:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state by time; inputs are state and drive."""
-        return trace(self._derivative, (*self.state, *self.drive))
+
+        def slope(*inputs: Any) -> tuple[Any, ...]:
+            return kernel.derivative(self.numbers, *self._split(inputs))
+
+        return trace(slope, (*self.state, *self.drive))
 
     @cached_property
     def derivative(self) -> Function:
@@ -73,7 +77,11 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-        return trace(self._joints, (*QUATERNION, *RATE))
+
+        def joints(*state: Any) -> tuple[Any, ...]:
+            return tuple(number for kind in kernel.joints(self.numbers, state) for number in kind)
+
+        return trace(joints, (*QUATERNION, *RATE))
 
     @cached_property
     def inverse(self) -> Function:
@@ -81,15 +89,28 @@ class Dynamics:
 
         Of the first seven numbers of the state, W_dot, and a moment if it comes from a topic.
         """
+
+        def torques(*inputs: Any) -> tuple[Any, ...]:
+            q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:]
+            found = kernel.actuator_torque(self.model, q, rate, acceleration, moment or None)
+            rows = rotation_rows(q)
+            squares = (kernel.leg_motion(leg, rows, rate).u for leg in self.model.legs)
+            return (*found[0], found[1], *squares)
+
         more = MOMENT if self.has_moment_topic else ()
-        return compile_program(
-            trace(self._inverse, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more))
-        )
+        return compile_program(trace(torques, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
 
     @cached_property
     def energies(self) -> Function:
         """Kinetic and potential energy [J] and power put in [W], of state and drive."""
-        return compile_program(trace(self._energies, (*self.state, *self.drive)))
+
+        def energies(*inputs: Any) -> tuple[Any, ...]:
+            model, (state, torque, moment) = self.model, self._split(inputs)
+            kinetic = kernel.kinetic_energy(model, state)
+            potential = kernel.potential_energy(model, state)
+            return kinetic, potential, kernel.power(model, state, torque, moment)
+
+        return compile_program(trace(energies, (*self.state, *self.drive)))
 
     def total_energy(self, state: Sequence[float]) -> float:
         """Kinetic and potential energy [J] of a state, whose further numbers are not looked at."""
@@ -101,27 +122,6 @@ class Dynamics:
         """The model, in which what is not 0 or 1 may have another value in another scene."""
         model: kernel.Model = number_constants(self.model, ("model",))
         return model
-
-    def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
-        return kernel.derivative(self.numbers, *self._split(inputs))
-
-    def _joints(self, *state: Any) -> tuple[Any, ...]:
-        return tuple(number for triple in kernel.joints(self.numbers, state) for number in triple)
-
-    def _inverse(self, *inputs: Any) -> tuple[Any, ...]:
-        q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:] or None
-        torque, determinant = kernel.actuator_torque(self.model, q, rate, acceleration, moment)
-        rows = rotation_rows(q)
-        squares = (kernel.leg_motion(leg, rows, rate).u for leg in self.model.legs)
-        return (*torque, determinant, *squares)
-
-    def _energies(self, *inputs: Any) -> tuple[Any, ...]:
-        state, torque, moment = self._split(inputs)
-        stored = (
-            kernel.kinetic_energy(self.model, state),
-            kernel.potential_energy(self.model, state),
-        )
-        return (*stored, kernel.power(self.model, state, torque, moment))
 
     def _split(self, inputs: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         size = len(self.state)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import with_jacobian
-from sst_ros.dynamics.model import joint_angle
 from sst_ros.dynamics.traced_dynamics import QUATERNION, compile_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
@@ -316,7 +315,7 @@ def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
         legs = [(kernel.leg_motion(leg, rows, ZERO), leg) for leg in model.legs]
         first, second, third = rows
         return (
-            *(joint_angle(at, 0) for at, leg in legs),
+            *(kernel.joint_angle(at, 0) for at, leg in legs),
             atan2(second[2], first[2]),
             atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
             atan2(third[1], -third[0]),

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from sst_ros.dynamics.kernel import Leg, Model, leg_motion
+from sst_ros.dynamics.kernel import Leg, LegMotion, Model, leg_motion
 from sst_ros.dynamics.limits import Limit
-from sst_ros.dynamics.model import LegMotion
-from sst_ros.mechanism.generic_math import Scalar, dot, rotation_rows
+from sst_ros.mechanism.generic_math import Scalar, dot3, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 
@@ -150,7 +149,7 @@ def _distance(
 ) -> tuple[Scalar, Scalar]:
     """sqrt(u) sin(sign * (angle - end)) and its rate; of mu sin(mu)^2 - sin(end)^2."""
     if limit.joint < 3:
-        along, across, rate = dot(at.outward, leg.v), dot(at.outward, leg.across), at.gamma_dot
+        along, across, rate = dot3(at.outward, leg.v), dot3(at.outward, leg.across), at.gamma_dot
     elif limit.joint < 6:
         return at.u - sine * sine, -2.0 * at.a * at.a_dot
     else:

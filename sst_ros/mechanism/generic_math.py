@@ -161,11 +161,11 @@ def rotate_back(rows: Rows, vector: Triple) -> Triple:
     return (first, second, third)
 
 
-def dot(a: Triple, b: Triple) -> Scalar:
+def dot3(a: Triple, b: Triple) -> Scalar:
     """Scalar product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Triple, b: Triple) -> Triple:
+def cross3(a: Triple, b: Triple) -> Triple:
     """Vector product of two triples."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

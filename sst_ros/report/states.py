@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.initial_state import body_acceleration, initial_state
+from sst_ros.dynamics.initial_state import accelerate_by_paper, initial_state
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -111,7 +111,7 @@ def compare_with_paper(
     for y, (first, second, third) in given:
         state = tuple(y[:7].tolist())
         try:
-            paper, _ = body_acceleration(mechanism, state, (first, second, third))
+            paper, _ = accelerate_by_paper(mechanism, state, (first, second, third))
         except (SingularConfiguration, np.linalg.LinAlgError):
             continue
         ours = np.array(kernel.derivative(model, state, (first, second, third))[4:7])

@@ -39,7 +39,7 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_result import BatchResult
 from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
 from sst_ros.integration.methods import DOP853
-from sst_ros.mechanism.generic_math import axpy, dot, positive
+from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.sweeps.sweep_study import ControlledRun
 
@@ -292,7 +292,7 @@ class ControlledBatch:
         )
         if self._limited:
             cut = axpy(1.0, command.total, -1.0, command.torque)
-            new["limited"] = (memory["limited"][0] + is_above(dot(cut, cut)),)
+            new["limited"] = (memory["limited"][0] + is_above(dot3(cut, cut)),)
             torque = bound(torque, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
         new["squares"] = tuple(s + e * e for s, e in zip(memory["squares"], off, strict=True))

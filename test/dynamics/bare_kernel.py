@@ -15,8 +15,8 @@ import numpy as np
 
 from sst_ros.dynamics.expression import Program, trace
 from sst_ros.mechanism.generic_math import (
-    cross,
-    dot,
+    cross3,
+    dot3,
     quaternion_rate,
     rotate_back,
     rotation_rows,
@@ -35,7 +35,7 @@ def derivative(star, legs, q, rate, torque):
     for _, e, _, link in legs:
         mass = mass + link[0][0] * (np.eye(3) - np.outer(e, e))
     mass = mass.tolist()
-    force = list(cross([dot(row, rate) for row in mass], rate))
+    force = list(cross3([dot3(row, rate) for row in mass], rate))
     for leg, drive in zip(legs, torque, strict=True):
         add_leg(mass, force, leg, drive, rotation, rate)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = mass
@@ -49,10 +49,10 @@ def add_leg(mass, force, leg, drive, rotation, rate):
     p = (e1 * axis[2], -(e0 * axis[2]), side)
     u = side * side + axis[2] * axis[2]
     g = ((axis[0] - a * e0) / u, (axis[1] - a * e1) / u, axis[2] / u)
-    a_rate, c = dot(p, rate), dot(g, rate)
+    a_rate, c = dot3(p, rate), dot3(g, rate)
     # Accelerations of a and gamma that W' = 0 leaves.
     about = e0 * rate[0] + e1 * rate[1]
-    a_left = dot(axis, rate) * about - a * dot(rate, rate)
+    a_left = dot3(axis, rate) * about - a * dot3(rate, rate)
     c_left = a_rate * (2.0 * a * c - about) / u
     # Energy m a' c + d c^2 / 2 and its slopes by a.
     d = (own + iyy - ixx) + (izz - iyy + ixx) * (a * a)

@@ -18,7 +18,8 @@ from scipy.linalg import eigh
 
 from sst_ros import Simulation, load_scene
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.model import friction_torque, loads_of_leg, stop_torque
+from sst_ros.dynamics.kernel import friction_torque, stop_torque
+from sst_ros.dynamics.model import loads_of_leg
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
@@ -129,7 +130,7 @@ def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
 def extra_torque(sample, **terms):
     """Torque at the actuators that has the effect of the terms, by the paper's Eq. 90."""
     model = kernel.model_of(replace(sample.scene, **terms))
-    rate = kernel.body_acceleration(model, sample.quaternion, sample.body_rate, REST)
+    rate = kernel.derivative(model, sample.state, REST)[4:]
     arguments = sample.mechanism, sample.posture, sample.gamma_dot
     return virtual_work.inverse_dynamics(*arguments, sample.gamma_ddot_of(rate))
 
