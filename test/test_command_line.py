@@ -96,7 +96,7 @@ def error_of(words, capsys):
         (["report", "run", "nowhere"], "nowhere"),
         (["export", "nowhere"], "does not exist"),
         (["scene", "show", "nowhere"], "must be a readable .yaml file or one of"),
-        (["report", "accuracy", "--scene", "nowhere"], "must be a readable .yaml file or one of"),
+        (["report", "accuracy", "nowhere"], "must be a readable .yaml file or one of"),
         (["plan", "check", "spiral", "--csv", "{here}"], "--csv"),
         (["plan", "check", "spiral", "--force", "--csv", "{here}"], "Is a directory"),
         (["plan", "check", "spiral", "--csv", "/proc/torques.csv"], "/proc/torques.csv"),

@@ -82,7 +82,7 @@ plan check reach --csv /proc/x
 plan check reach --csv /tmp
 report run /nonexistent
 report run /etc
-report accuracy --scene nosuchscene
+report accuracy nosuchscene
 export /nonexistent
 plot /nonexistent
 recover /nonexistent

@@ -193,8 +193,6 @@ COMMANDS: dict[str, Subcommand | str] = {
         _scene(
             "scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"
         ),
-        _scene("--scene", "the same", nargs="+", default=[], metavar="S"),
-        _flag("--all", "all shipped scenes, the default"),
         *_out("folder of the results", "accuracy_out"),
         _flag("--mpmath", "reference in 30 digits, slow"),
     ),
@@ -223,14 +221,14 @@ COMMANDS: dict[str, Subcommand | str] = {
     ),
     "export": Subcommand(
         "write a recorded run as CSV or Parquet",
-        "cli.recordings:write_tables",
+        "cli.runs:write_tables",
         BAG,
         Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
         *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
     "recover": Subcommand(
         "write a valid recording from a truncated or damaged one",
-        "cli.recordings:write_recovered",
+        "cli.runs:write_recovered",
         BAG,
         _path("--out", "folder of the new bag; default: beside the old"),
     ),
@@ -247,7 +245,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation motions",
-        "cli.identification:run_identification",
+        "cli.motions:run_identification",
         Arg("bag", "folder of the bag, or the word design", metavar="BAG"),
         _scene(
             "designed",
@@ -313,16 +311,13 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(parser=self)  # that of the innermost command remains
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and the error, and exit with status 2."""
-        super().error(printable(message) + self._suggestion(message))
-
-    def _suggestion(self, message: str) -> str:
-        wrong = re.search(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message)
-        if wrong is None:
-            return ""
-        known = [str(choice) for action in self._actions for choice in action.choices or ()]
-        known += self._option_string_actions
-        return suggestion(wrong[1] or wrong[2].partition("=")[0], known)
+        """Print the usage, the error and the nearest name; exit with status 2."""
+        more = ""
+        if wrong := re.search(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message):
+            known = [str(choice) for action in self._actions for choice in action.choices or ()]
+            known += self._option_string_actions
+            more = suggestion(wrong[1] or wrong[2].partition("=")[0], known)
+        super().error(printable(message) + more)
 
 
 def parser() -> Parser:

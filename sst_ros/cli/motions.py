@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands on motions of a scene: a plan of one, a sweep of many."""
+"""Commands on motions: a plan of one, a sweep of many, a scene from one that was recorded."""
 
 from __future__ import annotations
 
@@ -10,16 +10,19 @@ from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.time_scaling import plan_json, plan_table, time_scaling, write_torques
 from sst_ros.errors import InputError, Problem
-from sst_ros.host.output import require_free
+from sst_ros.host.output import require_free, write_into
+from sst_ros.identification.excitation import design
+from sst_ros.identification.identify import identify
 from sst_ros.scene.scene import load
+from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.sweeps.chunk_task import read_sweep, summarize
 from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
-PLOT = "plot"
-"""Word in place of a study."""
+PLOT, DESIGN = "plot", "design"
+"""Words in place of a study, and of a bag."""
 
 
 def check_plan(options: argparse.Namespace) -> int:
@@ -72,8 +75,38 @@ def run_sweep(options: argparse.Namespace) -> None:
 def _draw_sweep(options: argparse.Namespace) -> None:
     if options.folder is None or options.scheduler or options.workers or options.resume:
         options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
-    draw = function(
-        "sweeps.sweep_pictures:draw_pictures"
-    )  # Matplotlib, which a sweep does not need
+    draw = function("sweeps.sweep_pictures:draw_pictures")  # a sweep needs no Matplotlib
     for path in draw(read_sweep(options.folder), options.out or options.folder):
         print(path)
+
+
+def run_identification(options: argparse.Namespace) -> None:
+    """Identify a scene from a recorded run, or design a motion that determines its parameters."""
+    designing = options.bag == DESIGN
+    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
+    form = DESIGN if designing else "BAG"
+    wrong = [
+        Problem(f"--{name}", getattr(options, name), f"is no option of identify {form}")
+        for name in (others if designing else ours)
+        if getattr(options, name) is not None
+    ]
+    if designing != (options.designed is not None):
+        allowed = "must be given after design, and only there"
+        wrong.append(Problem("SCENE", options.designed, allowed))
+    if wrong:
+        raise InputError("identify", wrong)
+    if options.out is not None:
+        free_out(options, options.out)
+    names = ours if designing else others
+    chosen = {name: value for name in names if (value := getattr(options, name)) is not None}
+    if designing:
+        motion = design(load(options.designed), options.parameters, **chosen)
+        lines, scene = motion.table(), motion.scene
+    else:
+        found = identify(options.bag, parameters=options.parameters, **chosen)
+        lines, scene = found.table(), found.scene
+    print(lines, end="")
+    if options.out is not None:
+        with write_into(options.out.parent, "identify"):
+            options.out.write_text(dump(scene), encoding="utf-8")
+        print(f"wrote {options.out}")

@@ -31,8 +31,7 @@ def report_accuracy(options: argparse.Namespace) -> None:
     """Measure the error and the run time of every method."""
     out = free_out(options, "accuracy_out")
     kind = MPMATH if options.mpmath else EXTENDED
-    scenes = [] if options.all else [*options.scenes, *options.scene]
-    accuracy.write_accuracy_report(scenes or names(), out, kind=kind)
+    accuracy.write_accuracy_report(options.scenes or names(), out, kind=kind)
 
 
 def report_stability(options: argparse.Namespace) -> int:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that assemble a scene: contents, faults, motion, compiled code, workspace, view.
+"""Commands on one scene or one recording: contents, faults, motion, compiled code, tables, view.
 
-Matplotlib and the page are imported by name where they are asked for: the rest runs without them.
+What needs an extra is imported by name where it is asked for: the rest runs without it.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import signal
 import threading
@@ -19,7 +20,7 @@ from sst_ros.errors import InputError, Problem, SstError, suggestion
 from sst_ros.extras import require
 from sst_ros.host import child_process
 from sst_ros.host.cache_folder import cache_folder, configured_folder
-from sst_ros.host.output import require_free
+from sst_ros.host.output import require_free, results_folder
 from sst_ros.host.table_file import SUFFIXES
 from sst_ros.integration import codegen, compiled_method
 from sst_ros.mechanism import workspace
@@ -174,24 +175,17 @@ def run_simulation(options: argparse.Namespace) -> int:
 
 def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one that is started for it."""
-    if options.bag is not None and options.scene is not None:
-        refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
     if options.bag is not None:
+        if options.scene is not None:
+            refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
         return _replay(options)
     require("rclpy")
-    if options.scene is None:
-        return _view_live(options)
-    load(options.scene)
-    with simulator(options.scene):
-        return _view_live(options)
-
-
-def _view_live(options: argparse.Namespace) -> int:
+    if options.scene is not None:
+        load(options.scene)  # refused before a process of its own would be
     given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
-    space = f"__ns:={options.namespace}"
-    status: int = function("nodes.process:run")(
-        ["viewer", "--ros-args", "-r", space, *child_process.words(given)]
-    )
+    words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace}"]
+    with simulator(options.scene) if options.scene else contextlib.nullcontext():
+        status: int = function("nodes.process:run")([*words, *child_process.words(given)])
     return status
 
 
@@ -205,3 +199,19 @@ def _replay(options: argparse.Namespace) -> int:
         pass
     page.close()
     return 0
+
+
+def write_tables(options: argparse.Namespace) -> None:
+    """Write the tables of a recorded run."""
+    out = free_out(options, results_folder(options.bag, "tables"))
+    export = function("recording.recording:export")
+    for path in export(options.bag, out, options.format, force=options.force):
+        print(path)
+
+
+def write_recovered(options: argparse.Namespace) -> None:
+    """Write what is intact in a recording as a new one."""
+    found = function("recording.bag_writer:recover")(options.bag, options.out)
+    print(f"{found.messages} messages recovered into {found.bag}, {found.lost} known to be lost")
+    for line in found.damage:
+        print(f"  {line}")
