@@ -109,6 +109,9 @@ def error_of(words, capsys):
         (["simulate", "example2", "--samples", "0"], "--samples = 0: must be a whole number"),
         (["compile", "--integrator", "nope"], "must be one of auto, rk4"),
         (["scene", "show", "{here}/latin.yaml"], "latin.yaml"),
+        (["view", "no_such_bag"], "does not exist"),
+        (["view", "--scene", "no_such_scene"], "must be a readable .yaml file"),
+        (["view", "some_bag", "--scene", "swing"], "a bag or a scene, not both"),
     ],
 )
 def test_an_error_is_one_line(words, said, tmp_path, monkeypatch, capsys):

@@ -5,7 +5,6 @@ import gc
 import random
 import struct
 
-import bags
 import pytest
 from mcap.records import ChunkIndex, MessageIndex
 from mcap.writer import MCAP0_MAGIC
@@ -49,32 +48,22 @@ def messages_of(bag):
         return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
 
 
-def flips(content, count, seed):
-    """Contents with one byte changed, at random places and in random ways."""
-    generator = random.Random(seed)
-    for _ in range(count):
-        at, bits = generator.randrange(len(content)), generator.randrange(1, 256)
+def check_changes(whole, path, changes):
+    """Change bytes, one at a time; return how often that made no difference, and none was told."""
+    content, expected = content_of(whole), list(McapFile(next(whole.glob("*.mcap"))).messages())
+    unnoticed = 0
+    for at, bits in changes:
         changed = bytearray(content)
         changed[at] ^= bits
-        yield at, bytes(changed)
-
-
-def check_flips(whole, folder, count, seed):
-    expected, messages = recording.read(whole), messages_of(whole)
-    refused = 0
-    for number, (at, content) in enumerate(flips(content_of(whole), count, seed)):
-        bag = damaged_copy(folder / str(number), whole, content)
-        try:
-            bags.same(recording.read(bag), expected)  # else a silent difference
-        except InputError as error:
-            refused += 1
-            assert "byte" in str(error) or "ends before" in str(error), str(error)
-        found = recover(bag, folder / f"{number}_recovered")
-        kept = messages_of(found.bag)
-        assert set(kept) <= set(messages), f"byte {at}: an invented message"
-        assert len(messages) - len(kept) == found.lost, f"byte {at}: losses not counted"
-        assert found.lost <= CHUNK and bool(found.damage) >= bool(found.lost)
-    return refused
+        path.write_bytes(changed)
+        file = McapFile(path)
+        kept = list(file.messages())
+        unnoticed += file.intact
+        assert kept == expected or not file.intact, f"byte {at}: a silent difference"
+        assert bool(file.describe()) == (not file.intact)
+        assert set(kept) <= set(expected), f"byte {at}: an invented message"
+        assert len(expected) - len(kept) == file.lost <= CHUNK, f"byte {at}: losses not counted"
+    return unnoticed
 
 
 def check_cuts(whole, folder, count, seed):
@@ -99,8 +88,14 @@ def check_cuts(whole, folder, count, seed):
         assert found.cut and kept == messages[: sum(end <= size for end in ends)]
 
 
-def test_a_changed_byte_is_never_silent(whole, tmp_path):
-    assert check_flips(whole, tmp_path, 100, seed=1) >= 99
+@pytest.mark.parametrize(
+    "count", [100, pytest.param(500, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+)
+def test_a_changed_byte_is_never_silent(count, whole, tmp_path):
+    size, generator = len(content_of(whole)), random.Random(count)
+    changes = [(generator.randrange(size), generator.randrange(1, 256)) for _ in range(count)]
+    assert check_changes(whole, tmp_path / "bag.mcap", changes) <= max(1, count // 250)
+    check_cuts(whole, tmp_path, 3 * count // 10, seed=count)
 
 
 def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, tmp_path):
@@ -111,28 +106,10 @@ def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, t
         heads.append(position)
         position += 9 + struct.unpack_from("<Q", content, position + 1)[0]
     assert len(heads) > 40 and position == len(content) - len(MCAP0_MAGIC)
-    path = tmp_path / "bag.mcap"
-    expected = list(McapFile(next(whole.glob("*.mcap"))).messages())
-    for at in [head + generator.randrange(24) for head in heads for _ in range(4)]:
-        changed = bytearray(content)
-        changed[min(at, len(content) - 1)] ^= 1 << generator.randrange(8)
-        path.write_bytes(changed)
-        file = McapFile(path)
-        kept = list(file.messages())
-        assert not file.intact and file.describe(), f"byte {at}: a silent difference"
-        assert set(kept) <= set(expected), f"byte {at}: an invented message"
-        assert len(expected) - len(kept) == file.lost <= CHUNK, f"byte {at}: losses not counted"
-
-
-def test_a_cut_recording_keeps_what_lies_before_the_cut(whole, tmp_path):
-    check_cuts(whole, tmp_path, 30, seed=2)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_changed_byte_is_never_silent_in_many(whole, tmp_path):
-    assert check_flips(whole, tmp_path / "flips", 500, seed=3) >= 498
-    check_cuts(whole, tmp_path / "cuts", 100, seed=4)
+    at = [min(head + generator.randrange(24), len(content) - 1) for head in heads * 4]
+    assert (
+        check_changes(whole, tmp_path / "bag", [(k, 1 << generator.randrange(8)) for k in at]) == 0
+    )
 
 
 def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_path):
@@ -146,6 +123,10 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
     run = recording.read(bag, damaged=True)
     assert 30 < len(run.time_ns) < 51
     assert any("40 messages are lost" in line for line in run.signals.damage)
+    found = recover(bag, tmp_path / "recovered")
+    whole_messages, kept = messages_of(whole), messages_of(found.bag)
+    assert set(kept) < set(whole_messages) and len(kept) == len(whole_messages) - CHUNK
+    assert found.lost == CHUNK and found.damage and not found.cut
 
 
 def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, entries):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading bags: what a whole one gives, and that every broken one is refused in words."""
+"""What a whole bag gives, as a motion to follow too, and that every broken one is refused."""
 
 import copy
 import dataclasses
@@ -10,10 +10,15 @@ import pytest
 from rosbags.rosbag2 import CompressionMode
 
 import sst_ros
+from sst_ros import __main__ as cli
+from sst_ros.control.plan import examine_motion
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import Bag
-from sst_ros.scene import scene
+from sst_ros.recording.recording import read_run_motion
+from sst_ros.scene import scene, yaml_document
+from sst_ros.scene.loads import DesiredMotion, Recorded
 
 
 @pytest.fixture
@@ -131,6 +136,7 @@ CONTENTS = [
     ("ORIENTATION", "quaternion.w", 3.0, "orientation.*must have length 1"),
     ("APPLIED", "joint_names", ["a", "b", "c"], "applied_torques.*gamma_1, gamma_2, gamma_3"),
     ("APPLIED", "header.stamp", -2_500_000, "ticks overlap"),
+    ("SCENE", "data", ("radius: 0.4", "radius: -0.4"), "/sst_simulator/scene: .*star.radius.*> 0"),
 ]
 
 
@@ -140,21 +146,14 @@ def test_contents_that_cannot_be_are_refused(reread, bags, example2, topic, attr
         result, (*parents, last) = copy.deepcopy(message), attribute.split(".")
         owner = getattr(result, parents[0]) if parents else result
         new = bags.time(AT + value) if last == "stamp" else value
+        if topic == "SCENE":
+            new = message.data.replace(*value)
         object.__setattr__(owner, last, new)
         return result
 
+    sample = -1 if topic == "SCENE" else 70
     with pytest.raises(InputError, match=f"(?s){said}"):
-        reread(bags.edited(example2, getattr(bags, topic), 70, change))
-
-
-def test_a_scene_that_is_refused_names_topic_and_key(reread, bags, example2):
-    def broken(message):
-        return dataclasses.replace(
-            message, data=message.data.replace("radius: 0.4", "radius: -0.4")
-        )
-
-    with pytest.raises(InputError, match=r"/sst_simulator/scene: .*star.radius.*> 0"):
-        reread(bags.edited(example2, bags.SCENE, -1, broken))
+        reread(bags.edited(example2, getattr(bags, topic), sample, change))
 
 
 def test_bags_of_every_kind_hold_the_same_run(reread, tmp_path, bags, example2):
@@ -206,3 +205,47 @@ def test_a_recording_is_a_trajectory_and_tables(tmp_path, bags, example2):
     assert between.gamma[0] == pytest.approx(simulation.state.joints.gamma, abs=1e-12)
     table = run.table("ticks")
     assert np.array_equal(table["tau_1_N_m"], run.ticks.torque[:, 0]) and table.index[0] == 0
+
+
+@pytest.fixture
+def bag(written, example2):
+    return written(example2)
+
+
+def following(bag):
+    motion = DesiredMotion(recorded=Recorded(bag=str(bag)))
+    return dataclasses.replace(scene.load("example2"), motion=motion)
+
+
+def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag):
+    """Held for 1 ms they are a staircase; the smooth motion asks for what lies between."""
+    run, held = recording.read(bag), following(bag)
+    plan = examine_motion(reference_motion(held, read_run_motion), held)
+    assert plan.motion.duration == pytest.approx(run.seconds[-1], abs=1e-12)
+    for row in (0, 40, len(run.gamma) - 1):
+        at = plan.motion.at(run.seconds[row])
+        assert at.gamma == pytest.approx(run.gamma[row], abs=1e-13)
+        assert at.gamma_dot == pytest.approx(run.gamma_dot[row], abs=1e-11)
+        assert at.quaternion == pytest.approx(run.quaternion[row], abs=1e-12)
+    torque = held.torque.at
+    # What is held since the last millisecond lags behind the sine by half of one.
+    expected = np.array([torque(time - 0.0005) for time in plan.times.tolist()])
+    inside = (plan.times > 0.02) & (plan.times < plan.motion.duration - 0.02)
+    half_a_step = 0.0005 * np.max(np.multiply(held.torque.amplitude, held.torque.frequency))
+    assert np.abs(plan.torques - expected)[inside].max() < half_a_step
+    assert np.abs(expected).max() > 100.0 * half_a_step
+
+
+def test_the_command_reads_the_bag(bag, tmp_path, capsys):
+    path = tmp_path / "again.yaml"
+    path.write_text(yaml_document.dump(following(bag)), encoding="utf-8")
+    assert cli.main(["plan", "check", str(path)]) == 0
+    assert "At any speed: the scene has no limit" in capsys.readouterr().out
+
+
+def test_what_is_no_motion_of_the_manipulator_is_refused(bag, tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        reference_motion(following(tmp_path / "nowhere"), read_run_motion)
+    other = dataclasses.replace(scene.load("general"), motion=following(bag).motion)
+    with pytest.raises(Exception, match="does not close the loops"):
+        reference_motion(other, read_run_motion)

@@ -4,8 +4,6 @@
 import http.client
 import re
 import socket
-import subprocess
-import sys
 from urllib.parse import urlsplit
 
 import pytest
@@ -16,7 +14,6 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from sst_ros.__main__ import main
 from sst_ros.errors import InputError
 from sst_ros.view.server import LOCAL, PageServer
 
@@ -122,23 +119,3 @@ def test_other_machines_addresses(host):
 def test_ports_that_are_none(port):
     with pytest.raises(InputError, match=r"port = .*must be between 1024 and 65535"):
         PageServer(port=port)
-
-
-def test_a_port_that_is_none_ends_the_command_with_one_line(bag):
-    command = [sys.executable, "-m", "sst_ros", "view", str(bag), "--port", "-1"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert ended.returncode != 0
-    assert "Traceback" not in ended.stderr and "from 1024 to 65535" in ended.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["no_such_bag"], "does not exist"),
-        (["--scene", "no_such_scene"], "must be a readable .yaml file"),
-        (["some_bag", "--scene", "swing"], "a bag or a scene, not both"),
-    ],
-)
-def test_what_cannot_be_shown(words, said, capsys):
-    assert main(["view", *words]) == 1
-    assert said in capsys.readouterr().err
