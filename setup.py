@@ -35,7 +35,7 @@ EXTRAS = {
     "record": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
     "plot": ["jinja2>=3", "matplotlib>=3.5", "pandas>=2"],
     "fast": ["numba>=0.57"],
-    "sweep": ["dask>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
+    "sweep": ["numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "view": ["jinja2>=3", "viser>=1.1,<2"],
 }

@@ -141,7 +141,7 @@ def _ratios(steps: int) -> dict[str, float]:
 
 def _chunks(study: SweepStudy, steps: int, folder: str) -> None:
     """Compute and write all chunks of a study, on all cores."""
-    task = ChunkTask(study, steps, folder, list_versions())
+    task = ChunkTask(study, steps, Path(folder), list_versions())
     run_local(task, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
 
 
@@ -187,7 +187,7 @@ def _cluster(steps: int) -> dict[str, float]:
         dask.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
         dask.Client(cluster) as client,
     ):
-        task = ChunkTask(study, steps, folder, list_versions())
+        task = ChunkTask(study, steps, Path(folder), list_versions())
         client.wait_for_workers(2, timeout=60)
         send_code(client, ready.module)
         both = list(client.scheduler_info(n_workers=-1)["workers"])
@@ -197,7 +197,7 @@ def _cluster(steps: int) -> dict[str, float]:
             client.gather([client.submit(_on_worker, task, i, **one) for i in range(CHUNKS)])
 
         def run_on_both() -> None:
-            run_on_cluster(client, task, range(CHUNKS), lambda _: None, print)
+            run_on_cluster(client, task, range(CHUNKS), lambda _: None)
 
         def run_empty() -> None:
             client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
@@ -235,7 +235,7 @@ def _hash(threads: int) -> None:
 
 
 def _on_worker(task: ChunkTask, index: int) -> str:
-    return run_chunk(task, index).status
+    return run_chunk(task, index).fault
 
 
 def _nothing(index: int) -> int:

@@ -9,7 +9,6 @@ from typing import Any
 from sst_ros.errors import SstError
 
 EXTRAS = {
-    "dask": "sweep",
     "distributed": "cluster",
     "jinja2": "plot",
     "lz4": "record",

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -142,13 +142,17 @@ UNITS = {
 """Unit of each column of a table of states: of one motion, or of many at their end."""
 
 
-def columns_of(states: Any) -> dict[str, Array]:
-    """Columns of a motion or a batch, each shape (n,), by the names of `UNITS`."""
+def columns_of(states: Any, names: Iterable[str] = (*QUANTITIES, "energy")) -> dict[str, Array]:
+    """Columns of a motion or a batch, each of the shape of t, by the names of `UNITS`."""
     columns: dict[str, Array] = {"t": states.t}
-    for name, (_, dimension) in QUANTITIES.items():
+    for name in names:
         array = getattr(states, name)
-        columns |= {f"{name}_{part}": array[:, i] for i, part in enumerate(DIMENSIONS[dimension])}
-    return columns | {"energy": states.energy}
+        if name in QUANTITIES:
+            parts = enumerate(DIMENSIONS[QUANTITIES[name][1]])
+            columns |= {f"{name}_{part}": array[..., i] for i, part in parts}
+        else:
+            columns[name] = array
+    return columns
 
 
 def arrays_of(states: Any, *first: str) -> dict[str, Any]:

@@ -4,14 +4,22 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 from sst_ros.errors import SstError
-from sst_ros.host.output import require_free
+from sst_ros.host.output import require_free, slices
 
 DOCS = Path(__file__).parents[1] / "docs"
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 
 def parser(name: str, description: str, out: Path) -> argparse.ArgumentParser:
@@ -44,3 +52,41 @@ def run(
     except SstError as error:
         print(f"{arguments.prog}: {error}", file=sys.stderr)
         return 1
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    progress: str = "",
+    workers: int | None = None,
+) -> list[Result]:
+    """Call a function of a module for each job; return the results in the order of the jobs.
+
+    A result may depend on its job only: then all bits are the same for any number of workers.
+
+    Args:
+        function: what to call; each process imports it by its name.
+        jobs: its arguments.
+        progress: label of a bar on the terminal; empty for none.
+        workers: processes; None for one a core, 1 for this process alone.
+
+    """
+    workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
+    bar = slices(len(jobs), 1, progress, bool(progress))
+    if workers <= 1:
+        return [function(jobs[part.start]) for part in bar]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _end_with_the_parent) as pool:
+        return [result for _, result in zip(bar, pool.map(function, jobs), strict=True)]
+
+
+def _end_with_the_parent() -> None:
+    """End a worker whose parent was killed; nothing else would end it."""
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -31,7 +31,7 @@ from sst_ros.scene.scene import Initial, Scene
 from sst_ros.scene.yaml_document import build, values_of
 from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
 from sst_ros.state import Vector3
-from sst_ros.sweeps.sweep_study import ControlledRun
+from sst_ros.sweeps.sweep_study import SampledControl
 from studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
@@ -73,15 +73,19 @@ class ChannelState:
 
 @dataclass(frozen=True)
 class ModelError:
-    """One error of a controller: its model of the plant's scene, and what stands between them."""
+    """One error of a controller: in its model of the plant's scene, or in the channel to it."""
 
     name: str
-    model: Callable[[Scene], Scene] = lambda scene: scene
-    channel: ControlChannel = field(default_factory=ControlChannel)
+    change: Callable[[Scene], Scene] | None = None
+    channel: Mapping[str, Any] = field(default_factory=dict)  # fields of a `ControlChannel`
+
+    def model(self, plant: Scene) -> Scene:
+        """Return the controller's model of a plant."""
+        return plant if self.change is None else self.change(plant)
 
     def changes(self, plant: Scene) -> bool:
         """Whether this plant can have it: friction that is not there cannot be unknown."""
-        return self.channel != ControlChannel() or self.model(plant) != plant
+        return bool(self.channel) or self.model(plant) != plant
 
 
 def make_heavier(scene: Scene, factor: float) -> Scene:
@@ -108,10 +112,10 @@ def model_errors() -> Iterator[ModelError]:
     yield ModelError("friction unknown", partial(replace, friction=None))
     yield ModelError("gravity missing", partial(replace, gravity=None))
     for delay in range(1, 6):
-        yield ModelError(f"delay {delay}", channel=ControlChannel(delay=delay))
+        yield ModelError(f"delay {delay}", channel={"delay": delay})
     for counts in (65536, 16384):
-        yield ModelError(f"encoder {counts}", channel=ControlChannel(counts=counts))
-    yield ModelError("noise", channel=ControlChannel(angle_noise=1e-4, rate_noise=1e-2))
+        yield ModelError(f"encoder {counts}", channel={"counts": counts})
+    yield ModelError("noise", channel={"angle_noise": 1e-4, "rate_noise": 1e-2})
 
 
 TorqueOf = Callable[[Simulation], Any]
@@ -182,9 +186,12 @@ def run_in_loop(
 
 
 @dataclass(frozen=True)
-class ControlLoop(ControlledRun):
+class ControlLoop:
     """A controller and a plant."""
 
+    model: Scene  # the controller's, of the plant
+    motion: ReferenceMotion
+    settings: SampledControl
     plant: Scene  # what moves
     seed: int = 0  # of the noise
     rest_s: float = 0.0  # time for which the loop goes on after the motion
@@ -194,7 +201,7 @@ class ControlLoop(ControlledRun):
     @property
     def period_ns(self) -> int:
         """Time between samples, over which a torque is held [ns]."""
-        return round(self.channel.period * NANOSECONDS)
+        return round(self.settings.period * NANOSECONDS)
 
 
 def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
@@ -209,7 +216,7 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
     plant = at_start(loop.plant, loop.motion, loop.offset)
     simulation = Simulation(plant, compiled=numba_version() is not None)
     controller = Controller(loop.model, loop.motion, loop.settings, period)
-    channel = ChannelState(loop.channel, loop.seed)
+    channel = ChannelState(loop.settings, loop.seed)
     rows, limited, failure = [], [], ""
 
     def torque(simulation: Simulation) -> Vector3:
@@ -265,7 +272,7 @@ def ideal_plant(scene: Scene) -> Scene:
 
 def bandwidth_in_theory(loop: ControlLoop) -> float:
     """Return the limit of the sampled double integrator, `stability_limit` [rad/s]."""
-    limit = stability_limit(loop.settings.damping_ratio, loop.channel.delay)
+    limit = stability_limit(loop.settings.damping_ratio, loop.settings.delay)
     return limit * NANOSECONDS / loop.period_ns
 
 
@@ -277,7 +284,7 @@ def bandwidth_limit(loop: ControlLoop) -> float:
 
 def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
     """Return whether a small error is less in the last quarter of a run than in the second."""
-    ticks = 600 + 200 * loop.channel.delay
+    ticks = 600 + 200 * loop.settings.delay
     rest = RestMotion(loop.motion, ticks * loop.period_ns / NANOSECONDS)
     settings = replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
     held = replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)

@@ -23,8 +23,7 @@ from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot.style import free_figure
 from sst_ros.report.results import data_frame, markdown, provenance, write
 from sst_ros.scene.scene import Scene
-from sst_ros.sweeps.job_list import run_jobs
-from studies import DOCS, parser, run
+from studies import DOCS, parser, run, run_jobs
 
 METHODS = ("dopri5", "dop853", "rk4", "rodas4", "auto")
 TIGHTER = 1e-3

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from sst_ros.integration.codegen import numba_version
 from sst_ros.report.results import data_frame, markdown, provenance, records, write
-from sst_ros.sweeps.job_list import run_jobs
-from studies import DOCS, parser, run
+from studies import DOCS, parser, run, run_jobs
 from studies import extreme_runs as runs
 from studies import stability_limits as limits
 from studies.extreme_cases import LOOSE, catalogue

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.law import INSTANTS, MODES, ControlChannel, ControllerSettings
+from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking
@@ -41,8 +41,8 @@ from sst_ros.report.results import data_frame, markdown, provenance, records, wr
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import Vector3
-from sst_ros.sweeps.job_list import run_jobs
-from studies import DOCS, parser, run
+from sst_ros.sweeps.sweep_study import SampledControl
+from studies import DOCS, parser, run, run_jobs
 from studies import control_loop as loops
 from studies.control_loop import SHARE, ControlLoop, ModelError, model_errors, run_loop
 from studies.feedforward_figure import draw_study
@@ -152,10 +152,10 @@ def feedforward_study(
     scene, motion = plan.scene, _motion(plan.scene)
     errors = [error for error in plan.errors if error.name == "nominal" or error.changes(scene)]
     left_out = tuple(error.name for error in plan.errors if error not in errors)
-    basic = ControllerSettings(damping_ratio=plan.damping_ratio)
+    basic = SampledControl(damping_ratio=plan.damping_ratio, period=plan.period_ns / NANOSECONDS)
     # What takes longest comes first, so that no core waits for another at the end.
     jobs: list[Callable[[], Any]] = [
-        partial(_limit, scene, basic, plan.period_ns, delay) for delay in plan.delays
+        partial(_limit, scene, replace(basic, delay=delay)) for delay in plan.delays
     ]
     schemes = [
         replace(basic, mode=mode, bandwidth=bandwidth)
@@ -163,13 +163,15 @@ def feedforward_study(
         for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
     ]
     jobs += [partial(_track, plan, error, settings) for error in errors for settings in schemes]
-    holds = [replace(basic, mode=OPEN_LOOP, feedforward_at=at) for at in INSTANTS]
-    jobs += [
-        partial(_held, scene, each, plan.period_ns * n) for each in holds for n in plan.multiples
+    holds = [
+        replace(basic, mode=OPEN_LOOP, feedforward_at=at, period=plan.period_ns * n / NANOSECONDS)
+        for at in INSTANTS
+        for n in plan.multiples
     ]
+    jobs += [partial(_held, scene, each) for each in holds]
     jobs.append(partial(_unheld, scene))
     found = run_jobs(methodcaller("__call__"), jobs, f"{scene.name:<16}" if shown else "", workers)
-    limits, count = len(plan.delays), len(holds) * len(plan.multiples)
+    limits, count = len(plan.delays), len(holds)
     return FeedforwardStudy(
         plan, motion.duration, left_out, data_frame(found[limits : -count - 1], COLUMNS),
         data_frame(found[-count - 1 : -1]), found[-1],
@@ -177,23 +179,18 @@ def feedforward_study(
     )  # fmt: skip
 
 
-def _track(
-    plan: FeedforwardPlan, error: ModelError, settings: ControllerSettings
-) -> dict[str, Any]:
+def _track(plan: FeedforwardPlan, error: ModelError, settings: SampledControl) -> dict[str, Any]:
     """Run a loop: its row of the table."""
     motion, open_loop = _motion(plan.scene), settings.mode == OPEN_LOOP
     named = {
         "scene": plan.scene.name, "error": error.name, "mode": settings.mode,
         "bandwidth_rad_per_s": None if open_loop else settings.bandwidth,
-        "damping_ratio": plan.damping_ratio, "period_s": plan.period_ns / NANOSECONDS,
+        "damping_ratio": plan.damping_ratio, "period_s": settings.period,
         "seed": plan.seed,
     }  # fmt: skip
-    channel = replace(error.channel, period=plan.period_ns / NANOSECONDS)
-    track, limited, failure = run_loop(
-        ControlLoop(
-            error.model(plan.scene), motion, settings, channel, plan.scene, plan.seed, REST_S
-        )
-    )
+    model, settings = error.model(plan.scene), replace(settings, **error.channel)
+    loop = ControlLoop(model, motion, settings, plan.scene, plan.seed, REST_S)
+    track, limited, failure = run_loop(loop)
     if failure:
         return named | {"failure": failure}
     found = evaluate_tracking(track, int(limited.sum()))
@@ -214,22 +211,24 @@ def _track(
     return named | dict(zip(COLUMNS[len(named) :], numbers, strict=True))
 
 
-def _limit(plant: Scene, settings: ControllerSettings, period: int, delay: int) -> dict[str, Any]:
-    channel = ControlChannel(period=period / NANOSECONDS, delay=delay)
+def _limit(plant: Scene, settings: SampledControl) -> dict[str, Any]:
     ideal, real = (
-        ControlLoop(each, _motion(each), settings, channel, each)
+        ControlLoop(each, _motion(each), settings, each)
         for each in (loops.ideal_plant(plant), plant)
     )
-    found = loops.bandwidth_in_theory(real), *map(loops.bandwidth_limit, (ideal, real))
-    return dict(zip(("delay", "theory", "ideal", "real"), (delay, *found), strict=True))
+    return {
+        "delay": settings.delay,
+        "theory": loops.bandwidth_in_theory(real),
+        "ideal": loops.bandwidth_limit(ideal),
+        "real": loops.bandwidth_limit(real),
+    }
 
 
-def _held(plant: Scene, settings: ControllerSettings, period_ns: int) -> dict[str, Any]:
+def _held(plant: Scene, settings: SampledControl) -> dict[str, Any]:
     """Find the largest error of gamma under feedforward alone; nan where the loop fails."""
-    channel = ControlChannel(period=period_ns / NANOSECONDS)
-    track, _, failure = run_loop(ControlLoop(plant, _motion(plant), settings, channel, plant))
+    track, _, failure = run_loop(ControlLoop(plant, _motion(plant), settings, plant))
     error = math.nan if failure else float(np.abs(track.error).max())
-    return {"at": settings.feedforward_at, "period_s": period_ns / NANOSECONDS, "error": error}
+    return {"at": settings.feedforward_at, "period_s": settings.period, "error": error}
 
 
 def _unheld(plant: Scene) -> tuple[float, float]:

@@ -42,7 +42,7 @@ from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, ste
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Array
-from sst_ros.sweeps.job_list import run_jobs
+from studies import run_jobs
 from studies.extreme_scenes import FREE, POSE, changed, start
 from studies.sampled_data import largest_stable
 

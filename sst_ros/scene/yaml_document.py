@@ -236,6 +236,7 @@ def build(
     values: Any,
     origin: str,
     *,
+    path: str = "",
     of_row: bool = False,
     lines: Mapping[str, int] | None = None,
     known: Sequence[Problem] = (),
@@ -246,6 +247,7 @@ def build(
         cls: the section.
         values: by name; arrays are allowed.
         origin: of the values, for messages.
+        path: key of the section in a larger document, for messages.
         of_row: leave out what has no effect, as a friction whose coefficients are zero; a document
             that says such a thing is refused.
         lines: of keys, for messages.
@@ -256,7 +258,7 @@ def build(
 
     """
     problems = list(known)
-    result = _build(cls, plain(values), "", problems, of_row)
+    result = _build(cls, plain(values), path, problems, of_row)
     if not problems and result is not None:
         return result
     if lines is not None:

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import json
 import platform
-import threading
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
 
 METADATA = b"sst_ros"
-
-DONE, REFUSED, UNWRITABLE = "done", "refused", "unwritable"
 
 
 class SweepFailed(SstError):
@@ -54,8 +51,8 @@ class ChunkTask:
 
     study: SweepStudy
     steps: int
-    folder: str | None
-    versions: tuple[tuple[str, str], ...]
+    folder: Path | None
+    versions: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -64,77 +61,67 @@ class ChunkOutcome:
 
     Attributes:
         index: of the chunk.
-        status: DONE, REFUSED by a worker of another version, or UNWRITABLE.
-        detail: the reason, where it is not done.
-        rows: number of rows.
+        worker: its address.
+        fault: why this worker can compute no chunk, or write none; empty where it is done.
         reasons: how runs ended, and how many; without those that reached the end.
         table: the results, where no file is written.
         trajectory: states over time, where no file is written.
-        worker: address of the worker.
 
     """
 
     index: int
-    status: str
-    detail: str = ""
-    rows: int = 0
-    reasons: tuple[tuple[str, int], ...] = ()
+    worker: str
+    fault: str = ""
+    reasons: Mapping[str, int] = field(default_factory=dict)
     table: pa.Table | None = None
     trajectory: pa.Table | None = None
-    worker: str = ""
 
 
-def list_versions() -> tuple[tuple[str, str], ...]:
+def list_versions() -> dict[str, str]:
     """Versions on which the bits of results depend."""
     import numba
     import scipy
 
-    return (
-        ("sst_ros", VERSION),
-        ("python", ".".join(platform.python_version_tuple()[:2])),
-        ("numpy", np.__version__),
-        ("scipy", scipy.__version__),
-        ("numba", numba.__version__),
-    )
+    return {
+        "sst_ros": VERSION,
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "numba": numba.__version__,
+    }
 
 
-def difference(expected: tuple[tuple[str, str], ...]) -> str:
+def difference(expected: Mapping[str, str]) -> str:
     """How this process differs from the versions expected; empty where it does not."""
-    here = dict(list_versions())
-    texts = [
+    here = list_versions()
+    return ", ".join(
         f"{name} {here.get(name, 'missing')} in place of {version}"
-        for name, version in expected
+        for name, version in expected.items()
         if here.get(name) != version
-    ]
-    return ", ".join(texts)
+    )
 
 
 def run_chunk(task: ChunkTask, index: int, worker: str = "") -> ChunkOutcome:
     """Compute a chunk and write its file; a fault of this machine is an outcome, not an error."""
+    folder = task.folder
     if differs := difference(task.versions):
-        return ChunkOutcome(index, REFUSED, f"this worker has {differs}", worker=worker)
-    folder = None if task.folder is None else Path(task.folder)
+        return ChunkOutcome(index, worker, f"this worker has {differs}")
     if folder is not None and not folder.is_dir():
-        allowed = f"{folder} is not there: workers need the folder of --out on a shared disk"
-        return ChunkOutcome(index, UNWRITABLE, allowed, worker=worker)
+        needed = f"{folder} is not there: workers need the folder of --out on a shared disk"
+        return ChunkOutcome(index, worker, needed)
     ready = prepare(task.study, task.steps)
     table, trajectory = ready.chunk(index)
-    counts = Counter(
-        {row["values"]: row["counts"] for row in table["reason"].value_counts().to_pylist()}
-    )
+    counts = {row["values"]: row["counts"] for row in table["reason"].value_counts().to_pylist()}
     counts.pop("reached the end", None)
-    outcome = ChunkOutcome(
-        index, DONE, rows=len(table), reasons=tuple(counts.items()), worker=worker
-    )
     if folder is None:
-        return ChunkOutcome(**vars(outcome) | {"table": table, "trajectory": trajectory})
+        return ChunkOutcome(index, worker, "", counts, table, trajectory)
     try:
         if trajectory is not None:
             write(trajectory, folder, part(index, "trajectory"), ready.about)
         write(table, folder, part(index), ready.about)
     except OSError as error:
-        return ChunkOutcome(index, UNWRITABLE, f"{folder}: {error}", worker=worker)
-    return outcome
+        return ChunkOutcome(index, worker, f"{folder}: {error}")
+    return ChunkOutcome(index, worker, "", counts)
 
 
 def run_local(
@@ -145,34 +132,23 @@ def run_local(
     Args:
         task: what all chunks have in common.
         chunks: indices of the chunks.
-        done: is called with each outcome, one at a time.
-        workers: number of threads; 1 for Dask's synchronous scheduler.
+        done: is called with each outcome, by this thread.
+        workers: number of threads.
 
     Raises:
         SweepFailed: a file cannot be written.
 
     """
-    dask = require("dask")
-    lock, failed = threading.Lock(), threading.Event()
-
-    def run(index: int) -> None:
-        if failed.is_set():
-            return
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(run_chunk, task, index) for index in chunks]
         try:
-            outcome = run_chunk(task, index)
-        except BaseException:
-            failed.set()
-            raise
-        if outcome.status != DONE:
-            failed.set()
-            raise SweepFailed(f"chunk {index}: {outcome.detail}")
-        with lock:
-            done(outcome)
-
-    # By its name Dask would look for a client first, and import all of distributed.
-    get = require("dask.threaded").get if workers > 1 else require("dask.local").get_sync
-    tasks = [dask.delayed(run, pure=False)(index) for index in chunks]
-    dask.compute(*tasks, scheduler=get, num_workers=workers)
+            for future in as_completed(futures):
+                outcome = future.result()
+                if outcome.fault:
+                    raise SweepFailed(f"chunk {outcome.index}: {outcome.fault}")
+                done(outcome)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def part(index: int, kind: str = "part") -> str:
@@ -228,10 +204,9 @@ def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
             allowed = "is of another study or version: choose another --out"
             raise InputError("sweep", [Problem("--resume", str(path), allowed)])
         index = int(path.stem.removeprefix("part-"))
-        rows = min(study.chunk, study.rows - index * study.chunk)
-        trajectory = folder / part(index, "trajectory")
-        kept = study.trajectory is not None and index * study.chunk < study.trajectory["rows"]
-        if about["rows"] == rows and (not kept or read_about(trajectory) is not None):
+        rows, trajectory = study.rows_of(index), folder / part(index, "trajectory")
+        kept = study.trajectory is not None and rows.start < study.trajectory["rows"]
+        if about["rows"] == len(rows) and (not kept or read_about(trajectory) is not None):
             found.add(index)
     return found
 
@@ -250,12 +225,11 @@ def read_sweep(folder: Path, kind: str = "part") -> pd.DataFrame:
 
     """
     paths = sorted(folder.glob(f"{kind}-*.parquet"))
-    about = [one for one in map(read_about, paths) if one is not None]
-    if not about:
+    about = next(filter(None, map(read_about, paths)), None)
+    if about is None:
         allowed = f"must be a folder with files {kind}-*.parquet of `sst-ros sweep`"
         raise InputError("sweep", [Problem("DIR", str(folder), allowed)])
-    dataset = require("pyarrow.parquet").read_table([str(path) for path in paths])
-    return to_frame(dataset, about[0])
+    return to_frame(require("pyarrow.parquet").read_table(list(map(str, paths))), about)
 
 
 def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
@@ -300,10 +274,13 @@ def correlate_early_ends(table: pd.DataFrame) -> pd.Series:
 
     Empty where all runs ended alike, or no input differs.
     """
-    early = (table["status"] != 0).astype(float)
+    return correlate(table, (table["status"] != 0).astype(float))
+
+
+def correlate(table: pd.DataFrame, column: pd.Series) -> pd.Series:
+    """Spearman's rank correlation of each input with a column, largest first; none if constant."""
     inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
-    if early.nunique() < 2 or not inputs:
+    if column.nunique() < 2 or not inputs:
         return table[[]].sum()
-    ranks = table[inputs].rank()
-    found = ranks.corrwith(early.rank())
-    return found.reindex(found.abs().sort_values(ascending=False).index)
+    found = table[inputs].corrwith(column, method="spearman")
+    return found.sort_values(key=abs, ascending=False)

@@ -9,16 +9,17 @@ worker again and again is given up when all others are done. Every wait has a bo
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
 from sst_ros.host.cache_folder import cache_folder, store
-from sst_ros.sweeps.chunk_task import DONE, ChunkOutcome, ChunkTask, SweepFailed, run_chunk
+from sst_ros.sweeps.chunk_task import ChunkOutcome, ChunkTask, SweepFailed, run_chunk
 
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker that takes chunks, and for a scheduler that does not answer [s]."""
@@ -72,35 +73,19 @@ def send_code(client: Any, module: Any) -> None:
     client.register_plugin(SentCode(), name=f"sst_ros-{path.stem}")
 
 
-def refuse_other_versions(client: Any, task: ChunkTask) -> dict[str, str]:
-    """Return the workers that have other versions, and how they differ."""
-    code = (
-        f"__import__('sst_ros.sweeps.chunk_task', fromlist=['difference'])"
-        f".difference({task.versions!r})"
-    )
-    found = client.run(eval, code, on_error="return")
-    return {
-        worker: f"this worker has {answer}" if isinstance(answer, str) else f"{answer!r}"
-        for worker, answer in found.items()
-        if answer != ""
-    }
-
-
 def run_on_cluster(
     client: Any,
     task: ChunkTask,
     chunks: Sequence[int],
     done: Callable[[ChunkOutcome], None],
-    note: Callable[[str], None],
 ) -> None:
-    """Compute chunks on the workers of a client.
+    """Compute chunks on the workers of a client; print what it finds out about them.
 
     Args:
         client: of a Dask cluster.
         task: what all chunks have in common.
         chunks: indices of the chunks.
         done: is called with each outcome that is done.
-        note: is called with messages about workers.
 
     Raises:
         SweepFailed: chunks are not done: no worker takes them, they end their workers, or the
@@ -108,26 +93,25 @@ def run_on_cluster(
 
     """
     with client.as_current():
-        _Run(client, task, done, note).run(list(chunks))
+        _Run(client, task, done).run(list(chunks))
 
 
 class _Run:
-    def __init__(self, client: Any, task: ChunkTask, done: Any, note: Any) -> None:
+    def __init__(self, client: Any, task: ChunkTask, done: Any) -> None:
         self._distributed = require("distributed")
         self._closed = require("distributed.comm").CommClosedError
         # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
         self._waits = TimeoutError, self._distributed.TimeoutError, self._distributed.CancelledError
-        self._client, self._task, self._done, self._note = client, task, done, note
+        self._client, self._task, self._done = client, task, done
         self._refused: dict[str, str] = {}
-        self._running: dict[Any, tuple[int, tuple[str, ...] | None]] = {}
+        self._running: dict[Any, tuple[int, list[str] | None]] = {}
         self._deaths: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
 
     def run(self, waiting: list[int]) -> None:
         waiting.reverse()
         try:
-            for worker, detail in refuse_other_versions(self._client, self._task).items():
-                self._refuse(worker, detail)
+            self._refuse_other_versions()
             self._run(waiting)
         except (self._closed, *self._waits) as error:
             raise SweepFailed(f"{NO_ANSWER} ({error})") from error
@@ -141,42 +125,47 @@ class _Run:
     def _run(self, waiting: list[int]) -> None:
         idle = time.monotonic()
         while waiting or self._running:
-            workers = self._workers()
-            if workers:
+            threads = self._threads()
+            if threads:
                 idle = time.monotonic()
             elif time.monotonic() - idle > NO_WORKER:
-                raise SweepFailed(self._no_worker())
-            waiting += self._stranded(set(workers))
-            room = AHEAD * sum(workers.values()) - len(self._running)
+                refused = "; ".join(f"{worker}: {text}" for worker, text in self._refused.items())
+                why = f"{NO_WORKER:g} s ({refused or 'none is there'})"
+                raise SweepFailed(f"no worker takes chunks for {why}")
+            waiting += self._take_back_stranded(threads.keys())
+            room = AHEAD * sum(threads.values()) - len(self._running)
             for _ in range(min(room, len(waiting))):
-                self._submit(waiting.pop(), tuple(workers))
+                self._submit(waiting.pop(), list(threads) if self._refused else None)
             waiting += self._collect()
 
-    def _submit(self, index: int, workers: tuple[str, ...]) -> None:
-        """Send a chunk: to any worker, or where some are refused to one of the others."""
-        chosen = workers if self._refused else None
-        future = self._client.submit(
-            _task_on_worker,
-            self._task,
-            index,
-            pure=False,
-            workers=chosen,
-            allow_other_workers=False,
-            key=f"chunk-{index}-{time.monotonic_ns()}",
-        )
-        self._running[future] = index, chosen
+    def _threads(self) -> dict[str, int]:
+        """Threads of each worker that takes chunks."""
+        end = time.monotonic() + NO_SCHEDULER
+        while self._client.status != "running":
+            if self._client.status == "closed" or time.monotonic() > end:
+                raise SweepFailed(NO_ANSWER)
+            time.sleep(0.1)
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].items()
+        return {name: about["nthreads"] for name, about in workers if name not in self._refused}
 
-    def _stranded(self, workers: set[str]) -> list[int]:
-        """Take back chunks whose chosen workers are all gone."""
+    def _submit(self, index: int, workers: list[str] | None) -> None:
+        """Send a chunk to any worker, or to one of these."""
+        key = f"chunk-{index}-{time.monotonic_ns()}"
+        future = self._client.submit(
+            _run_on_worker, self._task, index, pure=False, workers=workers, key=key
+        )
+        self._running[future] = index, workers
+
+    def _take_back_stranded(self, workers: Collection[str]) -> list[int]:
+        """Take back chunks whose chosen workers are all gone: Dask would wait for those."""
         stranded = [
             future
             for future, (_, chosen) in self._running.items()
-            if chosen is not None and not workers & set(chosen) and future.status == "pending"
+            if chosen and not set(workers).intersection(chosen) and future.status == "pending"
         ]
-        again = [self._running.pop(future)[0] for future in stranded]
         if stranded:
             self._client.cancel(stranded, force=True)
-        return again
+        return [self._running.pop(future)[0] for future in stranded]
 
     def _collect(self) -> list[int]:
         """Take what has ended; return the chunks to be computed again."""
@@ -188,67 +177,53 @@ class _Run:
         again = []
         for future in [one for one in self._running if one.status != "pending"]:
             index, _ = self._running.pop(future)
-            try:
-                if future.status == "finished":
-                    again += self._take(index, future.result(timeout=GATHER))
-                elif future.status == "error":
-                    again += self._failed(index, future.exception(timeout=GATHER))
-                else:
-                    again.append(index)
-            except self._waits:
-                again.append(index)  # the worker that held the outcome is gone
+            taken = False
+            with contextlib.suppress(*self._waits):  # the worker that held the outcome is gone
+                taken = self._take(index, future)
             future.release()
+            if not taken:
+                again.append(index)
         return again
 
-    def _take(self, index: int, outcome: ChunkOutcome) -> list[int]:
-        if outcome.status == DONE:
+    def _take(self, index: int, future: Any) -> bool:
+        """Take what a chunk has come to; return False if it has to be computed again."""
+        if future.status == "finished":
+            outcome = future.result(timeout=GATHER)
+            if outcome.fault:
+                self._refuse(outcome.worker, outcome.fault)
+                return False
             self._done(outcome)
-            return []
-        self._refuse(outcome.worker, outcome.detail)
-        return [index]
-
-    def _failed(self, index: int, error: BaseException | None) -> list[int]:
+            return True
+        if future.status != "error":
+            return False
+        error = future.exception(timeout=GATHER)
         if isinstance(error, self._distributed.KilledWorker):
             self._deaths[index] += 1
             if self._deaths[index] < MOST_DEATHS:
-                return [index]
+                return False
             self._given_up[index] = f"its workers died {MOST_DEATHS} times ({error})"
-            return []
-        if isinstance(error, SstError):
-            self._given_up[index] = str(error)
-            return []
-        self._given_up[index] = f"{type(error).__name__}: {error}"
-        return []
+        else:
+            name = "" if isinstance(error, SstError) else f"{type(error).__name__}: "
+            self._given_up[index] = f"{name}{error}"
+        return True
+
+    def _refuse_other_versions(self) -> None:
+        """Refuse the workers that have other versions, before they have to read a study."""
+        code = (
+            f"__import__('sst_ros.sweeps.chunk_task', fromlist=['difference'])"
+            f".difference({self._task.versions!r})"
+        )
+        for worker, answer in self._client.run(eval, code, on_error="return").items():
+            if answer != "":
+                text = f"this worker has {answer}" if isinstance(answer, str) else f"{answer!r}"
+                self._refuse(worker, text)
 
     def _refuse(self, worker: str, detail: str) -> None:
         if worker not in self._refused:
             self._refused[worker] = detail
-            self._note(f"worker {worker} gets no more chunks: {detail}")
-
-    def _workers(self) -> dict[str, int]:
-        """Threads of each worker that takes chunks."""
-        if not self._alive():
-            raise SweepFailed(NO_ANSWER)
-        info = self._client.scheduler_info(n_workers=-1)["workers"]
-        return {
-            address: about["nthreads"]
-            for address, about in info.items()
-            if address not in self._refused
-        }
-
-    def _alive(self) -> bool:
-        began = time.monotonic()
-        while self._client.status != "running":
-            if self._client.status == "closed" or time.monotonic() - began > NO_SCHEDULER:
-                return False
-            time.sleep(0.1)
-        return True
-
-    def _no_worker(self) -> str:
-        refused = "; ".join(f"{worker}: {text}" for worker, text in self._refused.items())
-        return f"no worker takes chunks for {NO_WORKER:g} s ({refused or 'none is there'})"
+            text = f"sweep: worker {worker} gets no more chunks: {detail}"
+            print(text, file=sys.stderr, flush=True)
 
 
-def _task_on_worker(task: ChunkTask, index: int) -> ChunkOutcome:
-    address = str(require("distributed").get_worker().address)
-    return run_chunk(task, index, address)
+def _run_on_worker(task: ChunkTask, index: int) -> ChunkOutcome:
+    return run_chunk(task, index, str(require("distributed").get_worker().address))

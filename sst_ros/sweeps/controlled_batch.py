@@ -30,7 +30,7 @@ from sst_ros.control.law import (
     feedforward_torques,
     is_above,
 )
-from sst_ros.control.reference import Reference
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, trace
 from sst_ros.errors import InputError, Problem
@@ -41,7 +41,7 @@ from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.sweeps.sweep_study import ControlledRun
+from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 NOISE = (
     """\
@@ -94,12 +94,11 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> Group:
 class ControlledBatch:
     """A batch whose torques come from a controller with zero-order hold.
 
+    The controller's model of the plant is the scene of the study, which does not vary.
+
     Args:
         batch: of the plants, without torques of their own.
-        loop: controller, channel and motion.
-        length: of a run [s], a whole number of control periods.
-        seed: of the noise.
-        varied: keys control.* that differ between scenarios.
+        study: with a controller.
 
     Attributes:
         samples: control periods in a run.
@@ -109,31 +108,31 @@ class ControlledBatch:
 
     """
 
-    def __init__(
-        self, batch: Batch, loop: ControlledRun, length: float, seed: int, varied: set[str]
-    ) -> None:
-        self._batch, self._loop, self._seed = batch, loop, seed
-        settings, channel = loop.settings, loop.channel
-        self.samples = round(length / channel.period)
-        if not self.samples or abs(self.samples * channel.period - length) > 1e-9 * length:
-            allowed = f"must be a whole number of control periods of {channel.period:g} s"
+    def __init__(self, batch: Batch, study: SweepStudy) -> None:
+        assert study.motion is not None
+        self._batch, self._model, self._seed = batch, study.scene, study.seed
+        self._motion: ReferenceMotion = study.motion
+        self._control: SampledControl = study.control
+        control, length, period = self._control, study.length, self._control.period
+        self.samples = round(length / period)
+        if not self.samples or abs(self.samples * period - length) > 1e-9 * length:
+            allowed = f"must be a whole number of control periods of {period:g} s"
             raise InputError("sweep", [Problem("duration", length, allowed)])
-        self._inertia = np.array(
-            Controller(loop.model, loop.motion, settings, channel.period).inertia
-        )[:, None]
+        controller = Controller(self._model, self._motion, control, period)
+        self._inertia = np.array(controller.inertia)[:, None]
+        varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
-            own = (getattr(settings if hasattr(settings, n) else channel, n) for n in names)
-            return any(own) or bool(varied & {f"control.{name}" for name in names})
+            return any(getattr(control, name) or f"control.{name}" in varied for name in names)
 
-        limits = loop.model.torque_limit, batch.scene.torque_limit
+        limits = self._model.torque_limit, batch.scene.torque_limit
         self._limited = has("torque_limit") or any(limits)
         self._noise = _NOISE if has("angle_noise", "rate_noise") else 0
         self._memory_sizes = {
             "integral": 3 if has("integral_rate") else 0,
-            "queue": 3 * channel.delay,
-            "before": 3 if channel.counts else 0,
-            "observed": 4 if settings.observes else 0,
+            "queue": 3 * control.delay,
+            "before": 3 if control.counts else 0,
+            "observed": 4 if control.observes else 0,
             "squares": 3,
             "largest": 3,
             "limited": 1,
@@ -171,10 +170,10 @@ class ControlledBatch:
 
         """
         count, hold = len(rows), steps // self.samples
-        start = self._loop.motion.at(0.0)
+        start = self._motion.at(0.0)
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
-        step = self.samples * self._loop.channel.period / steps
+        step = self.samples * self._control.period / steps
         memory = self._start_memory(gamma, rate, count)
         gains = self._make_gains(batch, given, count)
 
@@ -203,7 +202,7 @@ class ControlledBatch:
         squares = np.stack(found["squares"], axis=1) + np.where(complete, final**2, 0.0)
         largest = np.stack(found["largest"], axis=1)
         largest = np.where(complete, np.maximum(largest, np.abs(final)), largest)
-        samples = np.floor(last / self._loop.channel.period + 1e-9) + 1
+        samples = np.floor(last / self._control.period + 1e-9) + 1
         rms = np.sqrt(squares / samples[:, None])
         columns = {f"error_rms_{k + 1}": rms[:, k].copy() for k in range(3)}
         columns |= {f"error_max_{k + 1}": largest[:, k].copy() for k in range(3)}
@@ -212,14 +211,12 @@ class ControlledBatch:
     @cached_property
     def _references(self) -> Array:
         """References of all samples of a run, shape (samples + 1, n)."""
-        loop, period = self._loop, self._loop.channel.period
-        inverse, rows = InverseDynamics(loop.model), []
+        control, period = self._control, self._control.period
+        inverse, rows = InverseDynamics(self._model), []
         for k in range(self.samples + 1):
             time = k * round(period * 1e9) / 1e9
-            at = loop.motion.at(time)
-            torques = feedforward_torques(
-                loop.settings, inverse, loop.motion, at, time + 0.5 * period
-            )
+            at = self._motion.at(time)
+            torques = feedforward_torques(control, inverse, self._motion, at, time + 0.5 * period)
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
@@ -265,10 +262,10 @@ class ControlledBatch:
             noise: six standard normal numbers, or none.
 
         """
-        loop, new = self._loop, dict(memory)
+        control, new = self._control, dict(memory)
         angle, rate = gains["noise"]
         scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
-        gamma, gamma_dot, new["before"] = loop.channel.measure(
+        gamma, gamma_dot, new["before"] = control.measure(
             joints.gamma, joints.gamma_dot, memory["before"], scaled
         )
         new["observed"] = self._observe(gamma, memory["observed"])
@@ -276,7 +273,7 @@ class ControlledBatch:
         torques = given["feedforward"], given["held"]
         at = Sample(desired, *torques, gamma, gamma_dot, new["observed"], memory["integral"])
         command = ControlLaw(
-            loop.settings,
+            control,
             self._torque,
             self._accelerate,
             gains["kp"],
@@ -284,12 +281,10 @@ class ControlledBatch:
             gains["inertia"],
             gains["rate"][0],
             gains["limit"][0] if self._limited else None,
-            loop.channel.period,
+            control.period,
         ).answer(at)
         new["integral"] = command.integral
-        torque, new["queue"] = loop.channel.transmit(
-            command.torque, memory["queue"], given["first"][0]
-        )
+        torque, new["queue"] = control.transmit(command.torque, memory["queue"], given["first"][0])
         if self._limited:
             cut = axpy(1.0, command.total, -1.0, command.torque)
             new["limited"] = (memory["limited"][0] + is_above(dot3(cut, cut)),)
@@ -311,7 +306,7 @@ class ControlledBatch:
 
     def _torque(self, *at: Any) -> Any:
         """Inverse dynamics of the controller's model."""
-        return kernel.actuator_torque(kernel.model_of(self._loop.model), *at)[0]
+        return kernel.actuator_torque(kernel.model_of(self._model), *at)[0]
 
     def _accelerate(self, q: Any, gamma_dot: Any, gamma_ddot: Any) -> tuple[Any, Any]:
         """W and W_dot of the controller's model."""
@@ -320,33 +315,32 @@ class ControlledBatch:
 
     @cached_property
     def _space(self) -> ActuatorSpaceMap:
-        return ActuatorSpaceMap(Geometry.of(self._loop.model))
+        return ActuatorSpaceMap(Geometry.of(self._model))
 
     def _start_memory(self, gamma: Array, rate: Array, count: int) -> Array:
         """Return the memory before the first sample, a column a scenario."""
-        start, channel = self._loop.motion.at(0.0), self._loop.channel
+        start, control = self._motion.at(0.0), self._control
         blocks = {name: np.zeros((size, count)) for name, size in self._memory_sizes.items()}
-        if self._loop.settings.observes:
+        if control.observes:
             blocks["observed"][:] = np.array(start.quaternion)[:, None]
-        if channel.counts:
-            blocks["before"][:] = channel.count(gamma - channel.period * rate).T
+        if control.counts:
+            blocks["before"][:] = control.count(gamma - control.period * rate).T
         return np.concatenate(list(blocks.values()))
 
     def _make_gains(self, batch: Batch, given: dict[str, Array], count: int) -> Array:
         """Return the gains, a column a scenario; see GAINS."""
-        settings, channel = self._loop.settings, self._loop.channel
 
         def value(name: str) -> Any:
-            nominal = getattr(settings if hasattr(settings, name) else channel, name)
+            nominal = getattr(self._control, name)
             found = given.get(f"control.{name}", np.array(nominal))
             return found.T if np.ndim(nominal) == 1 and found.ndim == 2 else found
 
         varies = {"control.stiffness", "control.damping"} & given.keys()
         rows = (
-            *feedback_gains(self._inertia, value, settings.direct or bool(varies)),
+            *feedback_gains(self._inertia, value, self._control.direct or bool(varies)),
             self._inertia,
             value("integral_rate"),
-            command_limit(value("torque_limit"), self._loop.model),
+            command_limit(value("torque_limit"), self._model),
             batch.columns.torque_limit,
             value("angle_noise"),
             value("rate_noise"),

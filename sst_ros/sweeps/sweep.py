@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,7 @@ from sst_ros.sweeps.chunk_task import (
     run_local,
     to_frame,
 )
-from sst_ros.sweeps.prepared import PreparedSweep, prepare
+from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 if TYPE_CHECKING:
@@ -75,24 +74,13 @@ def sweep(
     Raises:
         InputError: an argument or a value in the study is not allowed; nothing has run then.
         SweepFailed: chunks could not be computed or written; those that are done remain.
-        MissingDependency: dask, pandas, pyarrow or numba is not installed.
+        MissingDependency: pandas, pyarrow or numba is not installed.
 
     """
-    tabular = hasattr(vary, "columns")
-    table = {str(name): vary[name].to_numpy(dtype=float) for name in vary} if tabular else None
-    values = dict(
-        options,
-        torque=torque,
-        duration=duration,
-        n=n,
-        seed=seed,
-        scene=scene_of(scene),
-        vary={} if tabular else dict(vary),
-    )
-    if table is not None:
-        values["table"] = table
+    rows = {"table": vary} if hasattr(vary, "columns") else {"vary": dict(vary)}
+    given = {"torque": torque, "duration": duration, "n": n, "seed": seed, **options, **rows}
     return run_study(
-        SweepStudy.from_values(values),
+        SweepStudy.from_values({"scene": scene_of(scene), **given}),
         None if out is None else Path(out),
         client=client,
         workers=workers,
@@ -111,7 +99,7 @@ def run_study(
     progress: bool = True,
 ) -> pd.DataFrame:
     """Run a study and return its table; see `sweep`."""
-    for module in ("dask", "pandas", "pyarrow"):
+    for module in ("pandas", "pyarrow"):
         require(module)
     if type(workers) is not int or not 0 <= workers <= 1024:
         allowed = "must be a whole number from 0 to 1024"
@@ -120,87 +108,77 @@ def run_study(
         raise InputError("sweep", [Problem("resume", True, "needs out")])
     if out is not None and not resume:
         require_free(out, "sweep")
-    ready = prepare(study, _read_steps(out) if resume else None)
+    ready = prepare(study, _read_steps(out) if resume and out is not None else None)
     if study.table is not None:  # refuse rows that make no scene, before anything runs
         ready.check(study.sampler.rows(0, study.rows))
-    done: set[int] = set()
+    complete: set[int] = set()
     if out is not None:
         out = out.resolve()
         with write_into(out, "sweep"):
             clear_temporary(out)
-            done = find_complete(out, study, ready.steps)
-            (out / "study.json").write_text(
-                json.dumps(ready.about, indent=1) + "\n", encoding="utf-8"
-            )
-    before = sum(min(study.chunk, study.rows - index * study.chunk) for index in done)
-    bar = SweepProgress(study.rows, before, shown=progress)
-    tables: dict[int, ChunkOutcome] = {}
+            complete = find_complete(out, study, ready.steps)
+            text = json.dumps(ready.about, indent=1) + "\n"
+            (out / "study.json").write_text(text, encoding="utf-8")
+    missing = [index for index in range(study.chunks) if index not in complete]
+    bar, tables = SweepProgress(study, missing, shown=progress), dict[int, ChunkOutcome]()
 
-    def take(outcome: ChunkOutcome) -> None:
+    def done(outcome: ChunkOutcome) -> None:
         bar.add(outcome)
         if out is None:
             tables[outcome.index] = outcome
 
-    task = ChunkTask(study, ready.steps, None if out is None else str(out), list_versions())
-    missing = [index for index in range(study.chunks) if index not in done]
+    task = ChunkTask(study, ready.steps, out, list_versions())
     if client is None:
-        run_local(task, missing, take, workers or len(os.sched_getaffinity(0)))
+        run_local(task, missing, done, workers or len(os.sched_getaffinity(0)))
     else:
         from sst_ros.sweeps.cluster_engine import run_on_cluster, send_code
 
         send_code(client, ready.module)
-        run_on_cluster(client, task, missing, take, bar.note)
-    if out is None:
-        return _join(ready, tables)
-    frame = read_sweep(out)
+        run_on_cluster(client, task, missing, done)
+
+    def read(kind: str) -> pd.DataFrame:
+        if out is not None:
+            return read_sweep(out, kind)
+        ordered = [tables[index] for index in range(study.chunks)]
+        parts = [one.table if kind == "part" else one.trajectory for one in ordered]
+        found = [part for part in parts if part is not None]
+        return to_frame(require("pyarrow").concat_tables(found), ready.about)
+
+    frame = read("part")
     if study.trajectory is not None:
-        frame.attrs["trajectory"] = read_sweep(out, "trajectory")
+        frame.attrs["trajectory"] = read("trajectory")
     return frame
 
 
-def _read_steps(out: Path | None) -> int | None:
+def _read_steps(out: Path) -> int | None:
     """Return the number of steps of the study in a folder, chosen when it was started."""
     try:
-        steps = json.loads((Path(out or ".") / "study.json").read_text(encoding="utf-8"))["steps"]
-        return int(steps)
+        return int(json.loads((out / "study.json").read_text(encoding="utf-8"))["steps"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _join(ready: PreparedSweep, outcomes: Mapping[int, ChunkOutcome]) -> pd.DataFrame:
-    pyarrow = require("pyarrow")
-    ordered = [outcomes[index] for index in sorted(outcomes)]
-    frame = to_frame(pyarrow.concat_tables([one.table for one in ordered]), ready.about)
-    known = [one.trajectory for one in ordered if one.trajectory is not None]
-    if known:
-        frame.attrs["trajectory"] = to_frame(pyarrow.concat_tables(known), ready.about)
-    return frame
 
 
 class SweepProgress:
     """A bar with the runs that are done and how the early ones ended.
 
     Args:
-        total: rows of the study.
-        done: rows that are there already.
+        study: what runs.
+        missing: chunks that are not there already.
         shown: draw it, if stderr is a terminal.
 
     """
 
-    def __init__(self, total: int, done: int, *, shown: bool) -> None:
-        self._total, self._before, self._done = total, done, done
-        self._bar, self._began = Bar("sweep", shown), time.monotonic()
+    def __init__(self, study: SweepStudy, missing: Sequence[int], *, shown: bool) -> None:
+        self._study, self._bar, self._began = study, Bar("sweep", shown), time.monotonic()
+        self._left = self._missing = sum(len(study.rows_of(index)) for index in missing)
         self._reasons: Counter[str] = Counter()
 
     def add(self, outcome: ChunkOutcome) -> None:
         """Count a chunk that is done."""
-        self._done += outcome.rows
-        self._reasons.update(dict(outcome.reasons))
-        rate = (self._done - self._before) / max(time.monotonic() - self._began, 1e-9)
+        self._left -= len(self._study.rows_of(outcome.index))
+        self._reasons.update(outcome.reasons)
+        rate = (self._missing - self._left) / max(time.monotonic() - self._began, 1e-9)
         ended = ", ".join(f"{count} {text}" for text, count in self._reasons.most_common(3))
-        left = f"{rate:.0f} runs/s, {(self._total - self._done) / max(rate, 1e-9):.0f} s left"
-        self._bar.draw(self._done / self._total, left + (f"; early: {ended}" if ended else ""))
-
-    def note(self, text: str) -> None:
-        """Print a message."""
-        print(f"sweep: {text}", file=sys.stderr, flush=True)
+        text = f"{rate:.0f} runs/s, {self._left / max(rate, 1e-9):.0f} s left"
+        share = 1.0 - self._left / self._study.rows
+        self._bar.draw(share, text + (f"; early: {ended}" if ended else ""))

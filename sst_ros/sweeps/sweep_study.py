@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from sst_ros.control.law import ControlChannel, ControllerSettings
@@ -21,8 +20,8 @@ from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.scene import Scene, SineTorque, scene_of
-from sst_ros.scene.schema import Section, anything, choice, integer, number, specs, texts
-from sst_ros.scene.yaml_document import plain, values_of
+from sst_ros.scene.schema import Section, anything, choice, integer, number, section, specs, texts
+from sst_ros.scene.yaml_document import build, plain, values_of
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     LARGEST_HYPERCUBE,
@@ -30,11 +29,9 @@ from sst_ros.sweeps.variations import (
     Sampler,
     Target,
     Variation,
-    digest_of,
     keys_of,
     read_table,
     read_variation,
-    scales_tensor,
     tabulate,
     targets_of,
 )
@@ -48,6 +45,11 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes")
 """What `outputs` may name: quantities of the final state, and extremes of joints."""
 
 MOST_ROWS, MOST = 2**53, 10_000_000
+
+
+@dataclass(frozen=True)
+class SampledControl(ControlChannel, ControllerSettings):
+    """A controller, and the channel between it and the plant."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,9 @@ class SweepStudy(Section):
     )
     seed: int = integer("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS, default="random")
-    table: Mapping[str, Any] | None = anything(
-        "values by column, in place of distributions", default=None
+    table: Any = anything(
+        "values by column, in place of distributions; a DataFrame, a mapping, or a file",
+        default=None,
     )
     duration: float | None = number(
         "length of a run; by default that of the scene, or of its motion if controlled",
@@ -99,8 +102,10 @@ class SweepStudy(Section):
         "or a SineTorque as a mapping",
         default=None,
     )
-    control: Mapping[str, Any] | None = anything(
-        "settings of a controller and its channel, see `ControlChannel`", default=None
+    control: Any = section(
+        "settings of a controller and its channel, also as a mapping; see `ControlChannel`",
+        SampledControl,
+        default=None,
     )
     outputs: tuple[str, ...] = texts(
         "quantities of the final state, and `extremes` of joints at the ends of the steps",
@@ -112,8 +117,14 @@ class SweepStudy(Section):
     chunk: int = integer("rows of a task and of a file", default=CHUNK, least=1, most=MOST)
 
     def __post_init__(self) -> None:
+        if isinstance(self.control, Mapping):
+            object.__setattr__(
+                self, "control", build(SampledControl, self.control, "sweep", path="control")
+            )
+        if self.table is not None:
+            object.__setattr__(self, "table", read_table(self.table))
         super().__post_init__()
-        _ = self.variations, self.rows, self.length, self.controlled
+        _ = self.variations, self.rows, self.length
 
     def check(self) -> Iterator[Problem]:
         """Refuse outputs, torques and trajectories that are none."""
@@ -133,9 +144,9 @@ class SweepStudy(Section):
             allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
             yield Problem("trajectory", kept, allowed)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __getstate__(self) -> dict[str, Any]:
         """Pickle what was given, not what has been computed from it."""
-        return _build_study, ({name: getattr(self, name) for name in specs(SweepStudy)},)
+        return {name: getattr(self, name) for name in specs(SweepStudy)}
 
     @classmethod
     def read(cls, path: Path) -> SweepStudy:
@@ -152,51 +163,46 @@ class SweepStudy(Section):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
-        """Build a study from a mapping."""
+        """Build a study from a mapping; names of files are relative to a folder."""
         known = specs(cls)
         for key in values:
             if key not in known:
                 hint = suggestion(str(key), known)
                 allowed = f"unknown key; allowed are {', '.join(known)}{hint}"
                 raise InputError("sweep", [Problem(str(key), values[key], allowed)])
-        given = dict(values)
-        scene, table = given.pop("scene", None), given.pop("table", None)
-        if isinstance(scene, str) and (folder / scene).is_file():
-            scene = folder / scene
-        if isinstance(table, str):
-            table = read_table(folder / table)
-        return cls(scene=scene_of(scene), table=table, **given)
+        given = {"scene": None, **values}
+        if isinstance(given["scene"], str) and (folder / given["scene"]).is_file():
+            given["scene"] = folder / given["scene"]
+        if isinstance(given.get("table"), str):
+            given["table"] = folder / given["table"]
+        return cls(**given | {"scene": scene_of(given["scene"])})
 
     @cached_property
     def model_scene(self) -> Scene:
         """The scene with the torques of the study: none of its own where a controller acts."""
-        if self.control is not None:
-            return dataclasses.replace(self.scene, torque=None)
-        if self.torque is None:
+        torque = self.torque
+        if self.control is not None or isinstance(torque, SineTorque):
+            return dataclasses.replace(self.scene, torque=torque)
+        if torque is None:
             return self.scene
-        if isinstance(self.torque, SineTorque):
-            return dataclasses.replace(self.scene, torque=self.torque)
-        if isinstance(self.torque, Mapping):
-            return self.scene.with_values({"torque": dict(self.torque)})
-        constant = {
-            "amplitude": list(self.torque),
-            "frequency": [0.0] * 3,
-            "phase": [math.pi / 2] * 3,
-        }
-        return self.scene.with_values({"torque": constant})
+        if not isinstance(torque, Mapping):  # constant: a sine that stays at its largest value
+            torque = {
+                "amplitude": list(torque),
+                "frequency": [0.0] * 3,
+                "phase": [math.pi / 2] * 3,
+            }
+        return self.scene.with_values({"torque": dict(torque)})
 
     @cached_property
-    def controlled(self) -> ControlledRun | None:
-        """The control loop; None without one."""
-        return None if self.control is None else read_control(self.scene, self.control)
+    def motion(self) -> ReferenceMotion | None:
+        """The motion of the scene that a controller follows; None without one."""
+        return None if self.control is None else reference_motion(self.scene)
 
     @cached_property
     def length(self) -> float:
         """Length of a run [s]."""
-        duration = self.duration
-        if duration is None and self.controlled is not None:
-            duration = self.controlled.motion.duration
-        duration = duration or self.scene.duration
+        moving = None if self.motion is None else self.motion.duration
+        duration = self.duration or moving or self.scene.duration
         if duration is None:
             allowed = "must be given [s]: the scene has none"
             raise InputError("sweep", [Problem("duration", None, allowed)])
@@ -205,20 +211,20 @@ class SweepStudy(Section):
     @cached_property
     def variations(self) -> tuple[Variation, ...]:
         """What varies, key by key."""
-        found, problems = [], []
+        found: list[Variation] = []
+        problems = []
         for key, given in self.vary.items():
             try:
                 found.append(read_variation(key, given, self._targets(key)))
             except (ValueError, TypeError, OverflowError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
-        columns = [name for one in found for name in one.columns]
+        columns = {name for one in found for name in one.columns}
         for key, names in keys_of(self.table or {}).items():
             try:
-                targets = self._targets(key)
-                if key in self.vary or set(names) & set(columns):
+                if key in self.vary or columns & set(names):
                     raise ValueError("is given in vary, too")
-                factor = scales_tensor(key, targets)
-                found.append(tabulate(key, names, targets, factor))
+                own = {name: self.table[name] for name in names}
+                found.append(tabulate(key, own, self._targets(key)))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
         if not found:
@@ -233,117 +239,64 @@ class SweepStudy(Section):
         grid = math.prod(len(one.numbers) for one in self.variations if one.kind == "grid")
         lengths = {len(values) for values in (self.table or {}).values()}
         drawn = any(one.kind in ("uniform", "normal") for one in self.variations)
-        natural = min(lengths) if lengths else grid
+        natural = min(lengths, default=grid)
         if len(lengths) > 1 or (lengths and grid > 1):
             allowed = "must have columns of equal length, and no grid beside it"
             raise InputError("sweep", [Problem("table", sorted(lengths), allowed)])
-        if self.n is None and drawn and not lengths and grid == 1:
+        if self.n is None and drawn and grid == 1 and not lengths:
             raise InputError("sweep", [Problem("n", None, "must be given with distributions")])
-        rows = natural if self.n is None else self.n
-        if (lengths and rows > natural) or (grid > 1 and rows % grid):
+        rows, allowed = self.n or natural, ""
+        if lengths and rows > natural:
             allowed = f"must be <= {natural}, the rows of the table"
-            allowed = allowed if lengths else f"must be a multiple of {grid}, the size of the grid"
-            raise InputError("sweep", [Problem("n", rows, allowed)])
-        if self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
+        elif grid > 1 and rows % grid:
+            allowed = f"must be a multiple of {grid}, the size of the grid"
+        elif self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
             allowed = f"must be <= {LARGEST_HYPERCUBE} with latin_hypercube; use sobol"
+        if allowed:
             raise InputError("sweep", [Problem("n", rows, allowed)])
         return rows
 
     @cached_property
     def sampler(self) -> Sampler:
         """Rows of what varies."""
-        table = {
-            name: np.asarray(values, dtype=float) for name, values in (self.table or {}).items()
-        }
-        return Sampler(self.variations, table, self.rows, self.seed, self.sampling)
+        return Sampler(self.variations, self.rows, self.seed, self.sampling)
 
     @property
     def chunks(self) -> int:
         """Number of chunks."""
         return -(-self.rows // self.chunk)
 
+    def rows_of(self, chunk: int) -> range:
+        """Return the rows of a chunk."""
+        return range(self.rows)[chunk * self.chunk : (chunk + 1) * self.chunk]
+
     def document(self) -> dict[str, Any]:
-        """Return the study as nested dicts and lists; a table as its digest."""
-        values = {name: getattr(self, name) for name in specs(SweepStudy)}
-        values["scene"] = values_of(self.scene)
-        if isinstance(self.torque, SineTorque):
-            values["torque"] = values_of(self.torque)
+        """Return the study as nested dicts and lists; a table as digests of its columns."""
+        values = {name: values_of(getattr(self, name)) for name in specs(SweepStudy)}
         if self.table is not None:
-            values["table"] = {key: digest_of(np.asarray(x)) for key, x in self.table.items()}
+            digests = {name: make_digest(column.tobytes()) for name, column in self.table.items()}
+            values["table"] = digests
         document: dict[str, Any] = plain(values)
         return document
 
     @cached_property
     def digest(self) -> str:
         """Digest of the document: two studies with the same one have the same rows."""
-        text = json.dumps(self.document(), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:24]
+        return make_digest(json.dumps(self.document(), sort_keys=True).encode())
 
     def _targets(self, key: str) -> list[Target]:
-        if key.partition(".")[0] == "control":
-            if self.controlled is None:
-                raise ValueError("acts with control only")
-            return self.controlled.targets(key)
-        if key == "initial.orientation" or key.partition(".")[0] in ("motion", "duration"):
+        section, _, name = key.partition(".")
+        if section == "control" and self.control is None:
+            raise ValueError("acts with control only")
+        if key in ("initial.orientation", "control.period") or section in ("motion", "duration"):
             raise ValueError("cannot vary")
-        if key.partition(".")[0] == "torque" and self.control is not None:
+        if section == "control":
+            return targets_of(self.control, name, ("control",))
+        if section == "torque" and self.control is not None:
             raise ValueError("has no effect: the controller gives the torques")
         return targets_of(self.model_scene, key)
 
 
-def _build_study(values: Mapping[str, Any]) -> SweepStudy:
-    return SweepStudy(**values)
-
-
-@dataclass(frozen=True)
-class ControlledRun:
-    """A control loop.
-
-    Attributes:
-        model: the controller's model of the plant, which does not vary.
-        motion: reference motion, that of the scene.
-        settings: scheme and gains.
-        channel: period, delay, encoders, noise.
-
-    """
-
-    model: Scene
-    motion: ReferenceMotion
-    settings: ControllerSettings
-    channel: ControlChannel
-
-    def targets(self, key: str) -> list[Target]:
-        """Return what a key control.* names."""
-        name = key.removeprefix("control.")
-        for given in (self.settings, self.channel):
-            spec = specs(type(given)).get(name)
-            if spec is not None and spec.kind == "number" and name != "period":
-                return [Target(key, np.array(getattr(given, name), dtype=float), spec)]
-        known = [*_numbers(ControllerSettings), *_numbers(ControlChannel)]
-        raise ValueError(f"must be one of {', '.join(f'control.{name}' for name in known)}")
-
-
-def read_control(scene: Scene, given: Mapping[str, Any]) -> ControlledRun:
-    """Read the settings of a control loop: those of a controller and of its channel.
-
-    Raises:
-        InputError: a key is unknown or its value not allowed, or the scene has no motion.
-
-    """
-    controller, channel = specs(ControllerSettings), specs(ControlChannel)
-    known = (*controller, *channel)
-    allowed = f"unknown key; allowed are {', '.join(known)}"
-    unknown = [Problem(f"control.{key}", given[key], allowed) for key in given if key not in known]
-    if unknown:
-        raise InputError("sweep", unknown)
-    motion = reference_motion(scene)
-    return ControlledRun(
-        scene,
-        motion,
-        ControllerSettings(**{key: value for key, value in given.items() if key in controller}),
-        ControlChannel(**{key: value for key, value in given.items() if key in channel}),
-    )
-
-
-def _numbers(cls: type[Section]) -> list[str]:
-    return [name for name, spec in specs(cls).items() if spec.kind == "number" and name != "period"]
+def make_digest(content: bytes) -> str:
+    """Return the first 24 digits of a SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:24]

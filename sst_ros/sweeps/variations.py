@@ -14,8 +14,8 @@ row; Sobol points from their index; a Latin hypercube from all n rows at once.
 
 from __future__ import annotations
 
-import hashlib
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,7 +28,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
-from sst_ros.scene.schema import Section, Spec, key_of, specs
+from sst_ros.scene.schema import Place, Section, Spec, key_of, specs
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 
 KINDS = ("uniform", "normal", "grid", "linspace")
@@ -56,21 +56,25 @@ class Variation:
 
     Attributes:
         key: as given.
-        kind: uniform, normal, or grid.
-        numbers: (low, high), (mean, standard deviation, low, high), or the values of a grid, rows
-            of as many components as the key has.
-        columns: names of the columns of a table of results, one for each component.
+        kind: uniform, normal, grid, or table.
+        numbers: (low, high), (mean, standard deviation, low, high), or the values of a grid or of
+            the columns of a table, rows of as many components as the key has.
         targets: what it sets; several where one factor scales a tensor, or a key means a list.
-        factor: the column is a factor of the targets' values.
+        factor: the one component is a factor of the targets' values.
 
     """
 
     key: str
     kind: str
     numbers: Array
-    columns: tuple[str, ...]
     targets: tuple[Target, ...]
     factor: bool
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of a table, one for each component."""
+        shape = () if self.factor else self.targets[0].nominal.shape
+        return tuple(self.key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape))
 
     def values(self, quantiles: Array) -> Array:
         """Values, shape (n, components), at quantiles in (0, 1) of the same shape."""
@@ -83,6 +87,15 @@ class Variation:
         first, last = ndtr((low - mean) / deviation), ndtr((high - mean) / deviation)
         return np.asarray(mean + deviation * ndtri(first + (last - first) * quantiles))
 
+    def ends(self) -> Array:
+        """Return a middle value, and others that differ in every component; all of a grid."""
+        if self.kind == "normal":
+            quantiles = np.repeat([[0.4], [0.6]], len(self.columns), axis=1)
+            return np.vstack([self.numbers[0], self.values(quantiles)])
+        if self.kind == "uniform":
+            return np.vstack([self.numbers.mean(axis=0), self.numbers])
+        return self.numbers
+
     def parameters(self, values: Array) -> dict[str, Array]:
         """Arrays (n, ...) by key of the scene for values (n, components)."""
         found = {}
@@ -90,6 +103,15 @@ class Variation:
             rows = values * target.nominal.ravel() if self.factor else values
             found[target.key] = rows.reshape(len(values), *target.nominal.shape)
         return found
+
+    def refuse_forbidden(self) -> None:
+        """Raise ValueError if a target must not have a value that is reached."""
+        reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
+        for target, numbers in zip(self.targets, self.parameters(reached).values(), strict=True):
+            known, spec = numbers[np.isfinite(numbers)], target.spec
+            if not np.all((known > spec.above) & (known >= spec.least) & (known <= spec.most)):
+                words = f"it reaches from {known.min()} to {known.max()}"
+                raise ValueError(f"{spec.describe()}; {words}")
 
 
 def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
@@ -105,48 +127,83 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
 
     """
     kind, numbers, relative = _read(given)
-    factor = scales_tensor(key, targets)
+    factor = _scales_tensor(key, targets)
     if factor and not relative:
         raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
-    shape = () if factor else targets[0].nominal.shape
-    size = int(np.prod(shape, dtype=int))
-    nominal = np.ones(1) if factor else targets[0].nominal.ravel()
+    nominal = np.ones(()) if factor else targets[0].nominal
     if kind == "linspace":
         low, high, count = numbers
         kind, numbers = "grid", np.linspace(low, high, int(count))
     if kind == "grid":
-        rows = np.array(numbers, dtype=float)
-        if rows.shape[1:] != shape or not len(rows) or not np.all(np.isfinite(rows)):
-            raise ValueError(f"must be a list of values of shape {shape}")
-        values = rows.reshape(len(rows), size)
+        values = np.array(numbers, dtype=float)
+        if values.shape[1:] != nominal.shape or not len(values) or not np.all(np.isfinite(values)):
+            raise ValueError(f"must be a list of values of shape {nominal.shape}")
     else:
-        values = _distribution(kind, numbers, shape).reshape(-1, size)
+        values = _read_distribution(kind, numbers, nominal.shape)
     if relative and not factor:
-        if any(not np.array_equal(one.nominal, targets[0].nominal) for one in targets):
+        if any(not np.array_equal(one.nominal, nominal) for one in targets):
             raise ValueError("its entries differ in the scene: give each by its index")
         values = values * nominal
-        if kind == "normal":
+        if kind == "normal":  # a negative value has mirrored it
             values[1] = np.abs(values[1])
             values[2:] = np.sort(values[2:], axis=0)
         if kind == "uniform":
             values = np.sort(values, axis=0)
     if kind == "normal" and not np.all(values[1] > 0.0):
         raise ValueError("the standard deviation must be > 0")
-    _refuse_ends(kind, values, targets, factor)
-    columns = tuple(f"{key}{index}" for index in _list_indices(shape))
-    return Variation(key, kind, values, columns, tuple(targets), factor)
+    found = Variation(key, kind, values.reshape(len(values), -1), tuple(targets), factor)
+    found.refuse_forbidden()
+    return found
 
 
-def targets_of(scene: Section, key: str) -> list[Target]:
+def _read(given: Any) -> tuple[str, Any, bool]:
+    """Kind, numbers, and whether they are relative."""
+    allowed = f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
+    kind, numbers, relative = "grid", given, False
+    if isinstance(given, Mapping):
+        words = dict(given)
+        relative = words.pop("relative", False)
+        kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
+    elif isinstance(given, tuple) and given and isinstance(given[0], str):
+        kind, relative = given[0], given[-1] == "relative"
+        numbers = given[1 : len(given) - relative]
+    if kind not in KINDS or not isinstance(relative, bool):
+        raise ValueError(allowed)
+    if isinstance(numbers, str) or not np.iterable(numbers):
+        raise ValueError(allowed)
+    return kind, numbers, relative
+
+
+def _read_distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
+    count = len(numbers)
+    if count not in ((2,) if kind == "uniform" else (2, 4)):
+        allowed = "low, high" if kind == "uniform" else "mean, standard deviation[, low, high]"
+        raise ValueError(f"{kind} takes {allowed}")
+    more = [] if count != 2 or kind == "uniform" else [-np.inf, np.inf]
+    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in (*numbers, *more)])
+    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
+        raise ValueError("must be finite numbers")
+    if not np.all(values[-2] < values[-1]):
+        raise ValueError("the lower end must be less than the upper one")
+    return values
+
+
+def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
     """Return what a key names; a list without an index means all of its entries.
+
+    Args:
+        tree: the scene, or settings.
+        key: in it.
+        place: of the tree in a study.
 
     Raises:
         ValueError: it names nothing that can vary.
 
     """
     found = []
-    for place, value, spec in find_fields(scene, key):
-        here = key_of(place)
+    for at, value, spec in find_fields(tree, key, place=place):
+        here = key_of(at)
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
         if isinstance(value, Inertia):
@@ -163,64 +220,9 @@ def targets_of(scene: Section, key: str) -> list[Target]:
     return found
 
 
-def scales_tensor(key: str, targets: Sequence[Target]) -> bool:
+def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
     """Whether a key names an inertia as a whole, which one factor scales."""
     return targets[0].key.count(".") > key.count(".")
-
-
-def _read(given: Any) -> tuple[str, Any, bool]:
-    """Kind, numbers, and whether they are relative."""
-    allowed = f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
-    if isinstance(given, Mapping):
-        words = dict(given)
-        relative = words.pop("relative", False)
-        if len(words) != 1 or next(iter(words)) not in KINDS or not isinstance(relative, bool):
-            raise ValueError(allowed)
-        ((kind, numbers),) = words.items()
-        return kind, numbers, relative
-    if isinstance(given, tuple) and given and isinstance(given[0], str):
-        relative = given[-1] == "relative"
-        if given[0] not in KINDS:
-            raise ValueError(allowed)
-        return given[0], given[1 : len(given) - relative], relative
-    if isinstance(given, str) or not np.iterable(given):
-        raise ValueError(allowed)
-    return "grid", given, False
-
-
-def _distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
-    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
-    count = len(numbers)
-    if count not in ((2,) if kind == "uniform" else (2, 4)):
-        allowed = "low, high" if kind == "uniform" else "mean, standard deviation[, low, high]"
-        raise ValueError(f"{kind} takes {allowed}")
-    more = [] if count != 2 or kind == "uniform" else [-np.inf, np.inf]
-    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in (*numbers, *more)])
-    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
-        raise ValueError("must be finite numbers")
-    ends = values if kind == "uniform" else values[2:]
-    if not np.all(ends[0] < ends[1]):
-        raise ValueError("the lower end must be less than the upper one")
-    return values
-
-
-def _refuse_ends(kind: str, values: Array, targets: Sequence[Target], factor: bool) -> None:
-    """Refuse values that the specification of a target does not allow."""
-    ends = values[2:] if kind == "normal" else values
-    for target in targets:
-        spec = target.spec
-        numbers = ends * target.nominal.ravel() if factor else ends
-        if kind == "normal":
-            numbers = np.vstack([numbers, values[:1] * (target.nominal.ravel() if factor else 1.0)])
-            numbers = numbers[np.isfinite(numbers)]
-        if not np.all((numbers > spec.above) & (numbers >= spec.least) & (numbers <= spec.most)):
-            raise ValueError(
-                f"{spec.describe()}; it reaches from {numbers.min()} to {numbers.max()}"
-            )
-
-
-def _list_indices(shape: tuple[int, ...]) -> list[str]:
-    return ["".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
 
 
 def keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -231,39 +233,36 @@ def keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
     return found
 
 
-def tabulate(key: str, names: list[str], targets: list[Target], factor: bool) -> Variation:
+def tabulate(key: str, columns: Mapping[str, Array], targets: list[Target]) -> Variation:
     """Return the variation of a key whose values are columns of a table.
 
     Raises:
         ValueError: columns of its components are missing.
 
     """
-    shape = () if factor else targets[0].nominal.shape
-    expected = [key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
-    if names != expected:
-        raise ValueError(f"needs the columns {', '.join(expected)}")
-    return Variation(key, "table", np.empty((0, 1)), tuple(names), tuple(targets), factor)
+    numbers = np.stack(list(columns.values()), axis=1)
+    found = Variation(key, "table", numbers, tuple(targets), _scales_tensor(key, targets))
+    if tuple(columns) != found.columns:
+        raise ValueError(f"needs the columns {', '.join(found.columns)}")
+    return found
 
 
-def read_table(path: Path) -> dict[str, Array]:
-    """Read the columns of a CSV or Parquet file.
+def read_table(given: Any) -> dict[str, Array]:
+    """Read the columns of a DataFrame, a mapping, or a CSV or Parquet file.
 
     Raises:
         InputError: it is not readable, or holds more than numbers.
 
     """
-    pandas = require("pandas")
     try:
-        frame = pandas.read_parquet(path) if path.suffix == ".parquet" else pandas.read_csv(path)
-        return {str(name): frame[name].to_numpy(dtype=float) for name in frame}
-    except (OSError, ValueError) as error:
+        if isinstance(given, Path):
+            pandas = require("pandas")
+            read = pandas.read_parquet if given.suffix == ".parquet" else pandas.read_csv
+            given = read(given)
+        return {str(name): np.asarray(given[name], dtype=float) for name in given}
+    except (OSError, ValueError, TypeError) as error:
         allowed = f"must be a readable .csv or .parquet file of numbers ({error})"
-        raise InputError("sweep", [Problem("table", str(path), allowed)]) from None
-
-
-def digest_of(values: Array) -> str:
-    """Return a digest of the bits of a column."""
-    return hashlib.sha256(np.ascontiguousarray(values, dtype=float).tobytes()).hexdigest()[:24]
+        raise InputError("sweep", [Problem("table", str(given), allowed)]) from None
 
 
 class Sampler:
@@ -271,41 +270,31 @@ class Sampler:
 
     Args:
         variations: what varies.
-        table: columns given row by row, in place of distributions.
         n: number of rows.
         seed: of the random numbers.
         sampling: one of SAMPLINGS, for what has a distribution.
 
     """
 
-    def __init__(
-        self,
-        variations: Sequence[Variation],
-        table: dict[str, Array],
-        n: int,
-        seed: int,
-        sampling: str,
-    ) -> None:
-        self._variations, self._table = variations, table
-        self._n, self._seed, self._sampling = n, seed, sampling
-        self._drawn = [one for one in variations if one.kind in ("uniform", "normal")]
-        self._width = sum(len(one.columns) for one in self._drawn)
+    def __init__(self, variations: Sequence[Variation], n: int, seed: int, sampling: str) -> None:
+        self._variations, self._n, self._seed, self._sampling = variations, n, seed, sampling
+        drawn = (one for one in variations if one.kind in ("uniform", "normal"))
+        self._width = sum(len(one.columns) for one in drawn)
 
     def rows(self, first: int, count: int) -> dict[str, Array]:
         """Values of rows `first` to `first + count`, shape (count, components), by key."""
-        quantiles = self._quantiles(first, count)
-        found, at, index = {}, 0, np.arange(first, first + count)
-        grids = [one for one in self._variations if one.kind == "grid"]
-        for one in reversed(grids):  # the last key varies fastest
-            found[one.key] = one.numbers[index % len(one.numbers)]
-            index = index // len(one.numbers)
-        for one in self._drawn:
-            found[one.key] = one.values(quantiles[:, at : at + len(one.columns)])
-            at += len(one.columns)
+        quantiles = iter(self._quantiles(first, count).T)
+        found, index = {}, np.arange(first, first + count)
         for one in self._variations:
             if one.kind == "table":
-                columns = [self._table[name][first : first + count] for name in one.columns]
-                found[one.key] = np.stack(columns, axis=1)
+                found[one.key] = one.numbers[first : first + count]
+            elif one.kind != "grid":
+                own = np.stack([next(quantiles) for _ in one.columns], axis=1)
+                found[one.key] = one.values(own)
+        for one in reversed(self._variations):  # the last key of a grid varies fastest
+            if one.kind == "grid":
+                found[one.key] = one.numbers[index % len(one.numbers)]
+                index = index // len(one.numbers)
         return {one.key: found[one.key] for one in self._variations}
 
     def _quantiles(self, first: int, count: int) -> Array:
@@ -322,7 +311,9 @@ class Sampler:
             engine = qmc.Sobol(self._width, seed=np.random.default_rng(self._seed))
             if first:
                 engine.fast_forward(first)
-            points = _draw_points(engine, count)
+            with warnings.catch_warnings():  # that a chunk of rows is no power of two
+                warnings.simplefilter("ignore", UserWarning)
+                points = engine.random(count)
         return np.clip(points, _TINY, 1.0 - _TINY)
 
     @cached_property
@@ -340,12 +331,3 @@ def philox(seed: int, first: int, count: int, width: int) -> Array:
     generator.advance(first * blocks)
     raw = generator.random_raw(count * 4 * blocks).reshape(count, 4 * blocks)[:, :width]
     return np.asarray(((raw >> np.uint64(11)) + 0.5) * _TINY)
-
-
-def _draw_points(engine: object, count: int) -> Array:
-    """Sobol points without the warning that a count is no power of two: rows come in chunks."""
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return np.asarray(engine.random(count))  # type: ignore[attr-defined]

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
+from sst_ros.control.law import MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError
 from sst_ros.report.results import write
 from sst_ros.scene.scene import load
+from sst_ros.sweeps.sweep_study import SampledControl
 from studies import feedforward
 from studies.control_loop import (
     SHARE,
@@ -48,9 +49,15 @@ def errors(*names):
 
 
 def held(scene, delay, damping=1.0):
-    settings = ControllerSettings(mode="computed_torque", damping_ratio=damping)
-    channel = ControlChannel(period=1e-9 * PERIOD_NS, delay=delay)
-    return ControlLoop(scene, reference_motion(scene), settings, channel, scene)
+    settings = SampledControl(
+        mode="computed_torque", damping_ratio=damping, period=1e-9 * PERIOD_NS, delay=delay
+    )
+    return ControlLoop(scene, reference_motion(scene), settings, scene)
+
+
+def by_bandwidth(loop, bandwidth):
+    settings = dataclasses.replace(loop.settings, bandwidth=bandwidth)
+    return dataclasses.replace(loop, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -116,25 +123,15 @@ def test_every_bandwidth_up_to_the_limit_is_stable(delay, damping):
 @pytest.mark.parametrize("delay", range(6))
 def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
     bound = stability_limit(1.0, delay) * 1e9 / PERIOD_NS
-    near, beyond = (
-        run_loop(
-            dataclasses.replace(
-                held(ideal_plant(SHORT), delay),
-                settings=ControllerSettings(mode="computed_torque", bandwidth=share * bound),
-                lost=0.05,
-            )
-        )
-        for share in (0.9, 1.2)
-    )
+    loop = dataclasses.replace(held(ideal_plant(SHORT), delay), lost=0.05)
+    near, beyond = (run_loop(by_bandwidth(loop, share * bound)) for share in (0.9, 1.2))
     assert not near[2] and np.abs(near[0].error).max() < 1e-3
     assert beyond[2]
 
 
 def test_a_loop_that_is_lost_says_so():
     loop = dataclasses.replace(held(SHORT, 5), lost=0.01, offset=1e-3)
-    track, limited, failure = run_loop(
-        dataclasses.replace(loop, settings=dataclasses.replace(loop.settings, bandwidth=400.0))
-    )
+    track, limited, failure = run_loop(by_bandwidth(loop, 400.0))
     assert failure.endswith("off by more than 0.01 rad")
     assert len(track.time) == len(limited) < 400
 

@@ -18,7 +18,7 @@ from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from studies.control_loop import ChannelState, ControlLoop, run_loop
 
-for module in ("numba", "dask", "pandas", "pyarrow"):
+for module in ("numba", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
 
 SCENE = load_scene("reach")
@@ -78,7 +78,7 @@ def check_torques(case):
     ready.controlled.__dict__["module"] = SimpleNamespace(batch=one_period)
     rows = np.arange(5, 8)
     scenarios, starts, _ = ready.scenarios(study.sampler.rows(0, 3))
-    start = study.controlled.motion.at(0.0)
+    start = study.motion.at(0.0)
     # Off the reference, for feedback to act.
     off = np.array([0.01, -0.02, 0.005])
     starts["initial.gamma"] = np.tile(start.gamma + off, (3, 1))
@@ -88,7 +88,7 @@ def check_torques(case):
     settings = ControllerSettings(**{k: v for k, v in case.items() if k not in CHANNEL})
     joints = Dynamics.of(SCENE).joints
     for lane in range(3):
-        controller = Controller(SCENE, study.controlled.motion, settings, PERIOD)
+        controller = Controller(SCENE, study.motion, settings, PERIOD)
         quiet = {key: channel.get(key, 0) for key in ("delay", "counts")}
         encoders = ChannelState(ControlChannel(period=PERIOD, **quiet), 0)
         noise = channel.get("angle_noise", 0.0), channel.get("rate_noise", 0.0)
@@ -114,13 +114,8 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
     study = SweepStudy(SCENE, {"star.mass": [2.6, 2.0]}, control=control, tolerance=1e-10)
     found = run_study(study, None)
     for row, mass in enumerate((2.6, 2.0)):
-        loop = ControlLoop(
-            SCENE,
-            study.controlled.motion,
-            ControllerSettings(mode="feedforward_pd", bandwidth=40.0),
-            ControlChannel(period=0.01, delay=1),
-            SCENE.with_values({"star.mass": mass}),
-        )
+        plant = SCENE.with_values({"star.mass": mass})
+        loop = ControlLoop(SCENE, study.motion, study.control, plant)
         track, limited, failure = run_loop(loop)
         assert failure == ""
         rms = np.sqrt(np.mean(track.error**2, axis=0))

@@ -16,7 +16,7 @@ from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from test.sweeps.tables import same
 
-for module in ("numba", "dask", "pandas", "pyarrow"):
+for module in ("numba", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
 
 SCENE = load_scene("example2_heavy")

@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 from sst_ros.cli.main import run
 from sst_ros.sweeps.chunk_task import correlate_early_ends, read_sweep
 
-for module in ("numba", "dask", "pandas", "pyarrow", "matplotlib"):
+for module in ("numba", "pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
 
 STUDY = """

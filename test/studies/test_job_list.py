@@ -8,9 +8,9 @@ import sys
 import time
 from pathlib import Path
 
-from sst_ros.sweeps.job_list import run_jobs
+from studies import run_jobs
 
-ASKING = "from sweeps.test_job_list import waiting; waiting()"
+ASKING = "from test_job_list import waiting; waiting()"
 
 
 def slow(number):
@@ -29,7 +29,7 @@ def test_results_come_in_the_order_of_the_points():
 
 
 def test_no_worker_outlives_a_parent_that_is_killed():
-    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     parent = subprocess.Popen(
         [sys.executable, "-c", ASKING],
         stdout=subprocess.PIPE,
