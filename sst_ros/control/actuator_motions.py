@@ -17,12 +17,12 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solveh_banded
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.reference import (
     PIECES,
-    REST,
     Reference,
     ReferenceMotion,
     equal_pieces,
@@ -32,7 +32,7 @@ from sst_ros.control.reference import (
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.generic_math import axpy, multiply
+from sst_ros.mechanism.generic_math import ZERO, axpy, multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
@@ -192,7 +192,7 @@ def through_points(
     positions: Points,
     velocities: OpenPoints | None = None,
     accelerations: OpenPoints | None = None,
-    begin: tuple[Vector3, Vector3] = (REST, REST),
+    begin: tuple[Vector3, Vector3] = (ZERO, ZERO),
 ) -> ReferenceMotion:
     """Return the motion of the actuators through points, quintic between them.
 
@@ -377,39 +377,25 @@ class Quintic:
 
 
 def _complete(nodes: Array, lengths: Array) -> None:
-    """Fill in what is open in nodes, shape (n, 3, m), in place."""
+    """Fill in what is open in nodes, shape (n, 3, m), in place: the least integral of jerk^2."""
     usual = float(np.median(lengths))
     # A velocity times the usual length has the size of a position: the system stays well scaled.
-    scale = np.array([1.0, usual, usual * usual])
-    hessians = np.stack([_jerk(h) for h in (lengths / usual).tolist()])
+    scale = np.array([1.0, usual, usual * usual])[:, None]
+    forms = np.stack([_jerk(h) for h in (lengths / usual).tolist()])
+    places = 3 * np.arange(len(lengths))[:, None] + np.arange(6)  # of the numbers at its ends
+    ends = (
+        np.broadcast_to(places[:, :, None], forms.shape),
+        np.broadcast_to(places[:, None], forms.shape),
+    )
+    hessian = csc_array((forms.ravel(), tuple(map(np.ravel, ends))))
     for column in range(nodes.shape[2]):
-        if np.isnan(nodes[:, :, column]).any():
-            nodes[:, :, column] = _least_jerk(nodes[:, :, column], hessians, scale)
-
-
-def _least_jerk(nodes: Array, hessians: Array, scale: Array) -> Array:
-    """Return nodes, shape (n, 3), completed; hessians, shape (n - 1, 6, 6), are the segments'."""
-    missing = np.isnan(nodes).ravel()
-    x = np.where(missing, 0.0, (nodes * scale).ravel())
-    size, last = len(x), len(x) - 5
-    ends = x.reshape(-1, 3)
-    slope = np.einsum("nij,nj->ni", hessians, np.concatenate([ends[:-1], ends[1:]], axis=1))
-    right = np.zeros(size)
-    band = np.zeros((6, size))  # as solveh_banded takes it: band[5 + i - j, j] is entry (i, j)
-    for j in range(6):
-        right[j : last + j : 3] -= slope[:, j]
-        for i in range(j + 1):
-            band[5 + i - j, j : last + j : 3] += hessians[:, i, j]
-    # A given number keeps its value: its row and column become those of the unit matrix.
-    right[~missing] = 0.0
-    for above in range(1, 6):
-        band[5 - above, above:][~(missing[above:] & missing[:-above])] = 0.0
-    band[5][~missing] = 1.0
-    root = 1.0 / np.sqrt(band[5])
-    for above in range(6):
-        band[5 - above, above:] *= root[above:] * root[: size - above]
-    found = (root * solveh_banded(band, root * right)).reshape(nodes.shape) / scale
-    return np.where(np.isnan(nodes), found, nodes)
+        x = (nodes[:, :, column] * scale.T).ravel()
+        missing = np.isnan(x)
+        if missing.any():
+            x[missing] = 0.0
+            rows = hessian[missing]
+            x[missing] = splu(rows[:, missing]).solve(-(rows @ x))
+            nodes[:, :, column] = x.reshape(-1, 3) / scale.T
 
 
 def _jerk(h: float) -> Array:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,6 @@ from sst_ros.control.law import (
     Command,
     ControlLaw,
     ControllerSettings,
-    Sample,
     command_limit,
     feedback_gains,
     feedforward_torques,
@@ -24,7 +23,7 @@ from sst_ros.control.reference import ReferenceMotion
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.generic_math import ZERO
+from sst_ros.mechanism.generic_math import ZERO, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import State, Vector3
@@ -82,10 +81,10 @@ class Controller:
         t1, _ = virtual_work.equation_of_motion(
             virtual_work.Mechanism.of(model), posture, (0.0, 0.0, 0.0)
         )
-        self.inertia = _three(-np.diag(t1))
+        self.inertia: Vector3 = triple((-np.diag(t1)).tolist())
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
         gains = feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
-        kp, kd = (_three(gain[:, 0]) for gain in gains)
+        kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
         if rate >= min(kd) and rate > 0.0:
             allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
@@ -142,16 +141,10 @@ class Controller:
         instant = time + 0.5 * self._period_s
         torques = feedforward_torques(settings, self._inverse, self._motion, desired, instant)
         observed = self._observer.update(gamma) if settings.observes else ()
-        at = Sample(desired, *torques, gamma, gamma_dot, observed, self._integral)
-        command = self._law.answer(at)
+        command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
         _require_finite(command.total, "torque")
         self._integral = command.integral
         return command
-
-
-def _three(values: Iterable[float]) -> Vector3:
-    first, second, third = map(float, values)
-    return first, second, third
 
 
 def _require_finite(numbers: Sequence[float], what: str) -> None:

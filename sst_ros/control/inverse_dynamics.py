@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sst_ros.control.reference import REST, Reference
+from sst_ros.control.reference import Reference
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, State, Vector3
@@ -44,7 +45,7 @@ class InverseDynamics:
         quaternion: Quaternion,
         body_rate: Vector3,
         body_acceleration: Vector3,
-        moment: Vector3 = REST,
+        moment: Vector3 = ZERO,
     ) -> Vector3:
         """Torques [N m] that give W_dot in a state.
 
@@ -103,7 +104,7 @@ class InverseDynamics:
             allowed = "must be a State, three angles gamma or a quaternion"
             raise InputError("gravity_torque", [Problem("at", at, allowed)])
         x, y, z, w = pose
-        return self.torque((x, y, z, w), REST, REST)
+        return self.torque((x, y, z, w), ZERO, ZERO)
 
     def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> Exception:
         if not all(map(math.isfinite, given)):

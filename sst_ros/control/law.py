@@ -209,28 +209,6 @@ class ControlChannel(Section):
         return (line[0], line[1], line[2]), line[3:]
 
 
-class Sample(NamedTuple):
-    """What the law has at a sample.
-
-    Attributes:
-        desired: the reference.
-        feedforward: torque of the desired motion [N m].
-        held: the same at the instant whose torque is held.
-        gamma, gamma_dot: as measured [rad], [rad/s].
-        observed: orientation at the measured angles, where the law needs it.
-        integral: sum of errors [rad s]; none without integral action.
-
-    """
-
-    desired: Reference
-    feedforward: Triple
-    held: Triple
-    gamma: Triple
-    gamma_dot: Triple
-    observed: Any
-    integral: Any
-
-
 @dataclass(frozen=True)
 class Command:
     """What the law answers at a sample.
@@ -289,43 +267,64 @@ class ControlLaw(NamedTuple):
     limit: Scalar | None
     period: float
 
-    def answer(self, at: Sample) -> Command:
-        """Return the torques at a sample."""
+    def answer(
+        self,
+        desired: Reference,
+        torques: tuple[Triple, Triple],
+        gamma: Triple,
+        gamma_dot: Triple,
+        observed: Any,
+        integral: Any,
+    ) -> Command:
+        """Return the torques at a sample.
+
+        Args:
+            desired: the reference.
+            torques: of the desired motion [N m], now and at the instant whose torque is held.
+            gamma: as measured [rad].
+            gamma_dot: as measured [rad/s].
+            observed: orientation at the measured angles, where the law needs it.
+            integral: sum of errors [rad s]; none without integral action.
+
+        """
         mode, feedback, summed = self.settings.mode, ZERO, ZERO
-        feedforward = at.held if self.settings.feeds else ZERO
-        error = axpy(1.0, at.desired.gamma, -1.0, at.gamma)
-        rates = axpy(1.0, at.desired.gamma_dot, -1.0, at.gamma_dot)
+        feedforward = torques[1] if self.settings.feeds else ZERO
+        error = axpy(1.0, desired.gamma, -1.0, gamma)
+        rates = axpy(1.0, desired.gamma_dot, -1.0, gamma_dot)
         if mode == "gravity_pd":
-            feedforward = self.torque(at.observed, ZERO, ZERO)
+            feedforward = self.torque(observed, ZERO, ZERO)
         if mode == "computed_torque":
-            needed, summed = self._compute_torque(at, error, rates)
-            feedback = axpy(1.0, needed, -1.0, at.feedforward)
+            asked = add(desired.gamma_ddot, self._correct(integral, error, rates))
+            body_rate, acceleration = self.accelerate(observed, gamma_dot, asked)
+            summed = error
+            if self.settings.space == "so3":
+                summed, acceleration = self._correct_on_so3(desired, observed, body_rate, integral)
+            needed = self.torque(observed, body_rate, acceleration)
+            feedback = axpy(1.0, needed, -1.0, torques[0])
         elif mode != "feedforward":
             summed = error
-            feedback = _by_joint(self.inertia, self._correct(at.integral, error, rates))
+            feedback = _by_joint(self.inertia, self._correct(integral, error, rates))
         torque = total = add(feedforward, feedback)
         weight: Scalar = 1.0
         if self.limit is not None:
             torque = bound(total, self.limit)
             weight = 1.0 - is_above(dot3(axpy(1.0, total, -1.0, torque), error))
-        integral = at.integral and axpy(1.0, at.integral, weight * self.period, summed)
-        return Command(torque, feedforward, feedback, at.desired, error, rates, integral)
+        integral = integral and axpy(1.0, integral, weight * self.period, summed)
+        return Command(torque, feedforward, feedback, desired, error, rates, integral)
 
-    def _compute_torque(self, at: Sample, error: Triple, rates: Triple) -> tuple[Triple, Triple]:
-        """Torque of computed_torque, and the error to integrate."""
-        asked = add(at.desired.gamma_ddot, self._correct(at.integral, error, rates))
-        body_rate, body_acceleration = self.accelerate(at.observed, at.gamma_dot, asked)
-        if self.settings.space == "so3":
-            between = relative_quaternion(at.observed, at.desired.quaternion)
-            turn = rotation_rows(between)
-            rate, forward = (
-                (dot3(turn[0], vector), dot3(turn[1], vector), dot3(turn[2], vector))
-                for vector in (at.desired.body_rate, at.desired.body_acceleration)
-            )
-            moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
-            error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
-            body_acceleration = add(moving, self._correct(at.integral, error, rates))
-        return self.torque(at.observed, body_rate, body_acceleration), error
+    def _correct_on_so3(
+        self, desired: Reference, observed: Any, body_rate: Triple, integral: Any
+    ) -> tuple[Triple, Triple]:
+        """Error on SO(3) [rad], and W_dot [rad/s^2] that makes it vanish."""
+        between = relative_quaternion(observed, desired.quaternion)
+        turn = rotation_rows(between)
+        rate, forward = (
+            (dot3(turn[0], vector), dot3(turn[1], vector), dot3(turn[2], vector))
+            for vector in (desired.body_rate, desired.body_acceleration)
+        )
+        moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
+        error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
+        return error, add(moving, self._correct(integral, error, rates))
 
     def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
         """Acceleration kp e + kd e_dot, with integral action."""

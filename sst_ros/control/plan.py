@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import simpson
@@ -27,10 +26,14 @@ SAMPLES = 16
 SINGULAR_J2 = 1e-6
 """det J2 within which a motion counts as singular."""
 
+UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
+"""Of the peaks of an `ActuatorDemand`."""
+
 _ROUNDING = 1e-13
 
 
-class Peak(NamedTuple):
+@dataclass(frozen=True)
+class Peak:
     """A value and the time at which it is taken [s]."""
 
     value: float
@@ -104,7 +107,7 @@ class MotionPlan:
     times: Array
     references: tuple[Reference, ...]
     torques: Array
-    demands: tuple[ActuatorDemand, ActuatorDemand, ActuatorDemand]
+    demands: tuple[ActuatorDemand, ...]
     distances: tuple[LimitDistance, ...]
     problems: tuple[Problem, ...]
 
@@ -133,7 +136,10 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
         SingularConfiguration: the motion meets a singularity; no torque is defined there.
 
     """
-    times = sample_times(motion)
+    parts = (
+        np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
+    )
+    times = np.append(np.concatenate(list(parts)), motion.pieces[-1])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired))
     inverse = InverseDynamics(scene)
@@ -144,34 +150,20 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
         "acceleration": lambda at: at.gamma_ddot,
     }
     samples = {name: np.array(list(map(of, desired))) for name, of in asked.items()}
+    pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
     demands = []
     for leg in range(3):
-        peaks = {
-            name: peak_magnitude(_component(motion, of, leg), times, samples[name][:, leg])
-            for name, of in asked.items()
-        }
-        rms = _root_mean_square(samples["torque"][:, leg], times)
+        peaks = {}
+        for name, of in asked.items():
+            given = _component(motion, of, leg), times, samples[name][:, leg]
+            peaks[name] = max(maximum(*given), minimum(*given), key=lambda peak: abs(peak.value))
+        squares = simpson(samples["torque"][pieces, leg] ** 2, x=times[pieces], axis=1)
+        rms = math.sqrt(squares.sum() / times[-1])
         demands.append(ActuatorDemand(torque_rms=rms, **peaks))
-    first, second, third = demands
     problems = (*_beyond(distances), *_too_much(demands, scene.actuators))
     return MotionPlan(
-        motion,
-        scene,
-        times,
-        desired,
-        samples["torque"],
-        (first, second, third),
-        distances,
-        problems,
+        motion, scene, times, desired, samples["torque"], tuple(demands), distances, problems
     )
-
-
-def sample_times(motion: ReferenceMotion) -> Array:
-    """Return the ends of SAMPLES equal parts of every piece [s]."""
-    inner = [
-        np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
-    ]
-    return np.concatenate([*inner, [motion.pieces[-1]]])
 
 
 def _component(
@@ -179,16 +171,6 @@ def _component(
 ) -> Callable[[float], float]:
     """Return one of the numbers of a reference as a function of time."""
     return lambda time: of(motion.at(time))[index]
-
-
-def _root_mean_square(values: Array, times: Array) -> float:
-    square = sum(
-        float(
-            simpson(values[first : first + SAMPLES + 1] ** 2, x=times[first : first + SAMPLES + 1])
-        )
-        for first in range(0, len(times) - 1, SAMPLES)
-    )
-    return float(np.sqrt(square / times[-1]))
 
 
 def _distances(
@@ -202,23 +184,23 @@ def _distances(
         return (*at.gamma, *_posture(coordinates, at))
 
     values = np.array([measure(at) for at in desired]).T
+    given = [(_component(motion, measure, i), times, row) for i, row in enumerate(values)]
     ranges = (
         ("gamma", 0, geometry.arc.tolist(), scene.stroke.at_end != "ignore"),
         ("beta", 6, [geometry.beta_max] * 3, scene.workspace.at_edge != "ignore"),
     )
-    for name, column, ends, held in ranges:
+    for name, first, ends, held in ranges:
         for leg, end in enumerate(ends):
-            given = _component(motion, measure, column + leg), times, values[column + leg]
-            key = f"{name}_{leg + 1}"
-            yield LimitDistance(key, 0.0, 1.0, "rad", minimum(*given), held)
-            yield LimitDistance(key, end, -1.0, "rad", maximum(*given), held)
+            key, course = f"{name}_{leg + 1}", given[first + leg]
+            yield LimitDistance(key, 0.0, 1.0, "rad", minimum(*course), held)
+            yield LimitDistance(key, end, -1.0, "rad", maximum(*course), held)
     for leg in range(3):
-        low = minimum(_component(motion, measure, 3 + leg), times, values[3 + leg])
+        low = minimum(*given[3 + leg])
         if low.value < SINGULAR_MU:
             said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
         yield LimitDistance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
-    determinant, sign = _component(motion, measure, 9), 1.0 if values[9, 0] > 0.0 else -1.0
+    determinant, sign = given[9][0], 1.0 if values[9, 0] > 0.0 else -1.0
     low = minimum(lambda time: sign * determinant(time), times, sign * values[9])
     if low.value < SINGULAR_J2:
         end = low.time if low.value > 0.0 else brentq(determinant, 0.0, low.time)
@@ -250,15 +232,15 @@ def _beyond(distances: tuple[LimitDistance, ...]) -> Iterator[Problem]:
 def _too_much(demands: list[ActuatorDemand], actuators: Actuators | None) -> Iterator[Problem]:
     for name, limit, unit in limits(actuators):
         for leg, demand in enumerate(demands):
-            value, time = getattr(demand, name)
-            if abs(value) > limit:
-                allowed = f"exceeds the limit {limit:g} {unit} at t = {time:.9g} s"
-                yield Problem(f"{name}_{leg + 1}", value, allowed)
+            peak: Peak = getattr(demand, name)
+            if abs(peak.value) > limit:
+                allowed = f"exceeds the limit {limit:g} {unit} at t = {peak.time:.9g} s"
+                yield Problem(f"{name}_{leg + 1}", peak.value, allowed)
 
 
 def limits(actuators: Actuators | None) -> Iterator[tuple[str, float, str]]:
     """Yield the limits that the actuators have: name of the demand, limit, unit."""
-    for name, unit in (("torque", "N m"), ("velocity", "rad/s"), ("acceleration", "rad/s^2")):
+    for name, unit in UNITS.items():
         limit: float | None = getattr(actuators, f"{name}_limit", None)
         if limit is not None:
             yield name, limit, unit
@@ -288,12 +270,9 @@ def maximum(
     summits = (values >= left) & (values >= right) & high
     for index in np.flatnonzero(summits):
         bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
-        width = float(bounds[1] - bounds[0])
+        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
         found = minimize_scalar(
-            lambda time: -function(time),
-            bounds=bounds,
-            method="bounded",
-            options={"xatol": 1e-8 * width},
+            lambda time: -function(time), bounds=bounds, method="bounded", options=options
         )
         if -found.fun > best.value + _ROUNDING * abs(best.value):
             best = Peak(float(-found.fun), float(found.x))
@@ -304,9 +283,3 @@ def minimum(function: Callable[[float], float], times: Array, values: Array) -> 
     """Return the minimum; see `maximum`."""
     found = maximum(lambda time: -function(time), times, -values)
     return Peak(-found.value, found.time)
-
-
-def peak_magnitude(function: Callable[[float], float], times: Array, values: Array) -> Peak:
-    """Return the value of the largest magnitude, with its sign; see `maximum`."""
-    high, low = maximum(function, times, values), minimum(function, times, values)
-    return high if high.value >= -low.value else low

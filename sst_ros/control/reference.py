@@ -6,10 +6,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
-from sst_ros.mechanism.generic_math import axpy, multiply
+from sst_ros.mechanism.generic_math import ZERO, axpy, multiply
 from sst_ros.state import Quaternion, Vector3
-
-REST: Vector3 = (0.0, 0.0, 0.0)
 
 PIECES = 8
 """Pieces of a minimum-jerk motion, and of a quarter of a turn."""
@@ -59,7 +57,7 @@ class ReferenceMotion(ABC):
         if 0.0 <= time <= self.duration:
             return self._inside(time)
         end = self._inside(0.0 if time < 0.0 else self.duration)
-        return replace(end, body_rate=REST, body_acceleration=REST, gamma_dot=REST, gamma_ddot=REST)
+        return replace(end, body_rate=ZERO, body_acceleration=ZERO, gamma_dot=ZERO, gamma_ddot=ZERO)
 
     @abstractmethod
     def _inside(self, time: float) -> Reference:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -28,8 +27,9 @@ from sst_ros.control.reference import (
 )
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration
-from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product
+from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product, triple
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.loads import Spiral
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
 
@@ -63,12 +63,10 @@ def reference_motion(
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
     start = (x, y, z, w)
-    if motion.to_orientation:
-        end = motion.to_orientation.orientation
-        return GeodesicMotion(geometry, start, end, motion.to_orientation.duration)
-    if spiral := motion.spiral:
-        angles = (spiral.theta, spiral.phi, spiral.psi)
-        return SpiralMotion(geometry, start, angles, spiral.duration)
+    if turn := motion.to_orientation:
+        return geodesic_motion(geometry, start, turn.orientation, turn.duration)
+    if motion.spiral:
+        return spiral_motion(geometry, start, motion.spiral)
     if points := motion.waypoints:
         rows = zip(
             *((at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in points), strict=True
@@ -93,90 +91,83 @@ StarState = tuple[Quaternion, Vector3, Vector3]
 
 
 class StarMotion(ReferenceMotion):
-    """A motion of the star; a subclass defines it by `star`."""
+    """A motion of the star.
 
-    def __init__(self, geometry: Geometry, duration: float, turn: float) -> None:
-        """Prepare a motion that turns the star by some `turn` [rad] in all."""
+    Args:
+        geometry: base triangle and star.
+        star: quaternion, W and W_dot at a time [s] between 0 and the duration.
+        duration: [s].
+        turn: by which the star turns in all [rad].
+
+    """
+
+    def __init__(
+        self, geometry: Geometry, star: Callable[[float], StarState], duration: float, turn: float
+    ) -> None:
         count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
         super().__init__(duration, equal_pieces(duration, count))
-        self._coordinates = ActuatorSpaceMap(geometry)
-
-    @abstractmethod
-    def star(self, time: float) -> StarState:
-        """Quaternion, W and W_dot at a time [s] between 0 and the duration."""
+        self._star, self._coordinates = star, ActuatorSpaceMap(geometry)
 
     def _inside(self, time: float) -> Reference:
         try:
-            return self._coordinates.of_star(*self.star(time))
+            return self._coordinates.of_star(*self._star(time))
         except ArithmeticError:
             said = f"serial singularity at t = {time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, 0.0) from None
 
 
-class GeodesicMotion(StarMotion):
+def geodesic_motion(
+    geometry: Geometry, start: Quaternion, end: Quaternion, duration: float
+) -> StarMotion:
     """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
 
     Quaternions (x, y, z, w) may have any length > 0; the shorter rotation is taken.
     """
+    # The axis is the same in {B} and in {E}.
+    turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
+    vector, begin = triple(turn.tolist()), _unit(start)
+    angle = math.hypot(*vector)
 
-    def __init__(
-        self, geometry: Geometry, start: Quaternion, end: Quaternion, duration: float
-    ) -> None:
-        self._start = _unit(start)
-        vector = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
-        x, y, z = vector.tolist()
-        self._angle = math.hypot(x, y, z)
-        self._vector: Vector3 = (x, y, z)
-        super().__init__(geometry, duration, self._angle)
+    def star(time: float) -> StarState:
+        s, rate, acceleration = minimum_jerk_over(time, duration)
+        half = 0.5 * s * angle
+        part = math.sin(half) / angle if angle else 0.0
+        q = quaternion_product(begin, (*multiply(part, vector), math.cos(half)))
+        return q, multiply(rate, vector), multiply(acceleration, vector)
 
-    def star(self, time: float) -> StarState:
-        """See `StarMotion.star`; the axis is the same in {B} and in {E}."""
-        s, rate, acceleration = minimum_jerk_over(time, self.duration)
-        half = 0.5 * s * self._angle
-        part = math.sin(half) / self._angle if self._angle else 0.0
-        q = quaternion_product(self._start, (*multiply(part, self._vector), math.cos(half)))
-        return q, multiply(rate, self._vector), multiply(acceleration, self._vector)
+    return StarMotion(geometry, star, duration, angle)
 
 
-class SpiralMotion(StarMotion):
+def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> StarMotion:
     """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
 
     Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so the motion
     is smooth where ZYZ angles are not.
     """
+    begin, duration = _unit(start), spiral.duration
+    theta, phi, third = spiral.theta, spiral.phi, spiral.psi - spiral.theta
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        start: Quaternion,
-        end: tuple[float, float, float],
-        duration: float,
-    ) -> None:
-        self._start = _unit(start)
-        self._theta, self._phi, self._psi = end
-        turn = abs(self._theta) + abs(self._phi) + abs(self._psi)
-        super().__init__(geometry, duration, turn)
-
-    def star(self, time: float) -> StarState:
-        """See `StarMotion.star`."""
-        s, rate, acceleration = minimum_jerk_over(time, self.duration)
-        a, b, c = s * self._theta, s * self._phi, s * (self._psi - self._theta)
+    def star(time: float) -> StarState:
+        s, rate, acceleration = minimum_jerk_over(time, duration)
+        a, b, c = s * theta, s * phi, s * third
         q = quaternion_product(
             quaternion_product(_about_z(a), (0.0, math.sin(0.5 * b), 0.0, math.cos(0.5 * b))),
             _about_z(c),
         )
         # W = u rate with u = (theta part, phi part, third angle's part) by the angles a, b, c.
-        third = self._psi - self._theta
         sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
-        x = -self._theta * sb * cc + self._phi * sc
-        y = self._theta * sb * sc + self._phi * cc
-        z = self._theta * cb + third
+        u = (-theta * sb * cc + phi * sc, theta * sb * sc + phi * cc, theta * cb + third)
         # Its derivatives by s; the angles are linear in s.
-        dx = -self._theta * (self._phi * cb * cc - third * sb * sc) + self._phi * third * cc
-        dy = self._theta * (self._phi * cb * sc + third * sb * cc) - self._phi * third * sc
-        dz = -self._theta * self._phi * sb
-        turning = axpy(acceleration, (x, y, z), rate * rate, (dx, dy, dz))
-        return quaternion_product(self._start, q), multiply(rate, (x, y, z)), turning
+        slope = (
+            -theta * (phi * cb * cc - third * sb * sc) + phi * third * cc,
+            theta * (phi * cb * sc + third * sb * cc) - phi * third * sc,
+            -theta * phi * sb,
+        )
+        turning = axpy(acceleration, u, rate * rate, slope)
+        return quaternion_product(begin, q), multiply(rate, u), turning
+
+    turn = abs(theta) + abs(phi) + abs(spiral.psi)
+    return StarMotion(geometry, star, duration, turn)
 
 
 def _about_z(angle: float) -> Quaternion:

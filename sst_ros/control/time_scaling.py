@@ -9,18 +9,17 @@ limits are tested on the dynamics themselves, not scaled.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.plan import ActuatorDemand, LimitDistance, MotionPlan, limits, maximum
+from sst_ros.control.plan import UNITS, LimitDistance, MotionPlan, limits, maximum
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array
@@ -71,20 +70,31 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     if torque_limit is None:
         return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
     torques = _Torques(plan, torque_limit)
+
+    def bisect(fits: float, fails: float) -> float:
+        """Return the feasible end of a change between two factors."""
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (fits + fails)
+            fits, fails = (middle, fails) if torques.fit(middle) else (fits, middle)
+        return fits
+
     top = min(cap, torques.top())
-    grid = np.geomspace(SLOWEST * top, top, _GRID).tolist()
-    last = _last(torques, grid, len(grid) - 1, feasible=True)
-    if last is None:
+    grid = np.geomspace(SLOWEST * top, top, _GRID)
+    fits = np.array([torques.fit(factor) for factor in grid.tolist()])
+    if not fits.any():
         return TimeScaling(None, 0.0, "torque")
-    highest = grid[last]
+    last = int(np.flatnonzero(fits)[-1])
+    highest = float(grid[last])
     if last < len(grid) - 1:
-        highest, binding = _between(torques, highest, grid[last + 1]), "torque"
+        highest, binding = bisect(highest, float(grid[last + 1])), "torque"
     elif math.isinf(cap):
         highest, binding = math.inf, ""
-    first = _last(torques, grid, last, feasible=False)
-    if first is not None:
-        return TimeScaling(highest, _between(torques, grid[first + 1], grid[first]), binding)
-    return TimeScaling(highest, 0.0 if torques.fit(0.0) else grid[0], binding)
+    slow = np.flatnonzero(~fits[:last])
+    if len(slow):
+        lowest = bisect(float(grid[slow[-1] + 1]), float(grid[slow[-1]]))
+    else:
+        lowest = 0.0 if torques.fit(0.0) else float(grid[0])
+    return TimeScaling(highest, lowest, binding)
 
 
 class _Torques:
@@ -143,23 +153,6 @@ class _Torques:
         return self._inverse.torque(
             at.quaternion, multiply(factor, rate), multiply(factor * factor, acceleration)
         )
-
-
-def _last(torques: _Torques, grid: list[float], start: int, *, feasible: bool) -> int | None:
-    """Index of the last factor up to `start` that is feasible, or is not; None if there is none."""
-    down = range(start, -1, -1)
-    return next((index for index in down if torques.fit(grid[index]) == feasible), None)
-
-
-def _between(torques: _Torques, fits: float, fails: float) -> float:
-    """Return the feasible end of a change between two factors."""
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (fits + fails)
-        fits, fails = (middle, fails) if torques.fit(middle) else (fits, middle)
-    return float(fits)
-
-
-UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 
 
 def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
@@ -241,10 +234,8 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
             "feasible": not plan.problems,
             "problems": [str(problem) for problem in plan.problems],
             "limits": {name: limit for name, limit, _ in limits(plan.scene.actuators)},
-            "actuators": [_plain(demand) for demand in plan.demands],
-            "distances": [
-                {**_plain(distance), "least": distance.least} for distance in plan.distances
-            ],
+            "actuators": [asdict(demand) for demand in plan.demands],
+            "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
             "highest_speed": None if highest is None or math.isinf(highest) else highest,
             "any_speed": highest is not None and math.isinf(highest),
             "lowest_speed": fastest.lowest,
@@ -252,12 +243,6 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
         },
         indent=2,
     )
-
-
-def _plain(part: ActuatorDemand | LimitDistance) -> dict[str, object]:
-    """Turn a part into a mapping; extremes become mappings, too."""
-    values = ((field.name, getattr(part, field.name)) for field in dataclasses.fields(part))
-    return {name: value._asdict() if hasattr(value, "_asdict") else value for name, value in values}
 
 
 def write_torques(plan: MotionPlan, path: Path, period: float) -> None:

@@ -23,7 +23,6 @@ from sst_ros.control.controller import Controller
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import (
     ControlLaw,
-    Sample,
     bound,
     command_limit,
     feedback_gains,
@@ -270,8 +269,6 @@ class ControlledBatch:
         )
         new["observed"] = self._observe(gamma, memory["observed"])
         desired = Reference(**{name: given[name] for name in _DESIRED})
-        torques = given["feedforward"], given["held"]
-        at = Sample(desired, *torques, gamma, gamma_dot, new["observed"], memory["integral"])
         command = ControlLaw(
             control,
             self._torque,
@@ -282,7 +279,14 @@ class ControlledBatch:
             gains["rate"][0],
             gains["limit"][0] if self._limited else None,
             control.period,
-        ).answer(at)
+        ).answer(
+            desired,
+            (given["feedforward"], given["held"]),
+            gamma,
+            gamma_dot,
+            new["observed"],
+            memory["integral"],
+        )
         new["integral"] = command.integral
         torque, new["queue"] = control.transmit(command.torque, memory["queue"], given["first"][0])
         if self._limited:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sst_ros.control.actuator_space import ActuatorSpaceMap, OrientationObserver
 from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.law import MODES, ControllerSettings
-from sst_ros.control.reference_motions import GeodesicMotion
+from sst_ros.control.reference_motions import geodesic_motion
 from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -41,7 +41,7 @@ def turned(model, vector, duration=0.4):
     geometry = Geometry.of(model)
     start = kinematics.admissible(geometry, model.initial.gamma).rotation
     end = quaternion_of(start @ Rotation.from_rotvec(vector).as_matrix())
-    return GeodesicMotion(geometry, tuple(quaternion_of(start)), tuple(end), duration)
+    return geodesic_motion(geometry, tuple(quaternion_of(start)), tuple(end), duration)
 
 
 def desired_near(sample, seed):

@@ -19,7 +19,7 @@ from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
 from sst_ros.control.plan import check_motion, examine_motion, maximum, minimum
-from sst_ros.control.reference_motions import GeodesicMotion, reference_motion
+from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.control.time_scaling import time_scaling
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics, workspace
@@ -256,7 +256,7 @@ def test_a_turn_through_a_parallel_singularity_is_refused():
     with pytest.raises(
         SingularConfiguration, match=r"parallel singularity at t = 0\.\d+ s"
     ) as told:
-        check_motion(GeodesicMotion(geometry, first, last, 1.0), scene)
+        check_motion(geodesic_motion(geometry, first, last, 1.0), scene)
     assert abs(told.value.measure) < 1e-9
 
 
@@ -269,7 +269,7 @@ def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
         for off in (-0.2, 0.2)
     )
     with pytest.raises(SingularConfiguration, match="serial singularity"):
-        check_motion(GeodesicMotion(geometry, first, last, 1.0), scene)
+        check_motion(geodesic_motion(geometry, first, last, 1.0), scene)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
