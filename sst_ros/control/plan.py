@@ -15,7 +15,7 @@ from scipy.optimize import brentq, minimize_scalar
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import Reference, ReferenceMotion
-from sst_ros.dynamics.limits import SINGULAR_MU
+from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Actuators, Scene

@@ -40,7 +40,7 @@ from sst_ros.description.tree import (
     shapes,
     tree,
 )
-from sst_ros.dynamics.limits import limits_of, ranges_of
+from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import LARGEST, Friction, Scene

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from sst_ros.dynamics.kernel import Leg, LegMotion, Model, leg_motion
-from sst_ros.dynamics.limits import Limit
+from sst_ros.dynamics.model import Limit
 from sst_ros.mechanism.generic_math import Scalar, dot3, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene

@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
-from sst_ros.dynamics.limits import Limit, limits_of
-from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.model import Limit, damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics.limits import Limit, limits_of, ranges_of
+from sst_ros.dynamics.model import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (

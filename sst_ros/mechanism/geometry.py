@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.scene.bodies import Base, Star
-from sst_ros.scene.loads import Workspace
+from sst_ros.scene.scene import Scene
 from sst_ros.state import Array
 
 __all__ = ["Array", "Geometry", "frozen"]
@@ -22,17 +21,6 @@ def frozen(*arrays: Any) -> tuple[Any, ...]:
     for array in arrays:
         array.setflags(write=False)
     return arrays
-
-
-class HasGeometry(Protocol):
-    """What of a scene has a part in its geometry."""
-
-    @property
-    def base(self) -> Base: ...
-    @property
-    def star(self) -> Star: ...
-    @property
-    def workspace(self) -> Workspace: ...
 
 
 @dataclass(frozen=True)
@@ -59,7 +47,7 @@ class Geometry:
     beta_max: Any
 
     @classmethod
-    def of(cls, scene: HasGeometry) -> Geometry:
+    def of(cls, scene: Scene) -> Geometry:
         """Derive the geometry of a scene."""
         return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 

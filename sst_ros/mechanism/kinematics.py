@@ -44,7 +44,7 @@ _NOT_ISOLATED = 1e-13
 
 _NEAR_REAL = 1e-3
 
-_NEAR = 1e-3
+_SAME = 1e-3
 
 _MISFIT = 1e-2
 
@@ -69,13 +69,13 @@ class Assemblies:
 
     """
 
-    configuration: NDArray[np.intp]
+    configuration: Index
     rotation: Array
     mu: Array
     beta: Array
     det_j2: Array
-    admissible: NDArray[np.bool_]
-    isolated: NDArray[np.bool_]
+    admissible: Mask
+    isolated: Mask
 
 
 def carriage_directions(geometry: Geometry, gamma: ArrayLike) -> Array:
@@ -151,7 +151,7 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
         raise AssemblyError("gamma must be rows of three finite numbers", angles)
     r = carriage_directions(geometry, angles)
-    configuration, rotation, isolated = rotations(r, geometry.e)
+    configuration, rotation, isolated = _solve_closure(r, geometry.e)
     mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
@@ -190,7 +190,7 @@ def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = No
 
 def describe_assemblies(
     geometry: Geometry, r: Array, rotation: Array
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Array, Mask]:
     """Passive angles mu, beta (..., 3) [rad], det J2 and admissibility (...) of assemblies.
 
     Args:
@@ -210,7 +210,7 @@ def describe_assemblies(
     return mu, beta, -volume, valid
 
 
-def rotations(r: Array, e: Array) -> tuple[Index, Array, Mask]:
+def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     """Solve r_k . R e_k = 0 for many configurations at once.
 
     Args:
@@ -393,7 +393,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
         new, old = rotation[later], rotation[later - back]
         sign = np.where(dot(new[:, :, 1], old[:, :, 1]) < 0.0, -1.0, 1.0)
         old = old * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, None, :]
-        close = np.abs(new - old).max(axis=(1, 2)) < _NEAR
+        close = np.abs(new - old).max(axis=(1, 2)) < _SAME
         if close.any():
             at = later[close]
             middle = rotate(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))

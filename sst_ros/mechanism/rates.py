@@ -74,10 +74,7 @@ def of_actuators(
     rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
     omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
-    found = _legs(at.r, at.t, at.w, at.c, omega, omega_dot)
-    return _motion(
-        at.r, at.t, at.w, omega, omega_dot, (rate, *found[1:3], acceleration, *found[4:])
-    )
+    return _motion(at.r, at.t, at.w, omega, omega_dot, (rate, acceleration))
 
 
 def of_star(
@@ -108,8 +105,7 @@ def of_star(
     c = np.sum(cross(r, t) * w, axis=1)
     if np.min(np.abs(c)) < SINGULAR:
         raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
-    star = np.array(omega, dtype=float), np.array(omega_dot, dtype=float)
-    return _motion(r, t, w, *star, _legs(r, t, w, c, *star))
+    return _motion(r, t, w, np.array(omega, dtype=float), np.array(omega_dot, dtype=float))
 
 
 def body_rates(
@@ -129,11 +125,17 @@ def body_rates(
     return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
 
 
-def _legs(
-    r: Array, t: Array, w: Array, c: Array, omega: Array, omega_dot: Array
-) -> tuple[Array, ...]:
-    """Joint rates, then joint accelerations, of all legs."""
+def _motion(
+    r: Array,
+    t: Array,
+    w: Array,
+    omega: Array,
+    omega_dot: Array,
+    actuators: tuple[Array, Array] | None = None,
+) -> BodyRates:
+    """All joints and links; gamma_dot and gamma_ddot are those of `actuators` where given."""
     normal, wr, turning = cross(r, t), cross(w, r), cross(omega, t)
+    c = np.sum(normal * w, axis=1)
     gamma_dot = (normal @ omega) / c  # Eq. 10
     mu_dot = -(r @ omega)  # Eq. 18
     beta_dot = -(wr @ omega) / c  # Eq. 21
@@ -145,13 +147,8 @@ def _legs(
     ) / c  # Eq. 29
     mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * turning, axis=1)  # Eq. 42
     beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c  # Eq. 46
-    return gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
-
-
-def _motion(
-    r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, joints: tuple[Array, ...]
-) -> BodyRates:
-    gamma_dot, mu_dot, _, gamma_ddot, mu_ddot, _ = joints
+    gamma_dot, gamma_ddot = actuators or (gamma_dot, gamma_ddot)
+    joints = gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
     zero = np.zeros(3)
     omega_a = np.stack([zero, zero, gamma_dot], axis=1)
     omega_a_dot = np.stack([zero, zero, gamma_ddot], axis=1)
@@ -160,9 +157,9 @@ def _motion(
     x = np.array([1.0, 0.0, 0.0])
     omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
-    push = cross(turn, np.broadcast_to(x, turn.shape))
+    across = cross(turn, np.broadcast_to(x, turn.shape))
     omega_ipl_dot = (
-        gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * push
+        gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * across
     )
     return BodyRates(
         *frozen(omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)

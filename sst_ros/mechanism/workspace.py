@@ -2,8 +2,8 @@
 """Where the star can go, how far every limit is, how well the actuators hold it, what is singular.
 
 A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max, and gamma_k
-lies in its stroke. Two maps: over orientations (direction of s, turn psi about it), where the
-inverse kinematics has one answer, and over gamma, where the direct kinematics has 0 to 3.
+lies in its stroke. The map is over orientations (direction of s, turn psi about it), where the
+inverse kinematics has one answer.
 
 Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k = +-w_k, so
 w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever at the edge of what
@@ -106,26 +106,6 @@ class OrientationMap:
         return np.where(np.isfinite(most), most, np.nan)
 
 
-@dataclass(frozen=True)
-class GammaMap:
-    """Measures over a grid of gamma; of several admissible assemblies the best cond J counts.
-
-    Attributes:
-        geometry: what was mapped.
-        gamma: actuator angles [rad], shape (n, n, n, 3), mid-points of n equal parts of the stroke.
-        count: number of admissible assemblies, shape (n, n, n).
-        rotation: R, shape (n, n, n, 3, 3); NaN where there is none.
-        measures: shape (n, n, n); NaN and not admissible where there is none.
-
-    """
-
-    geometry: Geometry
-    gamma: Array
-    count: NDArray[np.intp]
-    rotation: Array
-    measures: Measures
-
-
 def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measures:
     """Measure assemblies: gamma [rad], shape (..., 3), with R, shape (..., 3, 3)."""
     angles, matrices = np.array(gamma, dtype=float), np.asarray(rotation, dtype=float)
@@ -183,33 +163,9 @@ def over_orientations(
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         parts.append(measures(geometry, gamma, rotation))
     frozen(directions, psi)
-    return OrientationMap(geometry, directions, psi, _join(parts))
-
-
-def over_gamma(geometry: Geometry, points: int = 24, progress: bool = False) -> GammaMap:
-    """Map points^3 actuator angles over the whole stroke; `progress` as in over_orientations."""
-    line = (np.arange(points) + 0.5) / points
-    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) * geometry.arc
-    gamma = grid.reshape(-1, 3)
-    count = np.zeros(len(gamma), dtype=np.intp)
-    rotation = np.full((len(gamma), 3, 3), np.nan)
-    for block in slices(len(gamma), 2000, "gamma", progress):
-        found = kinematics.direct_many(geometry, gamma[block])
-        valid = found.admissible
-        owner, candidates = found.configuration[valid] + block.start, found.rotation[valid]
-        np.add.at(count, owner, 1)
-        # Worst first: of several the best is written last.
-        order = np.argsort(-measures(geometry, gamma[owner], candidates).cond_j, kind="stable")
-        rotation[owner[order]] = candidates[order]
-    with np.errstate(invalid="ignore"):
-        measured = measures(geometry, gamma, rotation)
-    blank = np.where(count > 0, 0.0, np.nan)
-    values = [getattr(measured, name) for name in Measures.__dataclass_fields__]
-    values = [v if v.dtype == bool or v.ndim > 1 else v + blank for v in values]
-    cube = (points, points, points)
-    shaped = Measures(*frozen(*(v.reshape(cube + v.shape[1:]) for v in values)))
-    frozen(grid, count, rotation)
-    return GammaMap(geometry, grid, count.reshape(cube), rotation.reshape(*cube, 3, 3), shaped)
+    columns_of_parts = zip(*(vars(part).values() for part in parts), strict=True)
+    joined = Measures(*frozen(*map(np.concatenate, columns_of_parts)))
+    return OrientationMap(geometry, directions, psi, joined)
 
 
 def orientations(s: Array, psi: ArrayLike) -> Array:
@@ -244,11 +200,6 @@ def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array,
             faces.append((here, index[i + 1, j - 1], index[i + 1, j]))
     s = np.array(weights) @ geometry.v
     return s / np.linalg.norm(s, axis=1)[:, None], np.array(faces, dtype=np.intp)
-
-
-def _join(parts: list[Measures]) -> Measures:
-    names = Measures.__dataclass_fields__
-    return Measures(*frozen(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)))
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.limits import limits_of
-from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.compiled_method import CompiledMethod

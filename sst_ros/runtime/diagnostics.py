@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from sst_ros.dynamics.limits import limits_of
+from sst_ros.dynamics.model import limits_of
 from sst_ros.host import scheduling
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import Phase, RunLoop

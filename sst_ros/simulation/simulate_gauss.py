@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, number_constants, trace
-from sst_ros.dynamics.limits import Limit, limits_of
+from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event, limit_distances
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, tables

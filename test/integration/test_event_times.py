@@ -16,7 +16,7 @@ import pytest
 from loaded_scenes import REST, apart
 from models import inertia_of
 
-from sst_ros.dynamics.limits import SINGULAR_MU
+from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix

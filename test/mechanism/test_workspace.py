@@ -16,17 +16,12 @@ from sst_ros.mechanism.frames import zyz_angles
 
 @pytest.fixture(scope="module")
 def isotropic():
-    return chart_of(ISOTROPIC)
+    return workspace.workspace(ISOTROPIC, 16, 90)
 
 
 @pytest.fixture(scope="module")
 def folding():
-    return chart_of(FOLDING)
-
-
-def chart_of(geometry, divisions=16):
-    s, _ = workspace.triangle_directions(geometry, divisions)
-    return workspace.over_orientations(geometry, s, turns=90)
+    return workspace.workspace(FOLDING, 16, 90)
 
 
 def test_measures_are_those_of_the_velocity_analysis():
@@ -70,29 +65,6 @@ def test_the_isotropic_workspace(isotropic):
     # Home: beta is 35.2644 deg, the ends of the stroke are 45 deg away.
     np.testing.assert_allclose(np.degrees(centre.best_margin), 35.2644, atol=1.0)
     assert "parallel: none" in workspace.report_singularities(ISOTROPIC, isotropic)
-
-
-def test_a_quarter_of_the_isotropic_gamma_cube_is_empty():
-    found = workspace.over_gamma(ISOTROPIC, points=16)
-    assert set(np.unique(found.count)) == {0, 1}
-    assert 0.22 < np.mean(found.count == 0) < 0.29
-    assert np.array_equal(found.count > 0, found.measures.admissible)
-    assert np.all(np.isnan(found.measures.cond_j[found.count == 0]))
-    row = tuple(np.argwhere(found.count == 1)[100])
-    pose = kinematics.admissible(ISOTROPIC, found.gamma[row])
-    np.testing.assert_allclose(found.rotation[row], pose.rotation, atol=1e-12)
-
-
-def test_of_several_admissible_assemblies_the_best_conditioned_counts():
-    found = workspace.over_gamma(FOLDING, points=16)
-    rows = np.argwhere(found.count > 1)
-    assert len(rows) > 0
-    for row in map(tuple, rows):
-        gamma = found.gamma[row]
-        candidates = [a for a in kinematics.direct(FOLDING, gamma) if a.admissible]
-        assert len(candidates) == found.count[row]
-        conds = [workspace.measures(FOLDING, gamma, a.rotation).cond_j for a in candidates]
-        np.testing.assert_allclose(found.measures.cond_j[row], min(conds), rtol=1e-6)
 
 
 def test_parallel_singularities_of_the_folding_geometry(folding):
@@ -142,7 +114,7 @@ def test_the_bar_is_for_terminals_only(terminal, monkeypatch):
     stream = io.StringIO()
     stream.isatty = lambda: terminal
     monkeypatch.setattr(sys, "stderr", stream)
-    workspace.over_gamma(ISOTROPIC, points=4, progress=True)
+    workspace.workspace(ISOTROPIC, 2, 4, progress=True)
     assert ("100 %" in stream.getvalue()) == terminal
 
 
