@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lagrange import Lagrange, Motion
-from mechanism.closed_chains import ISOTROPIC, random_rotation, random_sample
+from mechanism.closed_chains import ISOTROPIC, random_sample
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, rates, virtual_work
@@ -129,14 +129,10 @@ def newton_euler(sample):
     return solved[:21].reshape(BODIES, 3), moments, frames
 
 
-def sample_of(seed):
-    return random_sample(np.random.default_rng(seed))
-
-
 @settings(max_examples=120)
 @given(st.integers(0, 2**32 - 1))
 def test_accelerations_and_constraint_moments_are_those_of_the_model(seed):
-    sample = sample_of(seed)
+    sample = random_sample(np.random.default_rng(seed))
     moving, expected, frames = newton_euler(sample)
     given_motion = sample.mechanism, sample.posture, sample.gamma_dot
     answer = virtual_work.direct_dynamics(*given_motion, sample.torque, sample.moment)
@@ -159,31 +155,6 @@ def test_accelerations_and_constraint_moments_are_those_of_the_model(seed):
     for name in ("actuated", "revolute", "prismatic", "torque"):
         one, two = getattr(found, name), getattr(other, name)
         assert np.linalg.norm(one - two) <= RELATIVE * max(np.linalg.norm(one), 1.0)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_the_star_is_in_balance(seed):
-    sample = sample_of(seed)
-    at, arguments = sample.posture, (sample.gamma_dot, sample.torque, sample.moment)
-    acceleration = virtual_work.direct_dynamics(sample.mechanism, at, *arguments)
-    bias = virtual_work.bias(at, sample.gamma_dot)
-    tensor = sample.rotation @ sample.scene.star.inertia.matrix @ sample.rotation.T
-    total = rates.of_torque(sample.mechanism, at, *arguments).prismatic.sum(axis=0) + sample.moment
-    change = tensor @ (at.j @ acceleration + bias.omega_dot)
-    spin = np.cross(bias.omega, tensor @ bias.omega)
-    np.testing.assert_allclose(total, change + spin, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_a_static_moment_goes_through_the_legs_to_the_base(seed):
-    """At rest with tau = -J^T n_ext all moments on the base add up to n_ext; without load, none."""
-    sample, moment = sample_of(seed), random_rotation(np.random.default_rng(seed))[0]
-    at_rest = sample.mechanism, sample.posture, np.zeros(3), np.zeros(3)
-    found = rates.of_motion(*at_rest, moment)
-    base = found.actuated + found.torque[:, None] * sample.geometry.w
-    np.testing.assert_allclose(base.sum(axis=0), -moment, atol=1e-12)
-    idle = rates.of_torque(*at_rest)
-    assert not np.any(idle.actuated) and not np.any(idle.prismatic)
 
 
 @pytest.mark.parametrize(
