@@ -5,7 +5,7 @@ import pytest
 
 from sst_ros.__main__ import main
 from sst_ros.errors import InputError
-from sst_ros.host.output import require_free, results_folder, write_into
+from sst_ros.host.output import require_free, results_folder
 
 
 @pytest.mark.parametrize(
@@ -36,15 +36,6 @@ def test_what_is_there_is_overwritten_only_with_force(tmp_path):
         with pytest.raises(InputError, match="--force"):
             require_free(taken, "export")
         assert require_free(taken, "export", force=True) == taken
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-    (tmp_path / "file").touch()
-    with (
-        pytest.raises(InputError, match=r"file/out.*can be written"),
-        write_into(tmp_path / "file" / "out", "plot"),
-    ):
-        pass
 
 
 @pytest.mark.parametrize(
