@@ -104,7 +104,7 @@ def compare(out: Path, identified: str) -> str:
     }
     lines, rms = [f"{'tracking error of gamma [rad]':32}{'RMS':>12}{'largest':>12}"], []
     for label, followed in runs.items():
-        found = tracking.metrics(followed)
+        found = followed.metrics
         rms.append(float(np.sqrt(np.mean(found.rms**2))))
         lines.append(f"{label:32}{rms[-1]:12.3e}{found.largest.max():12.3e}")
     lines.append(f"{'ratio':32}{rms[0] / rms[1]:12.1f}")

@@ -12,7 +12,7 @@ topic must be recorded; without it there is nothing to compare with.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,7 @@ CHUNK = 25_000
 """So many ticks at a time, which bounds the memory."""
 
 
-@dataclass(frozen=True)
-class Deviation:
+class Deviation(NamedTuple):
     """Distance between two motions at each sample, shape (n,); nan where there is none.
 
     Attributes:
@@ -51,14 +50,8 @@ class Deviation:
     gamma_dot: Array
     orientation: Array
 
-    @classmethod
-    def none(cls, count: int) -> Deviation:
-        """No error at `count` samples."""
-        return cls(*np.full((3, count), np.nan))
 
-
-@dataclass(frozen=True)
-class Comparison:
+class Comparison(NamedTuple):
     """A recording against a reference.
 
     Attributes:
@@ -73,9 +66,15 @@ class Comparison:
 
     error: Deviation
     own: Deviation
-    restarts_ns: tuple[int, ...]
-    steps: int
+    restarts_ns: tuple[int, ...] = ()
+    steps: int = 0
     reasons: tuple[str, ...] = ()
+
+    @classmethod
+    def none(cls, recording: Recording) -> Comparison:
+        """Return the comparison of a run in which nothing is compared yet."""
+        unknown = np.full((2, 3, len(recording.time_ns)), np.nan)
+        return cls(Deviation(*unknown[0]), Deviation(*unknown[1]))
 
     @property
     def compared(self) -> int:
@@ -95,13 +94,12 @@ def integration(recording: Recording) -> Comparison:
     """
     moment = recording.scene.moment
     if moment is not None and moment.topic and recording.ticks.moment is None:
-        count = len(recording.time_ns)
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
-        return Comparison(Deviation.none(count), Deviation.none(count), (), 0, (reason,))
+        return Comparison.none(recording)._replace(reasons=(reason,))
     start = states.initial(recording.scene) if states.begins(recording) else None
     ticks = ticks_of(recording)
     motion = TickPropagator(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
-    return _Reference(recording, motion, ticks).compare(start, restart=True)
+    return _compare(recording, motion, ticks, start, restart=True)
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -120,10 +118,8 @@ def ideal(recording: Recording) -> Comparison | None:
     time = recording.time_ns
     between = TickSequence(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
     many = len(recording.ticks.start_ns) > COMPILED_FROM
-    reference = _Reference(
-        recording, TickPropagator(recording.scene, torque, compiled=many), between
-    )
-    return reference.compare(states.initial(recording.scene), restart=False)
+    motion = TickPropagator(recording.scene, torque, compiled=many)
+    return _compare(recording, motion, between, states.initial(recording.scene), restart=False)
 
 
 def ticks_of(recording: Recording) -> TickSequence:
@@ -134,113 +130,90 @@ def ticks_of(recording: Recording) -> TickSequence:
     return TickSequence(ticks.start_ns, ticks.end_ns, torque)
 
 
-class _Reference:
-    """A run propagated with a coarse solution, compared at its samples.
+def _compare(
+    recording: Recording,
+    motion: TickPropagator,
+    ticks: TickSequence,
+    start: tuple[float, ...] | None,
+    *,
+    restart: bool,
+) -> Comparison:
+    """Propagate a run with a coarse solution, and compare both at its samples.
 
     Args:
         recording: what is compared.
         motion: propagates it.
         ticks: what acts, tick by tick.
+        start: state at time zero; None where it is not known.
+        restart: begin again at a recorded sample after lost torques; else the end is there.
 
     """
-
-    def __init__(self, recording: Recording, motion: TickPropagator, ticks: TickSequence) -> None:
-        self._recording, self._motion, self._ticks = recording, motion, ticks
-        self._tick_ns = recording.ticks.period_ns
-        self._error, self._own = (Deviation.none(len(recording.time_ns)) for _ in range(2))
-
-    def compare(self, start: tuple[float, ...] | None, *, restart: bool) -> Comparison:
-        """Integrate and compare.
-
-        Args:
-            start: state at time zero; None where it is not known.
-            restart: begin again at a recorded sample after lost torques; else the end is there.
-
-        """
-        ticks, time = self._ticks, self._recording.time_ns
-        count = self._count()
-        gaps = 1 + np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1])
-        bounds = [0, *gaps[gaps < count].tolist(), count]
-        restarts: list[int] = []
-        if start is not None:
-            self._note(np.array([0]), np.array([[start, start]]))
-            if ticks.start_ns[0] != 0:
-                start = None
-        for first, stop in itertools.pairwise(bounds):
-            while first < stop:
-                if start is None:
-                    found = self._restart(first, stop) if restart else None
-                    if found is None:
-                        break
-                    first, start = found
-                    restarts.append(int(ticks.start_ns[first]))
-                first = self._integrate(start, first, stop)
-                start = None
-        for values in (self._error.gamma, self._error.gamma_dot, self._error.orientation):
-            values[np.isin(time, restarts)] = np.nan
-        reasons = []
-        if count < len(ticks.start_ns):
-            until = ticks.end_ns[count - 1] / NANOSECONDS
-            reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
-        steps = 2 * -(-self._tick_ns // LONGEST_TICK_NS)
-        return Comparison(self._error, self._own, tuple(restarts), steps, tuple(reasons))
-
-    def _count(self) -> int:
-        """Return the number of ticks that are integrated."""
-        ticks = self._ticks
-        total = len(ticks.start_ns)
-        if self._motion.compiled:
-            return total
-        return min(
-            total, int(PLAIN_TICKS * self._tick_ns // np.median(ticks.end_ns - ticks.start_ns))
-        )
-
-    def _restart(self, first: int, stop: int) -> tuple[int, tuple[float, ...]] | None:
-        """Find the next tick that begins at a sample, and the state of that sample."""
-        recording = self._recording
-        at = places(recording.time_ns, self._ticks.start_ns[first:stop])
-        usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
-        if not len(usable):
-            return None
-        tick = int(usable[0])
-        geometry = Geometry.of(recording.scene)
-        state = states.of_samples(geometry, recording, [int(at[tick])])[0]
-        return first + tick, tuple(state.tolist())
-
-    def _integrate(self, start: tuple[float, ...], first: int, stop: int) -> int:
-        """Integrate ticks without gaps between them; return the first that was not reached."""
-        state = np.array(start)
-        for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):
-            ticks = self._ticks.part(slice(first + part.start, first + part.stop))
-            starts = np.full((len(ticks.start_ns), len(start)), np.nan)
-            starts[0] = state
-            reached = self._motion.follow(ticks, starts)[..., :-1]
-            done = int(np.isfinite(reached[:, 0, 0]).sum())
-            rows = places(self._recording.time_ns, ticks.end_ns[:done])
-            self._note(rows[rows >= 0], reached[:done][rows >= 0])
-            if done < len(starts):
-                return int(first + part.start + done + 1)
-            state = reached[-1, 0]
-        return stop
-
-    def _note(self, rows: Integers, reached: Array) -> None:
-        """Write down how far samples are from the solution, and the coarse solution, (n, 2, m)."""
-        recording, model = self._recording, self._motion.dynamics.model
-        fine, coarse = (states.outputs(model, reached[:, i]) for i in range(2))
-        sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
-        for deviation, one in ((self._error, sampled), (self._own, coarse)):
-            found = _deviation(one, fine)
-            deviation.gamma[rows], deviation.gamma_dot[rows] = found.gamma, found.gamma_dot
-            deviation.orientation[rows] = found.orientation
+    found, reasons, count = Comparison.none(recording), [], len(ticks.start_ns)
+    tick_ns = recording.ticks.period_ns
+    if not motion.compiled:
+        longest = PLAIN_TICKS * tick_ns // np.median(ticks.end_ns - ticks.start_ns)
+        count = min(count, int(longest))
+    if count < len(ticks.start_ns):
+        until = ticks.end_ns[count - 1] / NANOSECONDS
+        reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
+    if start is not None:
+        _note(found, recording, motion, np.array([0]), np.array([[start, start]]))
+        if ticks.start_ns[0] != 0:
+            start = None
+    gaps = 1 + np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1])
+    restarts: list[int] = []
+    for first, stop in itertools.pairwise([0, *gaps[gaps < count].tolist(), count]):
+        while first < stop:
+            if start is None:
+                again = _find_restart(recording, ticks, first, stop) if restart else None
+                if again is None:
+                    break
+                first, start = again
+                restarts.append(int(ticks.start_ns[first]))
+            for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):
+                some = ticks.part(slice(first + part.start, first + part.stop))
+                starts = np.full((len(some.start_ns), len(start)), np.nan)
+                starts[0] = start
+                reached = motion.follow(some, starts)[..., :-1]
+                done = int(np.isfinite(reached[:, 0, 0]).sum())
+                rows = places(recording.time_ns, some.end_ns[:done])
+                _note(found, recording, motion, rows[rows >= 0], reached[:done][rows >= 0])
+                if done < len(starts):  # no step resolves the next one
+                    first += part.start + done + 1
+                    break
+                start = tuple(reached[-1, 0].tolist())
+            else:
+                first = stop
+            start = None
+    for values in found.error:
+        values[np.isin(recording.time_ns, restarts)] = np.nan
+    steps = 2 * -(-tick_ns // LONGEST_TICK_NS)
+    return Comparison(found.error, found.own, tuple(restarts), steps, tuple(reasons))
 
 
-def _deviation(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array]) -> Deviation:
-    # Recorded angles may count whole turns, computed ones do not.
-    turn = 2.0 * np.pi
-    difference = first[1] - second[1]
-    gamma = np.abs(difference - turn * np.round(difference / turn))
-    return Deviation(
-        gamma.max(axis=1),
-        np.abs(first[2] - second[2]).max(axis=1),
-        angle_between(first[0], second[0]),
-    )
+def _find_restart(
+    recording: Recording, ticks: TickSequence, first: int, stop: int
+) -> tuple[int, tuple[float, ...]] | None:
+    """Find the next tick that begins at a sample, and the state of that sample."""
+    at = places(recording.time_ns, ticks.start_ns[first:stop])
+    usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
+    if not len(usable):
+        return None
+    tick = int(usable[0])
+    state = states.of_samples(Geometry.of(recording.scene), recording, [int(at[tick])])[0]
+    return first + tick, tuple(state.tolist())
+
+
+def _note(
+    found: Comparison, recording: Recording, motion: TickPropagator, rows: Integers, reached: Array
+) -> None:
+    """Write down how far samples are from the solution, and the coarse solution, (n, 2, m)."""
+    fine, coarse = (states.outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
+    sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
+    for deviation, one in ((found.error, sampled), (found.own, coarse)):
+        # Recorded angles may count whole turns, computed ones do not.
+        turn, difference = 2.0 * np.pi, one[1] - fine[1]
+        gamma = np.abs(difference - turn * np.round(difference / turn))
+        deviation.gamma[rows] = gamma.max(axis=1)
+        deviation.gamma_dot[rows] = np.abs(one[2] - fine[2]).max(axis=1)
+        deviation.orientation[rows] = angle_between(one[0], fine[0])

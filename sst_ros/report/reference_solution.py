@@ -5,7 +5,8 @@ Torques are continuous functions of time, not held over control periods: zero wh
 none. The span ends at the first limit that stops the run. Elastic stops and torque limits have
 kinks; there `Simulation`, which locates them, is the reference. Elsewhere the step size is halved
 in double precision until the solution stops improving; then DOP853 solves with that step in
-extended precision. The reference's own error is twice the difference of two step sizes.
+extended precision, by the code that is generated for it: what the methods solve, to the last bit.
+The reference's own error is twice the difference of two step sizes.
 """
 
 from __future__ import annotations
@@ -13,23 +14,24 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, Problem, RunStopped
 from sst_ros.extras import require
+from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
+from sst_ros.report.step_advice import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import TorqueFunction, Vector3
@@ -49,8 +51,14 @@ _MOST_STEPS = 200_000
 INTERVALS = 20
 """Solutions are compared at this many instants or more."""
 
-WHOLE_RUN_S = 1.0
-"""Time span of a scene that names no duration [s]."""
+EXACT = replace(
+    DOP853,
+    b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))),
+    error=(),
+    damping=(),
+)
+"""DOP853 without error estimates. As doubles its weights do not quite add up to 1, which no step
+size would show; here they do, exactly."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,6 @@ class InitialValueProblem:
 
     Args:
         scene: the scene.
-        like: a problem whose instants of comparison are taken.
 
     Attributes:
         system: right-hand side, torques and work included.
@@ -85,7 +92,7 @@ class InitialValueProblem:
 
     """
 
-    def __init__(self, scene: Scene, like: InitialValueProblem | None = None) -> None:
+    def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -97,11 +104,7 @@ class InitialValueProblem:
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
-        self.interval_ns: int
-        self.count: int
-        self.ends: str
-        horizon = self._horizon() if like is None else (like.interval_ns, like.count, like.ends)
-        self.interval_ns, self.count, self.ends = horizon
+        self.interval_ns, self.count, self.ends = self._horizon()
 
     @property
     def interval(self) -> float:
@@ -224,16 +227,13 @@ def solve_reference(
         return ReferenceSolution(fine, _own(problem, rough, fine), how)
     machine = CompiledMethod(problem.system, DOP853, compiled=compiled)
     best, solution = _finest(problem, machine)
-    solver = HighPrecisionDop853(problem.system.program, kind, problem.drive)
+    solver = ExtendedSolver(problem, kind)
     began = time.perf_counter()
-    for _ in range(3):
-        solver.evaluate(problem.start)
-    seconds = (time.perf_counter() - began) / 3 * 1.5 * 12 * problem.count
+    solver.run_steps(3, intervals=1)
+    seconds = (time.perf_counter() - began) / 3 * problem.count
     steps = (3 * best // 2, 2 * best)
     if kind != EXTENDED or seconds * sum(steps) < LONGEST_S:
-        rough, fine = (
-            solver.solve(problem.start, problem.interval, problem.count, n) for n in steps
-        )
+        rough, fine = map(solver.run_steps, steps)
         how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers}"
     else:
         fine = solution.astype(np.longdouble)
@@ -273,15 +273,12 @@ def _own(problem: InitialValueProblem, rough: LongArray, fine: LongArray) -> Sta
     )
 
 
-class HighPrecisionDop853:
-    """DOP853 with fixed steps on a number type: the integration package runs on doubles only.
-
-    It evaluates the same traced program, so that it solves what the methods solve to the last bit.
+class ExtendedSolver:
+    """DOP853 with fixed steps on long doubles or mpmath's numbers.
 
     Args:
-        program: derivative with the inputs t, state, drive.
+        problem: what is solved.
         kind: EXTENDED or MPMATH.
-        drive: constant inputs.
 
     Attributes:
         numbers: which numbers it calculates with, for reports.
@@ -291,61 +288,40 @@ class HighPrecisionDop853:
 
     """
 
-    def __init__(self, program: Program, kind: str, drive: Sequence[float]) -> None:
+    def __init__(self, problem: InitialValueProblem, kind: str) -> None:
         names = ("sqrt", "sin", "cos", "tanh", "exp")
         if kind == EXTENDED:
             self.numbers = f"{np.finfo(np.longdouble).precision}-digit floats"
-            namespace = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
+            functions = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
             self._number: Any = np.longdouble
-            self._long: Callable[[Any], np.longdouble] = np.longdouble
         else:
-            mpmath = require("mpmath")
-            context = mpmath.mp.clone()
+            context = require("mpmath").mp.clone()
             context.dps = DIGITS
             self.numbers = f"mpmath, {DIGITS} digits"
-            namespace = {each: getattr(context, each) for each in (*names, "atan2")}
+            functions = {each: getattr(context, each) for each in (*names, "atan2")}
             self._number = context.mpf
-            self._long = lambda x: np.longdouble(mpmath.nstr(x, DIGITS))
-        exec(program.source("rhs"), namespace)
-        self._rhs: Callable[..., tuple[Any, ...]] = namespace["rhs"]
-        self._sqrt: Callable[[Any], Any] = namespace["sqrt"]
-        number = self._number
-        self._drive = tuple(map(number, drive))
-        self._a = [[(i, number(w)) for i, w in enumerate(row) if w] for row in DOP853.a]
-        weights = [number(w) for w in DOP853.b]
-        # As doubles they do not quite add up to 1, which no step size would show.
-        weights[-1] = number(1) - sum(weights[:-1], number(0))
-        self._b = [(i, w) for i, w in enumerate(weights) if DOP853.b[i]]
-        self._c = [number(c) for c in DOP853.c]
+        self._problem = problem
+        step = codegen.explicit_step(EXACT, len(problem.start), len(problem.drive))
+        self._code: Any = codegen.load(
+            [problem.system.program.source("rhs"), step], {}, numba=False
+        )
+        vars(self._code).update(functions)
 
-    def solve(self, start: Sequence[float], interval: float, count: int, steps: int) -> LongArray:
-        """Return states at k * interval [s], k = 0 .. count, shape (count + 1, len(start)).
+    def run_steps(self, steps: int, intervals: int | None = None) -> LongArray:
+        """States at the instants, of the first `intervals` or all, with `steps` steps an interval.
 
-        The first four numbers are a quaternion, which is kept at length 1. A row of nan stands
-        where there is no finite state.
+        The quaternion is kept at length 1. A row of nan stands where there is no finite state.
         """
-        number = self._number
-        result = np.full((count + 1, len(start)), np.nan, dtype=np.longdouble)
-        y = [number(x) for x in start]
-        h = number(interval) / steps
-        result[0] = [self._long(x) for x in y]
+        problem, number = self._problem, self._number
+        count, size = intervals or problem.count, len(problem.start)
+        result = np.full((count + 1, size), np.nan, dtype=np.longdouble)
+        result[0] = problem.start
+        y, h = [number(x) for x in problem.start], number(problem.interval) / steps
         with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
-            for k in range(count):
-                for step in range(steps):
-                    y = self._step((k * steps + step) * h, y, h)
-                result[k + 1] = [self._long(x) for x in y]
+            for k in range(count * steps):
+                y = self._code.step(k * h, h, *y, *problem.drive)[:size]
+                length = self._code.sqrt(sum(x * x for x in y[:4]))
+                y = [*(x / length for x in y[:4]), *y[4:]]
+                if (k + 1) % steps == 0:  # as text, in which both kinds have all their digits
+                    result[(k + 1) // steps] = [np.longdouble(str(x)) for x in y]
         return result
-
-    def evaluate(self, start: Sequence[float]) -> tuple[Any, ...]:
-        """Evaluate the derivative once, at time zero, to measure its computing time."""
-        number = self._number
-        return self._rhs(number(0), *map(number, start), *self._drive)
-
-    def _step(self, t: Any, y: list[Any], h: Any) -> list[Any]:
-        slopes: list[tuple[Any, ...]] = []
-        for row, node in zip(self._a, self._c, strict=True):
-            at = [x + h * sum(w * slopes[i][j] for i, w in row) for j, x in enumerate(y)]
-            slopes.append(self._rhs(t + node * h, *at, *self._drive))
-        new = [x + h * sum(w * slopes[i][j] for i, w in self._b) for j, x in enumerate(y)]
-        length = self._sqrt(sum(x * x for x in new[:4]))
-        return [x / length for x in new[:4]] + new[4:]

@@ -166,7 +166,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Collect all figures of the report but those of `timing`."""
     tracked = tracking.of(run)
-    found = None if tracked is None else tracking.metrics(tracked)
+    found = None if tracked is None else tracked.metrics
     summary = {
         "scene": run.scene.name,
         "bag": str(run.path),

@@ -19,7 +19,6 @@ The balance of energy is what the samples have, less the work put in between.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,8 +51,7 @@ STATISTICS: dict[str, Callable[[Array], Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class Timing:
+class Timing(NamedTuple):
     """Timing of a recording by its clocks, and its energy balance.
 
     Attributes:
@@ -68,7 +66,7 @@ class Timing:
             of REPORTED, nan where one was not reported, shape (r, 1 + len(REPORTED)).
         latency: of commands.
         energy: energy balance residual of each sample since the start [J], shape
-            (n,); nan where it is not known. None where it cannot be known.
+            (n,); nan where it is not known.
         missing: what is not known, and why.
 
     """
@@ -82,7 +80,7 @@ class Timing:
     late_us: Array
     reported: Array
     latency: Latency
-    energy: Array | None
+    energy: Array
     missing: tuple[str, ...]
 
 
@@ -121,25 +119,22 @@ def measure(recording: Recording) -> Timing:
 
 def numbers(timing: Timing) -> dict[str, Any]:
     """Sum it up: flat, units in the names, None for what is not known."""
-    result: dict[str, Any] = {}
-    stamped = timing.latency.stamped_us
-    for name, values in (
-        ("period", timing.period_us),
-        ("command_latency", timing.latency.received_us),
-        ("command_stamp_to_tick", stamped[np.isfinite(stamped)]),
-    ):
-        known = len(values) > 0
-        for word, function in STATISTICS.items():
-            result[f"{name}_{word}_us"] = float(function(values)) if known else None
-    energy = None if timing.energy is None else np.abs(timing.energy)
-    known = energy is not None and bool(np.isfinite(energy).any())
-    return result | {
-        "commands_followed": len(timing.latency.time_s),
-        "samples_answered_percent": (
-            None if timing.latency.answered is None else 100.0 * timing.latency.answered
-        ),
-        "command_age_mean_s": timing.latency.age_s,
-        "energy_residual_max_J": float(np.nanmax(energy)) if known and energy is not None else None,
+    latency, energy = timing.latency, np.abs(timing.energy)
+    delays = {
+        "period": timing.period_us,
+        "command_latency": latency.received_us,
+        "command_stamp_to_tick": latency.stamped_us[np.isfinite(latency.stamped_us)],
+    }
+    return {
+        **{
+            f"{name}_{word}_us": float(function(values)) if len(values) else None
+            for name, values in delays.items()
+            for word, function in STATISTICS.items()
+        },
+        "commands_followed": len(latency.time_s),
+        "samples_answered_percent": latency.answered and 100.0 * latency.answered,
+        "command_age_mean_s": latency.age_s,
+        "energy_residual_max_J": float(np.nanmax(energy)) if np.isfinite(energy).any() else None,
         "unknown": list(timing.missing),
     }
 
@@ -189,10 +184,10 @@ class Latency(NamedTuple):
 
 def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     """Pair commands with ticks, by their values; `missing` gets a line where there are none."""
-    commands, ticks = recording.commands, recording.ticks
+    commands, ticks, none = recording.commands, recording.ticks, Latency(*np.empty((3, 0)))
     if not len(commands.torque):
         missing.append("no commands are recorded: their latency is not known")
-        return Latency(*np.empty((3, 0)))
+        return none
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
     asked, applied = (np.clip(each.torque, -most, most) for each in (commands, ticks))
@@ -203,7 +198,7 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     command, tick = _pairs(asked[new], earliest_ns, applied[changed], step_ns)
     if not len(command):
         missing.append("no recorded command is found among the applied torques")
-        return Latency(*np.empty((3, 0)))
+        return none
     stamps = commands.stamp_ns[new][command]
     begins = ticks.start_ns[changed][tick]
     answered = np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan)
@@ -261,7 +256,7 @@ def _pairs(
     return found["row_x"].to_numpy(), found["row_y"].to_numpy(dtype=int)
 
 
-def energy_residual(recording: Recording, missing: list[str]) -> Array | None:
+def energy_residual(recording: Recording, missing: list[str]) -> Array:
     """Return the energy balance residual since the start [J], shape (n,).
 
     Args:
@@ -269,22 +264,20 @@ def energy_residual(recording: Recording, missing: list[str]) -> Array | None:
         missing: gets a line for all that is not known.
 
     Returns:
-        nan where it is not known, None where it cannot be known. Where ticks are lost, the balance
-        goes on without them.
+        nan where it is not known. Where ticks are lost, the balance goes on without them.
 
     """
-    moment = recording.scene.moment
+    count, moment = len(recording.time_ns), recording.scene.moment
+    stored, work = np.full((2, count), np.nan)
     if moment and moment.topic and recording.ticks.moment is None:
         missing.append("the moment on the star is not recorded: no energy residual")
-        return None
+        return stored
     ticks = ticks_of(recording)
     many = len(ticks.start_ns) > COMPILED_FROM
-    count = len(recording.time_ns)
     if many and codegen.numba_version() is None:
         count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
         until = recording.seconds[count - 1]
         missing.append(f"energy after {until:g} s: there is no numba to balance it")
-    stored, work = np.full((2, len(recording.time_ns)), np.nan)
     geometry, model = Geometry.of(recording.scene), kernel.model_of(recording.scene)
     motion = TickPropagator(recording.scene, None, compiled=many)
     for part in slices(count, CHUNK, "energy", shown=False):
@@ -307,17 +300,17 @@ def _work(motion: TickPropagator, every: TickSequence, state: Array, time: Integ
     """
     places = np.searchsorted(every.start_ns, time)
     ticks = every.part(slice(places[0], places[-1]))
-    if not len(ticks.start_ns):
-        return np.full(len(state) - 1, np.nan)
-    places -= places[0]
-    # The ticks of a sample are all there if they follow each other from its time to the next.
-    breaks = np.concatenate([[0], np.cumsum(ticks.start_ns[1:] != ticks.end_ns[:-1])])
-    first, last = np.minimum(places[:-1], len(breaks) - 1), np.maximum(places[1:] - 1, 0)
-    whole = (first <= last) & (breaks[first] == breaks[last])
-    whole &= (ticks.start_ns[first] == time[:-1]) & (ticks.end_ns[last] == time[1:])
-    whole &= np.isfinite(state[:-1]).all(axis=1)
+    whole = np.zeros(len(state) - 1, dtype=bool)
+    if len(ticks.start_ns):
+        places -= places[0]
+        # The ticks of a sample are all there if they follow each other from its time to the next.
+        breaks = np.concatenate([[0], np.cumsum(ticks.start_ns[1:] != ticks.end_ns[:-1])])
+        first, last = np.minimum(places[:-1], len(breaks) - 1), np.maximum(places[1:] - 1, 0)
+        whole = (first <= last) & (breaks[first] == breaks[last])
+        whole &= (ticks.start_ns[first] == time[:-1]) & (ticks.end_ns[last] == time[1:])
+        whole &= np.isfinite(state[:-1]).all(axis=1)
     if not whole.any():
-        return np.full(len(state) - 1, np.nan)
+        return np.full(len(whole), np.nan)
     starts = np.full((len(ticks.start_ns), state.shape[1]), np.nan)
     starts[first[whole]] = state[:-1][whole]
     begin = int(first[whole][0])

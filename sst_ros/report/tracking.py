@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, Integers, places
+from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
 from sst_ros.state import NANOSECONDS
 
 PICTURES, TABLE = ("tracking", "tracking_error", "control_torques"), "tracking.txt"
@@ -39,18 +40,43 @@ class TrackedRun:
         recording: the run.
         track: reference, tracking error and torques.
         rows: which samples of the recording these are, shape (n,).
-        orientation_error: angle between the orientation and that of the reference [rad], shape
-            (n,); nan where it is not known.
-        limited: samples in which a torque was limited, by the last diagnostics of the controller;
-            None where that was not recorded.
 
     """
 
     recording: Recording
     track: TrackingRecord
     rows: np.ndarray[Any, np.dtype[np.intp]]
-    orientation_error: Array
-    limited: int | None
+
+    @property
+    def metrics(self) -> TrackingMetrics:
+        """Metrics; how often a torque was limited is in the last diagnostics of the controller."""
+        counts = (
+            status.values.get("samples_limited", "")
+            for status in reversed(self.recording.signals.statuses)
+            if status.name.endswith(": control")
+        )
+        limited = next((int(count) for count in counts if count.isdecimal()), None)
+        return evaluate_tracking(self.track, limited)
+
+    @cached_property
+    def orientation_error(self) -> Array:
+        """Angle between the orientation and that of the reference [rad], shape (n,).
+
+        The assembly of the run is followed along the reference; nan where it is not known.
+        """
+        run, gamma = self.recording, self.track.gamma
+        geometry, measured = Geometry.of(run.scene), run.quaternion[self.rows]
+        unknown = np.full(len(gamma), np.nan)
+        if not np.isfinite(measured[0]).all():
+            return unknown
+        try:
+            start = continuation.advance(
+                geometry, rotation_matrix(measured[0]), run.gamma[self.rows[0]], gamma[0]
+            )
+            branch = continuation.follow(geometry, gamma, start)
+        except SingularConfiguration:
+            return unknown
+        return angle_between(quaternion_of(branch.rotation), measured)
 
 
 def read_tracking(path: Path) -> TrackedRun:
@@ -61,13 +87,11 @@ def read_tracking(path: Path) -> TrackedRun:
 
     """
     run = recording.read(path)
-    absent = [run.signals.absent[key] for key in KEYS if key in run.signals.absent]
-    if absent:
+    if absent := [run.signals.absent[key] for key in KEYS if key in run.signals.absent]:
         raise InputError(str(path), absent)
     found = of(run)
     if found is None:
-        allowed = "two samples or more must have a reference"
-        raise refusal(path, KEYS[0], 0, allowed)
+        raise refusal(path, KEYS[0], 0, "two samples or more must have a reference")
     return found
 
 
@@ -81,25 +105,15 @@ def of(run: Recording) -> TrackedRun | None:
     if len(rows) < 2:
         return None
     reference, error = (one.values[place[rows]] for one, place in zip(series, at, strict=True))
-    times = run.time_ns[rows]
-    gamma, gamma_dot, feedforward = np.split(reference, 3, axis=1)
-    off, off_rate, feedback = np.split(error, 3, axis=1)
-    track = TrackingRecord(
-        time=times / NANOSECONDS,
-        gamma=gamma,
-        gamma_dot=gamma_dot,
-        error=off,
-        error_rate=off_rate,
-        feedforward=feedforward,
-        feedback=feedback,
-        torque=_torque_of_ticks(run, times, feedforward + feedback),
-    )
-    return TrackedRun(run, track, rows, _orientation_error(run, rows, gamma), _count_limited(run))
-
-
-def metrics(tracked: TrackedRun) -> TrackingMetrics:
-    """Return the figures of the tracking."""
-    return evaluate_tracking(tracked.track, tracked.limited)
+    feedforward, feedback, times = reference[:, 6:], error[:, 6:], run.time_ns[rows]
+    # The torque of the tick that begins at a sample; what was lost is what was requested. A sample
+    # after the last tick has none.
+    tick = places(run.ticks.start_ns, times)
+    torque = np.where((tick >= 0)[:, None], run.ticks.torque[tick], feedforward + feedback)
+    torque[times >= run.ticks.end_ns[-1]] = 0.0
+    seconds = times[:, None] / NANOSECONDS
+    columns = seconds, reference[:, :6], error[:, :6], feedforward, feedback, torque
+    return TrackedRun(run, TrackingRecord.of_rows(np.hstack(columns)), rows)
 
 
 def write_tracking_report(bag: Path, out: Path) -> str:
@@ -112,7 +126,7 @@ def write_tracking_report(bag: Path, out: Path) -> str:
     """
     tracked = read_tracking(bag)
     title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
-    lines = [title, "", tracking_table(metrics(tracked))]
+    lines = [title, "", tracking_table(tracked.metrics)]
     if np.isfinite(tracked.orientation_error).any():
         worst = float(np.nanmax(tracked.orientation_error))
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
@@ -121,39 +135,3 @@ def write_tracking_report(bag: Path, out: Path) -> str:
         (out / TABLE).write_text(text, encoding="utf-8")
     pictures.draw_run(tracked.recording.signals, out, PICTURES, ["png"])
     return text
-
-
-def _count_limited(run: Recording) -> int | None:
-    counts = (
-        status.values.get("samples_limited", "")
-        for status in reversed(run.signals.statuses)
-        if status.name.endswith(": control")
-    )
-    return next((int(count) for count in counts if count.isdecimal()), None)
-
-
-def _torque_of_ticks(run: Recording, times: Integers, asked: Array) -> Array:
-    """Torque of the tick that begins at each sample; what was lost is what was asked for.
-
-    A sample after the last tick has no torque.
-    """
-    at = places(run.ticks.start_ns, times)
-    torque = np.where((at >= 0)[:, None], run.ticks.torque[at], asked)
-    torque[times >= run.ticks.end_ns[-1]] = 0.0
-    return torque
-
-
-def _orientation_error(run: Recording, rows: Any, gamma: Array) -> Array:
-    """Follow the assembly of the run along the reference."""
-    geometry, measured = Geometry.of(run.scene), run.quaternion[rows]
-    unknown = np.full(len(rows), np.nan)
-    if not np.isfinite(measured[0]).all():
-        return unknown
-    try:
-        start = continuation.advance(
-            geometry, rotation_matrix(measured[0]), run.gamma[rows[0]], gamma[0]
-        )
-        branch = continuation.follow(geometry, gamma, start)
-    except SingularConfiguration:
-        return unknown
-    return angle_between(quaternion_of(branch.rotation), measured)

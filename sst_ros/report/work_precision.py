@@ -16,13 +16,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.errors import SstError
 from sst_ros.host.output import slices
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper, StepperCheckpoint
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod, Method, Point
 from sst_ros.integration.methods import METHODS, Rosenbrock
@@ -43,12 +43,10 @@ from sst_ros.simulation.simulate_gauss import GAUSS, GaussMotion, NotSmooth
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-
 FIXED, TOLERANCE = "fixed steps", "tolerance"
 
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
-
 
 ABOVE_REFERENCE = 100.0
 """Errors are reported only if they are so many times larger than the reference's own."""
@@ -158,7 +156,6 @@ class WorkPrecision:
 def work_precision(
     scene: Scene,
     *,
-    solved: Scene | None = None,
     kind: str = EXTENDED,
     compiled: bool = True,
     shown: bool = False,
@@ -167,8 +164,7 @@ def work_precision(
     """Solve a scene with every method and setting and compare with the reference.
 
     Args:
-        scene: what the reference solves.
-        solved: what the methods solve, if it is another scene: the study must see the difference.
+        scene: what is solved.
         kind: arithmetic of the reference, reference_solution.EXTENDED or MPMATH.
         compiled: by numba, where it is installed.
         shown: draw a progress bar on the terminal.
@@ -180,24 +176,23 @@ def work_precision(
 
     """
     compiled = compiled and numba_version() is not None
-    target = InitialValueProblem(scene)
-    problem = target if solved is None else InitialValueProblem(solved, like=target)
+    problem = InitialValueProblem(scene)
     grid = solver_grid(problem, compiled)
-    truth = solve_reference(target, kind, compiled=compiled)
+    truth = solve_reference(problem, kind, compiled=compiled)
     rows: list[dict[str, Any]] = []
     ends: list[Array] = []
     for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
         for row, end in refine(grid[part.start], problem, truth, longest_s):
             rows.append({"scene": scene.name, **row})
             ends.append(end)
-    zero = np.zeros((len(target.times), 3))
-    torques = zero if scene.torque is None else scene.torque.values(target.times)
+    zero = np.zeros((len(problem.times), 3))
+    torques = zero if scene.torque is None else scene.torque.values(problem.times)
     along = zip(truth.states.astype(float), torques.tolist(), strict=True)
     difference, _ = states.compare_with_paper(scene, along)
     return WorkPrecision(
         scene=scene.name,
-        seconds=target.seconds,
-        ends=target.ends,
+        seconds=problem.seconds,
+        ends=problem.ends,
         compiled=compiled,
         reference=truth,
         rows=data_frame(rows, COLUMNS),
@@ -237,11 +232,9 @@ def _warnings(
         error = row.get("final_orientation_rad", math.inf)
         if error < best.get(row["method"], (math.inf,))[0]:
             best[row["method"]] = error, end
-    for (one, (error, end)), (two, (other_error, other_end)) in itertools.combinations(
-        best.items(), 2
-    ):
-        pair = np.stack([end, other_end])[:, :7]
-        apart = problem.errors(pair[:1], pair[1:].astype(np.longdouble))[0].orientation
+    for one, two in itertools.combinations(best, 2):
+        (error, end), (other_error, other_end) = best[one], best[two]
+        apart = problem.errors(end[None], other_end[None].astype(np.longdouble))[0].orientation
         least = min(error, other_error)
         if least > 100.0 * max(apart, 10.0 * truth.own.orientation, 1e-13):
             yield (
@@ -251,8 +244,7 @@ def _warnings(
             return
 
 
-@dataclass(frozen=True)
-class SolverSetting:
+class SolverSetting(NamedTuple):
     """One point of the grid.
 
     Attributes:
@@ -277,60 +269,57 @@ def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[S
     found: list[Iterator[SolverSetting]] = []
     for method in METHODS.values():
         if not problem.clamped:  # fixed steps know no limit of torque
-            found.append(_list_steps(problem, method, compiled))
+            machine = CompiledMethod(problem.system, method, compiled=compiled)
+            found.append(map(partial(_fix_steps, problem, machine), _STEPS_PER_INTERVAL))
         if not method.error_order:
             continue
         if not problem.kinked:
-            found.append(_list_tolerances(problem, method, compiled))
+            found.append(map(partial(_adapt_steps, problem, method, compiled), _TOLERANCES))
         elif not isinstance(method, Rosenbrock):  # which takes no torques that are functions
-            found.append(_list_simulations(problem, method))
+            found.append(map(partial(_step_simulation, problem, method), _TOLERANCES))
     if not problem.kinked:
         found += [_list_collocation(problem, compiled, kind) for kind in (FIXED, TOLERANCE)]
     return found
 
 
-def _list_steps(
-    problem: InitialValueProblem, method: Method, compiled: bool
-) -> Iterator[SolverSetting]:
-    machine = CompiledMethod(problem.system, method, compiled=compiled)
-    for steps in _STEPS_PER_INTERVAL:
-        count, h = steps * problem.count, problem.interval / steps
+def _fix_steps(problem: InitialValueProblem, machine: CompiledMethod, steps: int) -> SolverSetting:
+    count, h = steps * problem.count, problem.interval / steps
+    timed = partial(machine.step_fixed, 0.0, h, count, list(problem.start), problem.drive)
 
-        def solve(steps: int = steps, count: int = count) -> tuple[Array, int]:
-            return problem.run_steps(machine, steps), len(method.a) * count
+    def solve() -> tuple[Array, int]:
+        return problem.run_steps(machine, steps), len(machine.method.a) * count
 
-        timed = partial(machine.step_fixed, 0.0, h, count, list(problem.start), problem.drive)
-        yield SolverSetting(method.name, FIXED, h, solve, timed)
+    return SolverSetting(machine.method.name, FIXED, h, solve, timed)
 
 
-def _list_tolerances(
-    problem: InitialValueProblem, method: Method, compiled: bool
-) -> Iterator[SolverSetting]:
-    for tolerance in _TOLERANCES:
-        stepper = AdaptiveStepper(problem.system, method.name, tolerance, compiled=compiled)
-        run = partial(_run_adaptively, problem, stepper, stepper.checkpoint(), method.order)
+def _adapt_steps(
+    problem: InitialValueProblem, method: Method, compiled: bool, tolerance: float
+) -> SolverSetting:
+    stepper = AdaptiveStepper(problem.system, method.name, tolerance, compiled=compiled)
+    fresh, start = stepper.checkpoint(), list(problem.start)
 
-        def solve(
-            stepper: AdaptiveStepper = stepper, run: Callable[[], Array] = run
-        ) -> tuple[Array, int]:
-            before = stepper.budget.spent
-            return run(), stepper.budget.spent - before
+    def run() -> Array:
+        stepper.restore(fresh)
+        rows, at = [start], Point(start, start, (), method.order)
+        for k in range(problem.count):
+            begin, end = k * problem.interval, (k + 1) * problem.interval
+            for step in stepper.accepted_steps(begin, end, at, problem.drive):
+                at = step.end
+            rows.append(at.y)
+        return np.array(rows)
 
-        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
+    def solve() -> tuple[Array, int]:
+        before = stepper.budget.spent
+        return run(), stepper.budget.spent - before
+
+    return SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 
 
-def _run_adaptively(
-    problem: InitialValueProblem, stepper: AdaptiveStepper, fresh: StepperCheckpoint, order: int
-) -> Array:
-    stepper.restore(fresh)
-    rows = [list(problem.start)]
-    at = Point(list(problem.start), list(problem.start), (), order)
-    for k in range(problem.count):
-        begin, end = k * problem.interval, (k + 1) * problem.interval
-        for step in stepper.accepted_steps(begin, end, at, problem.drive):
-            at = step.end
-        rows.append(at.y)
-    return np.array(rows)
+def _step_simulation(
+    problem: InitialValueProblem, method: Method, tolerance: float
+) -> SolverSetting:
+    run = partial(problem.run_simulation, method.name, tolerance)
+    return SolverSetting(method.name, TOLERANCE, tolerance, lambda: (run(), None), run)
 
 
 def _list_collocation(
@@ -361,16 +350,6 @@ def _list_collocation(
             if motion.h < longest:
                 longest = motion.h
                 yield SolverSetting(GAUSS, kind, motion.h, solve, motion.run)
-
-
-def _list_simulations(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
-    for tolerance in _TOLERANCES:
-        run = partial(problem.run_simulation, method.name, tolerance)
-
-        def solve(run: Callable[[], Array] = run) -> tuple[Array, None]:
-            return run(), None
-
-        yield SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
 
 
 def refine(

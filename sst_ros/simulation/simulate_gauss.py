@@ -231,6 +231,8 @@ def _collocation(
             lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
+    if compiled:  # others that run in plain Python, as there was no code, find it from now on
+        _collocation.cache_clear()
     return Collocation(ODE(dynamics, sine), limits=program, compiled=compiled)
 
 

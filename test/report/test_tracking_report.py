@@ -36,7 +36,7 @@ def test_the_track_is_what_was_written(entries, written):
     assert np.array_equal(track.torque[:-1], run.ticks.torque[begins])
     assert not track.torque[-1].any()
     largest = np.abs(HOME + OFF - run.gamma).max(axis=0)
-    assert tracking.metrics(followed).largest == pytest.approx(largest)
+    assert followed.metrics.largest == pytest.approx(largest)
 
 
 def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entries, written):
@@ -50,7 +50,7 @@ def test_the_error_of_the_orientation_is_the_angle_to_that_of_the_reference(entr
 def test_the_last_report_of_the_controller_says_how_often_a_torque_was_limited(entries, written):
     said = bags.diagnostics_entry(entries[-1].received_ns + 1, samples_limited=7)
     said.content.status[0].name = "/sst_inverse_dynamics: control"
-    assert tracking.read_tracking(written([*entries, said])).limited == 7
+    assert tracking.read_tracking(written([*entries, said])).metrics.limited == 7
 
 
 def test_the_report_writes_a_table_and_a_picture(entries, written, tmp_path):

@@ -14,13 +14,15 @@ from matplotlib import image
 from sst_ros.errors import InputError
 from sst_ros.plot.methods import draw_summary
 from sst_ros.plot.style import save_figure
+from sst_ros.report import work_precision as study
 from sst_ros.report.accuracy import documents, fastest, figure, join_grids, page, text
 from sst_ros.report.accuracy import summary as summary_of
 from sst_ros.report.reference_solution import (
     EXTENDED,
     MPMATH,
-    HighPrecisionDop853,
+    ExtendedSolver,
     InitialValueProblem,
+    solve_reference,
 )
 from sst_ros.report.results import data_frame, write
 from sst_ros.report.scene_summary import cost_table, operations
@@ -63,12 +65,7 @@ def test_the_reference_is_what_mpmath_finds():
     """At the same steps, so that only the arithmetic differs."""
     pytest.importorskip("mpmath")
     problem = InitialValueProblem(SHORT)
-    ours, theirs = (
-        HighPrecisionDop853(problem.system.program, kind, problem.drive).solve(
-            problem.start, problem.interval, 2, 2
-        )
-        for kind in (EXTENDED, MPMATH)
-    )
+    ours, theirs = (ExtendedSolver(problem, kind).run_steps(2, 2) for kind in (EXTENDED, MPMATH))
     assert np.abs(ours - theirs).max() < 1e-17
 
 
@@ -165,13 +162,18 @@ def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chos
     assert (None if best is None else best.setting) == (None if chosen is None else 0.5**chosen)
 
 
-def test_another_inertia_in_the_runs_is_seen():
+def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     """A part in 1e7 of the star's inertia: no method gets near the reference, and it is said."""
     inertia = dataclasses.asdict(SHORT.star.inertia)
     inertia["zz"] *= 1.0 + 1e-7
     star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
-    solved = dataclasses.replace(BRIEF, star=star)
-    found = work_precision(BRIEF, solved=solved, compiled=False, longest_s=0.005)
+    target = InitialValueProblem(dataclasses.replace(BRIEF, star=star))
+    monkeypatch.setattr(
+        study,
+        "solve_reference",
+        lambda _, kind, compiled: solve_reference(target, kind, compiled=False),
+    )
+    found = work_precision(BRIEF, compiled=False, longest_s=0.005)
     least = found.rows[ERROR].min()
     assert 1e-10 < least < 1e-6
     assert any("do not solve what the reference solves" in words for words in found.warnings)

@@ -52,7 +52,7 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
     """
     run = tracking.read_tracking(twice[0] / "bag")
-    metrics = tracking.metrics(run)
+    metrics = run.metrics
     travel = np.ptp(run.track.gamma, axis=0).max()
     assert travel > 0.2
     assert metrics.samples == 301 and metrics.largest.max() < 1e-3 * travel
@@ -203,7 +203,7 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
     run = recording.read(bag)
     assert not run.effort[-1].any() and run.effort[:100].any()  # let go
-    metrics = tracking.metrics(tracking.read_tracking(bag))
+    metrics = tracking.read_tracking(bag).metrics
     # The last reference that was heard may have no state beside it: the controller is gone.
     assert metrics.samples > 90 and metrics.largest.max() < 1e-3
 
