@@ -26,8 +26,7 @@ from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.methods import MARKERS
-from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, free_figure, note, styled
+from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, free_figure, note, styled
 from sst_ros.recording import recording
 from sst_ros.report.reference_solution import (
     InitialValueProblem,

@@ -25,11 +25,11 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import METHODS, RODAS4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.plot.methods import MARKERS
 from sst_ros.plot.style import (
     BLUE,
     GREEN,
     INK,
+    MARKERS,
     ORANGE,
     PURPLE,
     VERMILION,

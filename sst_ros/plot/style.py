@@ -28,6 +28,15 @@ BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
 """Colours that the colour-blind can distinguish (Okabe and Ito); line styles differ too."""
 
+MARKERS = {
+    "rk4": (BLUE, "o"),
+    "dopri5": (VERMILION, "s"),
+    "dop853": (GREEN, "^"),
+    "rodas4": (PURPLE, "D"),
+    "gauss": (ORANGE, "v"),
+}
+"""Colour and marker of each method of integration."""
+
 Looks: TypeAlias = "dict[str, Any]"
 """Arguments of matplotlib that say how something looks."""
 

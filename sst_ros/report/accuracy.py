@@ -3,18 +3,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.plot.methods import draw_summary, draw_work_precision
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from sst_ros.plot.style import INK, MARKERS, Looks, free_figure, legend, note, styled
 from sst_ros.report.reference_solution import EXTENDED
 from sst_ros.report.results import data_frame, markdown, provenance, records, render, write
 from sst_ros.report.scene_summary import cost_table
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
     ERROR,
+    FIXED,
     TOLERANCE,
     WorkPrecision,
     work_precision,
@@ -22,7 +30,6 @@ from sst_ros.report.work_precision import (
 from sst_ros.scene import scene
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame, Series
 
 TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
@@ -173,23 +180,6 @@ def facts(study: WorkPrecision) -> Iterator[str]:
     yield f"Advice: {study.advice.text}.{measured}"
 
 
-def figure(study: WorkPrecision) -> Figure:
-    """Draw the study."""
-    found = {target: study.best(target) for target in TARGETS if target >= study.floor}
-    return draw_work_precision(
-        study.rows,
-        floors=(study.floor, ABOVE_REFERENCE * study.reference.own.gamma_dot),
-        seconds=study.seconds,
-        best={
-            target: (1e3 * row.wall_min_s, max(row[ERROR], study.floor))
-            for target, row in found.items()
-            if row is not None
-        },
-        title=f"{study.scene}: error against wall time\n{fastest(study)}",
-        footnote=f"Reference: {study.reference.how}. {provenance(compiled=study.compiled)}",
-    )
-
-
 def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
     """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
     found, rows = summary(studies), []
@@ -211,3 +201,125 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
         facts=facts,
         provenance=provenance,
     )
+
+
+@styled
+def figure(study: WorkPrecision) -> Figure:
+    """Draw the largest errors of orientation and actuator rates over wall time, side by side.
+
+    The fastest setting for each of TARGETS is marked.
+    """
+    rows, floor = study.rows, study.floor
+    figure = free_figure(11.0, 6.4)
+    panels = figure.subplots(1, 2, sharex=True)
+    figure.subplots_adjust(left=0.075, right=0.985, top=0.875, bottom=0.205, wspace=0.2)
+    rate = ABOVE_REFERENCE * study.reference.own.gamma_dot
+    for axes, quantity, least, label in (
+        (panels[0], ERROR, floor, "largest error of the orientation [rad]"),
+        (panels[1], "largest_gamma_dot_rad_per_s", rate, "largest error of γ̇ [rad/s]"),
+    ):
+        _draw_grid(axes, rows, quantity, least)
+        axes.set_ylabel(label)
+        axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
+    found = {target: study.best(target) for target in TARGETS if target >= floor}
+    best = {target: row for target, row in found.items() if row is not None}
+    ring = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
+    for target, row in best.items():
+        panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
+        place = 1e3 * row.wall_min_s, max(row[ERROR], floor)
+        panels[0].plot(*place, "o", markeredgecolor=INK, **ring)
+    below: Looks = {"loc": "center", "bbox_to_anchor": (0.5, 0.095), "ncol": 9}
+    figure.legend(handles=[*_handles(rows, [*best])], fontsize=8, frameon=False, **below)
+    figure.suptitle(f"{study.scene}: error against wall time\n{fastest(study)}", fontsize=12)
+    note(figure, f"Reference: {study.reference.how}. {provenance(compiled=study.compiled)}", 185)
+    return figure
+
+
+def _entry(label: str, marker: str, color: str = INK, **looks: Any) -> Line2D:
+    """Return an entry of a legend."""
+    return Line2D([], [], label=label, marker=marker, color=color, **looks)
+
+
+def _handles(rows: DataFrame, targets: Sequence[float]) -> Iterator[Line2D]:
+    for name, (colour, marker) in MARKERS.items():
+        if name in set(rows.method):
+            yield _entry(name, marker, colour, linewidth=1.5)
+    yield _entry("fixed steps (full)", "o")
+    yield _entry("tolerance (hollow)", "o", markerfacecolor="white", linestyle="--")
+    if (rows.failure != "").any():
+        yield _entry("failed", "x", linestyle="none")
+    if targets:
+        name = f"fastest for {', '.join(f'{target:.0e}' for target in targets)} rad"
+        yield _entry(name, "o", linestyle=":", markersize=11, markerfacecolor="none")
+
+
+def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
+    for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
+        colour, marker = MARKERS[name]
+        face, line = (colour, "-") if kind == FIXED else ("white", "--")
+        looks: Looks = {"marker": marker, "linestyle": line, "markerfacecolor": face, "zorder": 3}
+        x, y = 1e3 * group.wall_min_s, group[quantity]
+        axes.plot(x, y, color=colour, markersize=6.5, linewidth=1.5, **looks)
+    errors: Any = drawn[quantity]
+    high = 10.0 ** math.ceil(math.log10(errors.max() if len(errors) else 1.0) + 0.01)
+    low = 10.0 ** math.floor(math.log10(errors.min() if len(errors) else high * 1e-3) - 0.7)
+    top = high * (high / low) ** 0.1
+    across: Looks = {"transform": axes.get_yaxis_transform(), "va": "center"}
+    failed = rows[rows.failure != ""]
+    if len(failed):  # in a band above everything, at their wall time
+        axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
+        middle = math.sqrt(high * top)
+        axes.text(0.99, middle, f"failed: {len(failed)}", ha="right", fontsize=8.5, **across)
+        for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
+            colour, marker = MARKERS[name]
+            x = wall if wall > 0.0 else np.nan
+            hollow: Looks = {"markerfacecolor": "none", "markersize": 6.5}
+            axes.plot(x, middle, marker, color=colour, zorder=3, **hollow)
+            axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
+    if floor > low:
+        axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
+        text = "100 × the reference's own error: none plotted"
+        axes.text(0.02, math.sqrt(low * floor), text, fontsize=7.5, **across)
+    axes.set_ylim(low, top)
+    axes.yaxis.set_major_locator(LogLocator(numticks=12))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+@styled
+def draw_summary(rows: DataFrame, footnote: str) -> Figure:
+    """Draw the time of the fastest setting for each error, a line of markers for each scene.
+
+    Args:
+        rows: scene, target [rad], method, share (wall time per time of the motion).
+        footnote: small print.
+
+    """
+    names = list(dict.fromkeys(rows.scene))
+    figure = free_figure(9.0, 1.7 + 0.36 * len(names))
+    axes = figure.subplots()
+    inch = 1.0 / figure.get_figheight()
+    figure.subplots_adjust(left=0.17, right=0.98, top=1.0 - 0.45 * inch, bottom=1.05 * inch)
+    sizes = {t: 5.5 + 3.0 * k for k, t in enumerate(sorted(set(rows.target), reverse=True))}
+    hollow: Looks = {"markerfacecolor": "none", "linestyle": "none"}
+    for row in rows.itertuples():
+        colour, marker = MARKERS[row.method]
+        place = 100.0 * row.share, names.index(row.scene)
+        looks: Looks = {"color": colour, "markersize": sizes[row.target], "markeredgewidth": 1.5}
+        axes.plot(*place, marker, **looks, **hollow)
+    axes.axvline(100.0, color=INK, linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlabel("wall time of the integration per time of the motion [%]")
+    title = "Fastest setting for an error of the orientation"
+    figure.suptitle(title, fontsize=11, x=0.02, ha="left")
+    used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
+    handles = [_entry(name, mark, colour, **hollow) for name, (colour, mark) in used.items()]
+    for target, size in sizes.items():
+        handles.append(_entry(f"{target:.0e} rad", "o", markersize=size, **hollow))
+    legend(axes, handles=handles, ncol=5)
+    note(figure, footnote, 150)
+    return figure

@@ -12,10 +12,17 @@ import pytest
 from matplotlib import image
 
 from sst_ros.errors import InputError
-from sst_ros.plot.methods import draw_summary
 from sst_ros.plot.style import save_figure
 from sst_ros.report import work_precision as study
-from sst_ros.report.accuracy import documents, fastest, figure, join_grids, page, text
+from sst_ros.report.accuracy import (
+    documents,
+    draw_summary,
+    fastest,
+    figure,
+    join_grids,
+    page,
+    text,
+)
 from sst_ros.report.accuracy import summary as summary_of
 from sst_ros.report.reference_solution import (
     EXTENDED,
