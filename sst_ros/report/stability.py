@@ -54,7 +54,8 @@ from sst_ros.report.step_advice import (
 from sst_ros.scene.loads import Initial, JointFriction
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section
-from sst_ros.simulation.simulate import GAUSS, simulate
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulate_gauss import GAUSS
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
 
