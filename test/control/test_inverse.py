@@ -21,6 +21,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import virtual_work, workspace
 from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.generic_math import symmetric_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.virtual_work import EquationOfMotion
 from sst_ros.scene.loads import Moment
@@ -34,12 +35,11 @@ ACCELERATIONS = st.tuples(*[st.floats(-20.0, 20.0)] * 3)
 
 def rounding(scene, sample, acceleration, torque, moment=None):
     """What rounding of the terms of both balances makes of W_dot, through M^-1 and the g_k."""
-    at = kernel.balance(
+    inertia, force, reach = kernel.balance(
         kernel.model_of(scene), sample.quaternion, sample.body_rate, (0.0,) * 3, moment
     )
-    xx, yy, zz, xy, xz, yz = at.inertia
-    m, reach = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.array(at.jacobian)
-    terms = np.abs(m) @ np.abs(acceleration) + np.abs(at.force) + np.abs(reach.T) @ np.abs(torque)
+    m, reach = np.array(symmetric_rows(inertia)), np.array(reach)
+    terms = np.abs(m) @ np.abs(acceleration) + np.abs(force) + np.abs(reach.T) @ np.abs(torque)
     return 16.0 * EPS * np.linalg.cond(reach) * np.linalg.norm(np.linalg.inv(m)) * terms.sum()
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gamma_ddot against MuJoCo and Pinocchio: the same seven links as a tree with two loops closed.
+"""gamma_ddot against Pinocchio: the same seven links as a tree with two loops closed.
 
+Other engines are compared, on one scene, in test/benchmark/test_peers.py.
 The tree is base -> actuated -> intermediate for each leg, the star hangs on leg 1, and a point of
 the axis t_k on legs 2 and 3 is tied to the star. Each model is built at one pose and then moved.
 """
@@ -11,7 +12,6 @@ from mechanism.closed_chains import ISOTROPIC, random_sample
 
 from sst_ros.mechanism import continuation, rates, virtual_work
 
-MUJOCO = 1e-6
 PINOCCHIO = 1e-12
 JOINTS = ("g0", "m0", "b0", "g1", "m1", "g2", "m2")
 
@@ -105,64 +105,3 @@ def test_pinocchio(case):
         proximal = pin.ProximalSettings(1e-16, 1e-3, 30)
         found = pin.constraintDynamics(model, data, q, v, u, ties, tied, proximal)
         assert relative(found[[place[f"g{k}"] for k in range(3)]], expected) <= PINOCCHIO
-
-
-def test_mujoco(case):
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
-    model = mujoco.MjModel.from_xml_string(mujoco_xml(case))
-    # The softness of an equality is (1 - d)/d times these, and d may not exceed 0.9999.
-    model.body_invweight0[:] *= 1e-4
-    place = {name: model.joint(name).dofadr[0] for name in JOINTS}
-    for q_by, v_by, torque, moment, expected in case.states:
-        data = mujoco.MjData(model)
-        for name, at in place.items():
-            data.qpos[at], data.qvel[at] = q_by[name], v_by[name]
-        for k in range(3):
-            data.qfrc_applied[place[f"g{k}"]] = torque[k]
-        data.xfrc_applied[model.body("s").id, 3:] = moment
-        mujoco.mj_forward(model, data)
-        assert np.abs(data.efc_pos).max() < 1e-12 and np.abs(data.efc_vel).max() < 1e-12
-        assert relative(data.qacc[[place[f"g{k}"] for k in range(3)]], expected) <= MUJOCO
-
-
-def mujoco_xml(case):
-    """The model at its building pose, where all joint angles are 0."""
-    bodies = []
-    for k in range(3):
-        star = body("s", case, hinge("b0", -case.t[0])) + "</body>" if k == 0 else ""
-        link = body(f"i{k}", case, hinge(f"m{k}", -case.r[k])) + star + "</body>"
-        bodies.append(body(f"a{k}", case, hinge(f"g{k}", case.w[k])) + link + "</body>")
-    ties = [
-        f'<connect body1="s" body2="i{k}" anchor="{numbers(case.t[k])}" solref="0.01 1"'
-        ' solimp="0.9999 0.9999 0.001"/>'
-        for k in (1, 2)
-    ]
-    return (
-        '<mujoco><compiler angle="radian" balanceinertia="false"/>'
-        '<option gravity="0 0 0" tolerance="0" iterations="100" solver="Newton"/>'
-        f"<worldbody>{''.join(bodies)}</worldbody><equality>{''.join(ties)}</equality></mujoco>"
-    )
-
-
-def body(name, case, joint):
-    """A body with its tensor about O and its centre of mass off O: `connect` scales by it."""
-    tensor, frame = case.tensors[name], case.frames[name]
-    least, middle, most = np.linalg.eigvalsh(tensor)
-    axis = np.linalg.eigh(tensor)[1][:, 2]
-    # A point mass on the axis of the largest moment: it takes from the two smaller ones only.
-    mass, shift = 1.0, np.sqrt(0.2 * (least + middle - most))
-    c = frame @ axis * shift
-    central = frame @ tensor @ frame.T - mass * (c @ c * np.eye(3) - np.outer(c, c))
-    six = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    return (
-        f'<body name="{name}"><inertial pos="{numbers(c)}" mass="{mass}"'
-        f' fullinertia="{numbers(six)}"/>{joint}'
-    )
-
-
-def hinge(name, axis):
-    return f'<joint name="{name}" type="hinge" axis="{numbers(axis)}"/>'
-
-
-def numbers(values):
-    return " ".join(f"{value:.17g}" for value in values)
