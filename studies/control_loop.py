@@ -29,8 +29,8 @@ from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.scene.scene import Initial, Scene
 from sst_ros.scene.yaml_document import build, values_of
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation, State
-from sst_ros.state import Vector3
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import NANOSECONDS, State, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies.sampled_data import largest_stable, stability_limit
 

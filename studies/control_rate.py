@@ -37,7 +37,8 @@ from sst_ros.report.results import data_frame, markdown, provenance, records, wr
 from sst_ros.report.states import of_samples
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import NANOSECONDS
 from studies import DOCS, parser, run
 from studies.control_loop import run_in_loop
 from studies.sampled_data import ORDERS, slope

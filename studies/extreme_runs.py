@@ -28,8 +28,8 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.yaml_document import values_of
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.state import Vector3
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import NANOSECONDS, Vector3
 from studies.control_loop import run_in_loop
 from studies.extreme_cases import Case, apart
 

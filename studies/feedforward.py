@@ -39,8 +39,8 @@ from sst_ros.control.tracking import evaluate_tracking
 from sst_ros.errors import InputError, Problem
 from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.state import Vector3
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import NANOSECONDS, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies import DOCS, parser, run, run_jobs
 from studies import control_loop as loops

@@ -4,17 +4,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
+from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
-    Linearisation,
     Method,
     Point,
     Vector,
@@ -153,19 +153,14 @@ class AdaptiveStepper:
     """Chooses methods and step sizes for an ODE.
 
     Args:
-        ode: what is integrated.
         method: name of a method in `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step: of the quaternion, and of the rate
             relative to its length.
-        compiled: by numba.
-        derivative: see `CompiledMethod`; without `linearise` only explicit methods are used.
-        linearise: see `CompiledMethod`.
-        find_jump: finds a jump of `derivative` between two times; see `AppliedTorque.jump`.
-        max_step: longest step [s].
-        doubling: control the steps of RK4, too, by the distance of a pair from one step.
+        derivative: see `CompiledMethod`; for explicit methods only.
+        law: a torque function, whose derivatives take the place of those of the ODE.
         ranges: see `CompiledMethod`.
         joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
-        budget: of evaluations; without one there is no bound.
+        doubling: control the steps of RK4, too, by the distance of a pair from one step.
 
     Attributes:
         history: changes of method.
@@ -182,8 +177,7 @@ class AdaptiveStepper:
         *,
         compiled: bool,
         derivative: Function | None = None,
-        linearise: Linearisation | None = None,
-        find_jump: Callable[[float, float, Vector], tuple[float, float] | None] | None = None,
+        law: AppliedTorque | None = None,
         ranges: JointRanges = (),
         joints: Function = lambda *_: (),
         budget: EvaluationBudget | None = None,
@@ -194,11 +188,10 @@ class AdaptiveStepper:
         self.history: list[MethodChange] = []
         self.budget = budget or EvaluationBudget()
         self.origin = 0.0
-        self._ode = ode
-        self._auto = method == "auto"
-        self._compiled = compiled
-        self._derivative, self._linearise = derivative, linearise
-        self._find_jump, self._max_step = find_jump, max_step
+        self._ode, self._law, self._max_step = ode, law, max_step
+        self._auto, self._compiled = method == "auto", compiled
+        self._derivative = derivative if law is None else law.derivative
+        self._linearise = None if law is None or not law.is_traced else law.linearise
         self._doubling = doubling and method == RK4.name
         self._ranges, self._joints = ranges, joints
         self._methods: dict[str, CompiledMethod] = {}
@@ -368,7 +361,7 @@ class AdaptiveStepper:
 
     def _jump_in(self, t: float, h: float, y: Vector) -> list[float]:
         """Return times just before and after a jump of the derivative in a step, if any."""
-        found = self._find_jump(t, t + h, y) if self._find_jump is not None else None
+        found = self._law.jump(t, t + h, y) if self._law is not None else None
         if found is None or h < 1e-13 * max(abs(self.origin + t), h):
             return []
         margin = 4e-16 * max(abs(self.origin + found[1]), h)

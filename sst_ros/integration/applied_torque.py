@@ -67,12 +67,13 @@ class AppliedTorque:
 
     Attributes:
         limit: as given.
+        is_traced: whether the derivative is that of `ode`.
 
     """
 
     def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
         self._ode, self.limit, self._rhs = ode, limit, rhs
-        self._traced, self._compiled = rhs is None, False
+        self.is_traced, self._compiled = rhs is None, False
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
 
@@ -83,7 +84,7 @@ class AppliedTorque:
         the derivative was given.
         """
         if isinstance(torque, SineTorque):
-            return torque if self._traced and self.limit_of(torque) is None else torque.at
+            return torque if self.is_traced and self.limit_of(torque) is None else torque.at
         if callable(torque):
             return torque
         first, second, third = torque
@@ -111,7 +112,7 @@ class AppliedTorque:
 
     def compile(self) -> None:
         """Evaluate the derivative in machine code from now on; the digits are the same."""
-        if self._traced and not self._compiled:
+        if self.is_traced and not self._compiled:
             self._compiled, self._rhs = True, None
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:

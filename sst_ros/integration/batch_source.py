@@ -77,11 +77,7 @@ class SampledFeedback(NamedTuple):
         ]
         accepted = [f"now = {at.lane('code')}"]
         for j, name in enumerate(at.rows("d", 3) + at.rows("memory", self.memory)):
-            accepted += [
-                f"old = {name}",
-                f"new = {at.lane('command', j)}",
-                f"{name} = new if now == 0.0 else old",
-            ]
+            accepted += _replace_valid(name, at.lane("command", j))
         lines = [
             "sample = step // hold",
             *(_over_lanes(noise) if noise else ()),
@@ -252,12 +248,12 @@ def _accepted(size: int, at: Layout) -> list[str]:
         inside += [f"here = abs({at.lane('e', j)})", "worst = here if here > worst else worst"]
     inside += [f"{at.lane('error')} = worst if now == 0.0 else least"]
     for j in range(size):
-        inside += [
-            f"old = {at.lane('y', j)}",
-            f"new = {at.lane('new', j)}",
-            f"{at.lane('y', j)} = new if now == 0.0 else old",
-        ]
+        inside += _replace_valid(at.lane("y", j), at.lane("new", j))
     return loop(at, inside)
+
+
+def _replace_valid(place: str, new: str) -> list[str]:
+    return [f"old = {place}", f"new = {new}", f"{place} = new if now == 0.0 else old"]
 
 
 def crossings(count: int, at: Layout) -> list[str]:

@@ -115,13 +115,14 @@ class Collocation:
         compiled: bool | None = True,
     ) -> None:
         _refuse(nodes=nodes)
-        slots = None if compiled is False else slots_of(ode, limits)
+        known = compiled is not False and codegen.numba_version() is not None
+        slots = slots_of(ode, limits) if known else None
         texts = source(ode, nodes, limits, slots)
-        if compiled is None:
-            compiled = codegen.has_code(texts, {}, ("integrate",), rounding=False)
-        self._ode, self._compiled = ode, compiled and codegen.numba_version() is not None
-        if slots is not None and not self._compiled:
+        if known and compiled is None:
+            known = codegen.has_code(texts, {}, ("integrate",), rounding=False)
+        if slots is not None and not known:
             slots, texts = None, source(ode, nodes, limits, None)
+        self._ode, self._compiled = ode, known
         self._at = layout(ode, nodes, limits, slots)
         self._numbers = slots.values if slots else []
         module = codegen.load(texts, {}, numba=self._compiled, rounding=False)

@@ -103,14 +103,12 @@ class Scenarios:
         try:
             return build(Scene, replace_values(self._values, values), "", of_row=True)
         except InputError as error:
-            problems_of_row = [
-                replace(fault, key=f"scenario {row}: {fault.key}") for fault in error.problems
-            ]
-            raise InputError(self.document.name, problems_of_row) from None
+            faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
+            raise InputError(self.document.name, faults) from None
 
-    def columns(self, chosen: slice | NDArray[np.intp] = slice(None)) -> Any:
-        """Return the document with arrays of the chosen rows for the numbers that vary."""
-        columns = {key: _components(rows[chosen]) for key, rows in self.rows.items()}
+    def columns(self) -> Any:
+        """Return the document with arrays for the numbers that vary."""
+        columns = {key: _components(rows) for key, rows in self.rows.items()}
         return open_values(Scene, replace_values(self._values, columns))
 
     def faults(
@@ -143,12 +141,8 @@ class Scenarios:
 
     def check(self, *, progress: bool = False) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        problems = [
-            problem
-            for error in self.faults(progress=progress).values()
-            for problem in error.problems
-        ]
-        if problems:
+        errors = self.faults(progress=progress).values()
+        if problems := [problem for error in errors for problem in error.problems]:
             raise InputError(self.document.name, problems[:_MOST_PROBLEMS])
 
 
@@ -273,7 +267,9 @@ class ParametricModel:
             if isinstance(value, np.ndarray) and not np.all(value == self._fixed[place]):
                 allowed = f"must be {self._fixed[place]} in all scenarios of this model"
                 raise InputError(self.scene.name, [Problem(str(place), value, allowed)])
-        self._refuse_no_lag(numbers)
+        if np.any(numbers.get(("model", "time_constant"), 1.0) == 0.0):
+            allowed = "must be > 0 [s] in every scenario, or in none"
+            raise InputError(self.scene.name, [Problem("actuators.time_constant", 0.0, allowed)])
         limit = self._torque_limit(scenarios, numbers)
         return ParameterColumns(inputs, *_geometries(scenarios), limit)
 
@@ -348,12 +344,6 @@ class ParametricModel:
             model = kernel.model_of(columns, geometry)
         tree = Constants(model, ends, columns.torque if self._profile else None)
         return tree, dict(leaves(tree))
-
-    def _refuse_no_lag(self, numbers: dict[Place, Any]) -> None:
-        lag = numbers.get(("model", "time_constant"), 1.0)
-        if np.any(lag == 0.0):
-            allowed = "must be > 0 [s] in every scenario, or in none"
-            raise InputError(self.scene.name, [Problem("actuators.time_constant", 0.0, allowed)])
 
     def _torque_limit(self, scenarios: Scenarios, numbers: dict[Place, Any]) -> Array:
         """Torque limits of scenarios; refuses those that would clamp a profile.

@@ -51,56 +51,15 @@ _SHARP, _SLIDING = 10.0, 5.0
 rates below 5 times; RK4 resolves less sharp ones within the accuracy of the estimate."""
 
 
-class ErrorGrowth(NamedTuple):
-    """How the distance of the two solutions has grown.
-
-    Attributes:
-        coulomb: joints with Coulomb friction (0 to 8, by kind and leg), and its smoothing [rad/s],
-            where fixed steps may step over its sign change.
-        lost, total: growth of the distance of the body rates in steps of order 1, and in all.
-
-    """
-
-    coulomb: tuple[tuple[int, float], ...] = ()
-    lost: float = 0.0
-    total: float = 0.0
-
-    def after(self, at: Point, end: Point) -> ErrorGrowth:
-        """Add a step from `at` to `end`."""
-        if not self.coulomb:
-            return self
-        old, new = ([a - b for a, b in zip(x.y[4:7], x.z[4:7], strict=True)] for x in (at, end))
-        grown = math.dist(old, new)
-        lost = grown if self._steps_over_sign_change(at, end) else 0.0
-        return ErrorGrowth(self.coulomb, self.lost + lost, self.total + grown)
-
-    def _steps_over_sign_change(self, at: Point, end: Point) -> bool:
-        for joint, smoothing in self.coulomb:
-            v, w = at.joints[joint + 9], end.joints[joint + 9]
-            nearest = 0.0 if v * w < 0.0 else min(abs(v), abs(w))
-            if abs(w - v) > _SHARP * smoothing and nearest < _SLIDING * smoothing:
-                return True
-        return False
-
-    def errors(self, at: Point, steps: int) -> tuple[float, float]:
-        """Estimated global errors of orientation [rad] and body rate [rad/s] after some steps.
-
-        Twice the asymptotic value: at loose tolerances the terms of higher order hide a part of it.
-        """
-        y, z = at.y, at.z
-        apart = orientation_distance(y, z), math.dist(y[4:7], z[4:7])
-        rounding = _ROUNDING * math.sqrt(steps + 1.0)
-        share = max(2.0 / (2.0**at.order - 1.0), self.lost / self.total if self.lost else 0.0)
-        scale = (1.0, max(1.0, math.hypot(*y[4:7])))
-        first, second = (
-            max(d * share, min(d, rounding * s)) for d, s in zip(apart, scale, strict=True)
-        )
-        return first, second
-
-
 def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
     """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
     return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+
+
+def _steps_over_sign_change(at: Point, end: Point, joint: int, smoothing: float) -> bool:
+    v, w = at.joints[joint + 9], end.joints[joint + 9]
+    nearest = 0.0 if v * w < 0.0 else min(abs(v), abs(w))
+    return abs(w - v) > _SHARP * smoothing and nearest < _SLIDING * smoothing
 
 
 def coulomb_joints(scene: Scene) -> Iterator[tuple[int, float]]:
@@ -120,14 +79,9 @@ class LimitReached(Exception):
         super().__init__(limit.reason)
 
 
-class Checkpoint(NamedTuple):
-    """All that a period changes beside the point, and the stepper in use before it."""
-
-    steps: int
-    growth: ErrorGrowth
-    in_use: AdaptiveStepper
-    stepper: AdaptiveStepper
-    kept: StepperCheckpoint
+Checkpoint = tuple[int, tuple[float, float], AdaptiveStepper, AdaptiveStepper, StepperCheckpoint]
+"""All that a period changes beside the point: accepted steps, growth of the distance of the two
+solutions, the stepper in use before it; the stepper of the period, and how that was."""
 
 
 class Propagator:
@@ -177,22 +131,17 @@ class Propagator:
         self._ranges = ranges_of([*ends, *free_range(contacts)])
         self.torque = AppliedTorque(self.ode, scene.torque_limit, derivative)
         self._new_stepper = partial(
-            AdaptiveStepper,
-            method=integrator,
-            tolerance=tolerance,
-            compiled=compiled,
-            ranges=self._ranges,
-            joints=self.dynamics.joints,
-            budget=budget,
-            max_step=max_step,
+            AdaptiveStepper, method=integrator, tolerance=tolerance, compiled=compiled,
+            ranges=self._ranges, joints=self.dynamics.joints, budget=budget, max_step=max_step,
             doubling=observe is not None,
-        )
+        )  # fmt: skip
         self._observe = observe
         self._constant = self._stepper = self._new_stepper(self.ode, derivative=derivative)
         self._others: dict[SineTorque | None, AdaptiveStepper] = {}
-        self._linearise = self.torque.linearise if derivative is None else None
         self.accepted_steps = 0
-        self._growth = ErrorGrowth(tuple(coulomb_joints(scene)) if integrator == RK4.name else ())
+        # Fixed steps may step over a sign change of sharp friction.
+        self._coulomb = tuple(coulomb_joints(scene)) if integrator == RK4.name else ()
+        self._growth = 0.0, 0.0  # of the distance of the body rates: in steps of order 1, in all
         self._first = self._before = self._checkpoint(self._constant)
 
     @property
@@ -233,10 +182,8 @@ class Propagator:
                 and nothing has changed.
 
         """
-        if type(torque) is tuple:
-            stepper, numbers = self._constant, torque
-        else:
-            stepper, numbers = self._stepper_for(torque), self.torque.begin(torque, start)
+        stepper = self._stepper_for(torque)
+        numbers = torque if type(torque) is tuple else self.torque.begin(torque, start)
         before = self._checkpoint(stepper)
         self._stepper = stepper
         drive = (*numbers, *moment) if moment else numbers
@@ -291,13 +238,24 @@ class Propagator:
         return self.torque.at(torque, time, at.y)
 
     def errors(self, at: Point) -> tuple[float, float]:
-        """Estimated global errors of orientation [rad] and body rate [rad/s]."""
-        return self._growth.errors(at, self.accepted_steps)
+        """Estimated global errors of orientation [rad] and body rate [rad/s].
+
+        Twice the asymptotic value: at loose tolerances the terms of higher order hide a part of it.
+        """
+        y, z = at.y, at.z
+        lost, total = self._growth
+        rounding = _ROUNDING * math.sqrt(self.accepted_steps + 1.0)
+        share = max(2.0 / (2.0**at.order - 1.0), lost / total if lost else 0.0)
+        turned, apart = orientation_distance(y, z), math.dist(y[4:7], z[4:7])
+        speed = max(1.0, math.hypot(*y[4:7]))
+        return (
+            max(turned * share, min(turned, rounding)),
+            max(apart * share, min(apart, rounding * speed)),
+        )
 
     def _checkpoint(self, stepper: AdaptiveStepper) -> Checkpoint:
         """Return what to go back to after a period by this stepper."""
-        kept = stepper.checkpoint()
-        return Checkpoint(self.accepted_steps, self._growth, self._stepper, stepper, kept)
+        return self.accepted_steps, self._growth, self._stepper, stepper, stepper.checkpoint()
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         self.accepted_steps, self._growth, self._stepper, stepper, kept = checkpoint
@@ -310,11 +268,7 @@ class Propagator:
         sine = torque if isinstance(torque, SineTorque) else None
         if sine not in self._others:
             if sine is None:
-                new = self._new_stepper(
-                    self.ode, compiled=False, ranges=(),
-                    derivative=self.torque.derivative, linearise=self._linearise,
-                    find_jump=self.torque.jump,
-                )  # fmt: skip
+                new = self._new_stepper(self.ode, compiled=False, ranges=(), law=self.torque)
             else:
                 new = self._new_stepper(ode_under(self.dynamics, sine, self.torque.limit_of(sine)))
             self._others[sine] = new
@@ -324,14 +278,21 @@ class Propagator:
         self, at: Point, h: float, count: int, drive: tuple[float, ...]
     ) -> tuple[Point, int]:
         """Advance by up to `count` periods of h [s] that take one pair of steps each."""
-        stepper, coulomb = self._stepper, self._growth.coulomb
-        if coulomb:  # the joints are looked at after each period
-            count = 1
-        done, end = stepper.step_many(h, count, at, drive)
-        self.accepted_steps += done
-        if coulomb and done:
-            self._growth = self._growth.after(at, end)
+        # With Coulomb friction the joints are looked at after each period.
+        done, end = self._stepper.step_many(h, 1 if self._coulomb else count, at, drive)
+        if done:
+            self._count_steps(done, at, end)
         return end, done
+
+    def _count_steps(self, count: int, at: Point, end: Point) -> None:
+        """Count steps, and where they may be of order 1 how the solutions have grown apart."""
+        self.accepted_steps += count
+        if self._coulomb:
+            lost, total = self._growth
+            old, new = ([a - b for a, b in zip(x.y[4:7], x.z[4:7], strict=True)] for x in (at, end))
+            grown = math.dist(old, new)
+            sharp = any(_steps_over_sign_change(at, end, *one) for one in self._coulomb)
+            self._growth = lost + (grown if sharp else 0.0), total + grown
 
     def _adaptive(self, at: Point, start: float, h: float, drive: tuple[float, ...]) -> Point:
         """Advance by h [s]; steps end where contact with a stop begins or ends."""
@@ -350,8 +311,7 @@ class Propagator:
     ) -> tuple[Point, float, Limit | None]:
         """Go on from x to h, or to the first limit or contact event before."""
         for step in self._stepper.accepted_steps(x, h, at, drive):
-            self.accepted_steps += 1
-            self._growth = self._growth.after(step.begin, step.end)
+            self._count_steps(1, step.begin, step.end)
             event = None
             if not step_loops.all_far(self._ranges, step.begin.joints, step.end.joints, step.h):  # type: ignore[no-untyped-call]
                 step, event = self._until_first(step)

@@ -32,8 +32,7 @@ from sst_ros.runtime.trajectory_following import (
     TrajectoryGoal,
 )
 from sst_ros.scene import scene
-from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.state import Vector3
+from sst_ros.state import NANOSECONDS, Vector3
 
 try:
     from control_msgs.action import FollowJointTrajectory

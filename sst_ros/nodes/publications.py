@@ -35,8 +35,7 @@ from sst_ros.runtime.torque_input import ACTUATORS, HasState
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.simulation import NANOSECONDS, State
-from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, Vector3
+from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, State, Vector3
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180

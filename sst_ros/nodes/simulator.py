@@ -35,7 +35,8 @@ from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, Simulation
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import NANOSECONDS
 
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 _DELAY_S = 5.0

@@ -26,8 +26,7 @@ from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS
-from sst_ros.state import Vector3, is_idle, nanoseconds
+from sst_ros.state import NANOSECONDS, Vector3, is_idle, nanoseconds
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 

@@ -33,8 +33,8 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.report.step_advice import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulation import NANOSECONDS, WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.state import TorqueFunction, Vector3
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 LongArray: TypeAlias = NDArray[np.longdouble]
 EXTENDED, MPMATH = "long double", "mpmath"

@@ -14,7 +14,8 @@ from sst_ros.errors import Problem
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
-from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS, NANOSECONDS
+from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
+from sst_ros.state import NANOSECONDS
 
 
 def _seconds(doc: str, default: float, *, least: float = 0.0, most: float = 1e6) -> Any:

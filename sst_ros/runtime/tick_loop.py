@@ -14,8 +14,8 @@ from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import HasState, TorqueInput
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation.simulation import Simulation, State
-from sst_ros.state import Vector3
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import State, Vector3
 
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4

@@ -116,19 +116,6 @@ def _one_of(names: tuple[str, ...]) -> str:
     return "must be one of " + ", ".join(names)
 
 
-__all__ = [
-    "AUTO",
-    "EQUATIONS",
-    "INTEGRATORS",
-    "NANOSECONDS",
-    "WHOLE_MOTION_BUDGET",
-    "Simulation",
-    "State",
-    "Torque",
-    "Vector3",
-]
-
-
 class _Instant(NamedTuple):
     """What a state is made of, when it is asked for; torque and moment acted before it."""
 
