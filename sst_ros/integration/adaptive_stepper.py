@@ -117,32 +117,22 @@ _CHOOSE_AFTER_REJECTIONS = 3
 
 
 class Step(NamedTuple):
-    """An accepted step, or the part of it before an event.
+    """An accepted step, or the part of it before an event."""
 
-    Attributes:
-        t: when it begins [s], as `method` takes it.
-        h: its length [s].
-        begin, end: solutions.
-        drive: what acts.
-        method: what has taken it.
-        last: whether it ends with the period.
-
-    """
-
-    t: float
-    h: float
+    t: float  # when it begins [s], as `method` takes it
+    h: float  # its length [s]
     begin: Point
     end: Point
-    drive: Vector
-    method: CompiledMethod
-    last: bool
+    drive: Vector  # what acts
+    method: CompiledMethod  # what has taken it
+    last: bool  # whether it ends with the period
 
 
 class MethodChange(NamedTuple):
-    """A change of method: time [s], the new method, why."""
+    """A change of method."""
 
-    time: float
-    method: str
+    time: float  # [s]
+    method: str  # the new one
     reason: str
 
 

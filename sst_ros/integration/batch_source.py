@@ -34,12 +34,9 @@ EARLIEST = 1e-8
 class SampledFeedback(NamedTuple):
     """A controller that acts every `hold` steps; its torques are held until it acts again.
 
-    Attributes:
-        program: outputs are the three torques and the new memory; inputs the references of a
-            sample, which all scenarios share, the state, the memory, the noise, the rest of the
-            drive with the parameters, and the gains.
-        references, memory, noise, gains: how many numbers each are.
-
+    Outputs of the program are the three torques and the new memory; inputs the references of a
+    sample, which all scenarios share, the state, the memory, the noise, the rest of the drive with
+    the parameters, and the gains. The other fields say how many numbers of each there are.
     """
 
     program: Program

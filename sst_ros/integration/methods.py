@@ -14,28 +14,16 @@ from fractions import Fraction
 
 @dataclass(frozen=True)
 class Tableau:
-    """An explicit method: stages a and c, weights b, and weights of its error estimates.
-
-    Attributes:
-        name: short name.
-        order: order of the solution that goes on.
-        a: lower triangle, row i has i entries.
-        b: weights of the solution.
-        c: nodes.
-        error: weights of the error estimate; empty where the method has none.
-        error_order: order p of the estimate, which shrinks like h^(p+1).
-        damping: weights of a second estimate that scales the first (DOP853); empty otherwise.
-
-    """
+    """An explicit method: stages a and c, weights b, and weights of its error estimates."""
 
     name: str
-    order: int
-    a: tuple[tuple[float, ...], ...]
-    b: tuple[float, ...]
-    c: tuple[float, ...]
-    error: tuple[float, ...] = ()
-    error_order: int = 0
-    damping: tuple[float, ...] = ()
+    order: int  # of the solution that goes on
+    a: tuple[tuple[float, ...], ...]  # lower triangle, row i has i entries
+    b: tuple[float, ...]  # weights of the solution
+    c: tuple[float, ...]  # nodes
+    error: tuple[float, ...] = ()  # weights of the error estimate, where the method has one
+    error_order: int = 0  # p of the estimate, which shrinks like h^(p+1)
+    damping: tuple[float, ...] = ()  # weights of a second estimate that scales the first (DOP853)
 
 
 def _row(entries: str) -> tuple[float, ...]:
@@ -125,26 +113,15 @@ DOP853 = Tableau(
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """A linearly implicit method in the form without matrix products; gamma is 1/4.
-
-    Attributes:
-        name: short name.
-        order: order of the solution that goes on.
-        error_order: order p of the error estimate.
-        a: weights of the stages in the arguments; the last two rows end in 1.
-        c: weights of the stages in the right-hand sides, over h.
-        alpha: nodes.
-        d: weights of the derivative by time.
-
-    """
+    """A linearly implicit method in the form without matrix products; gamma is 1/4."""
 
     name: str
-    order: int
-    error_order: int
-    a: tuple[tuple[float, ...], ...]
-    c: tuple[tuple[float, ...], ...]
-    alpha: tuple[float, ...]
-    d: tuple[float, ...]
+    order: int  # of the solution that goes on
+    error_order: int  # of the error estimate
+    a: tuple[tuple[float, ...], ...]  # of the stages in the arguments; the last two rows end in 1
+    c: tuple[tuple[float, ...], ...]  # of the stages in the right-hand sides, over h
+    alpha: tuple[float, ...]  # nodes
+    d: tuple[float, ...]  # of the derivative by time
 
 
 _RODAS_LAST = (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950)

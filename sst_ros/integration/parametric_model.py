@@ -166,18 +166,11 @@ def _components(values: Array) -> Any:
 
 
 class Constants(NamedTuple):
-    """All numbers that the traced programs of a scene are made of: a tree of numbers or columns.
-
-    Attributes:
-        model: the dynamics.
-        ends: cosine and sine of the end of each limit, in the order of `limits_of`.
-        torque: the scene's own torques over time; None where they do not act.
-
-    """
+    """All numbers that the traced programs of a scene are made of: a tree of numbers or columns."""
 
     model: kernel.Model
-    ends: tuple[tuple[float, float], ...]
-    torque: SineTorque | None
+    ends: tuple[tuple[float, float], ...]  # cosine and sine of the end of each of `limits_of`
+    torque: SineTorque | None  # the scene's own over time; None where it does not act
 
 
 def _with_damping(stroke: Any) -> Any:
@@ -201,20 +194,12 @@ class VariedNumber(Expression):
 
 
 class ParameterColumns(NamedTuple):
-    """Numbers of the scenarios of a batch.
+    """Numbers of the scenarios of a batch."""
 
-    Attributes:
-        inputs: the program's varied numbers, shape (numbers, N).
-        geometries: the distinct ones, or one for all rows.
-        geometry: index of the geometry of each row, shape (N,).
-        torque_limit: largest torque of an actuator [N m], infinite without one, shape (N,).
-
-    """
-
-    inputs: Array
-    geometries: Geometry
-    geometry: NDArray[np.intp]
-    torque_limit: Array
+    inputs: Array  # the program's varied numbers, shape (numbers, N)
+    geometries: Geometry  # the distinct ones, or one for all rows
+    geometry: NDArray[np.intp]  # index of the geometry of each row, shape (N,)
+    torque_limit: Array  # largest torque of an actuator [N m], infinite without one, shape (N,)
 
 
 class ParametricModel:

@@ -349,18 +349,11 @@ pairs of steps."""
 
 
 class TickSequence(NamedTuple):
-    """Ticks in order of time.
+    """Ticks in order of time."""
 
-    Attributes:
-        start_ns, end_ns: relative to the start of the run [ns], shape (m,).
-        drives: what is held over a tick, shape (m, 3 or 6 or 0): actuator torques [N m], and a
-            moment on the star in {B} [N m] if it comes from a topic.
-
-    """
-
-    start_ns: NDArray[np.int64]
+    start_ns: NDArray[np.int64]  # relative to the start of the run [ns], shape (m,)
     end_ns: NDArray[np.int64]
-    drives: Array
+    drives: Array  # held over a tick: torques [N m], a moment on the star in {B} [N m] or nothing
 
     def part(self, ticks: slice) -> TickSequence:
         """Return some of the ticks."""

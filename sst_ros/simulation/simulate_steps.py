@@ -47,43 +47,24 @@ _ATTEMPTS, _FINEST = 4, 1e-14
 
 @dataclass(frozen=True)
 class Task:
-    """What is simulated.
-
-    Attributes:
-        scene: what moves.
-        torque: what acts.
-        span: length of the motion [ns].
-        period: control period [ns]; None where torques are not held.
-        method: name of the method, or auto.
-        tolerance: largest error estimate at the end [rad].
-        breaks: further times at which the torques jump [s], ascending.
-        max_step: longest step [s].
-        times: of the samples [ns]; None for the ends of the steps of collocation, the control
-            periods, or even ones.
-
-    """
+    """What is simulated."""
 
     scene: Scene
     torque: TorqueProfile
-    span: int
-    period: int | None
-    method: str
-    tolerance: float
-    breaks: Array
-    max_step: float
-    times: np.ndarray | None
+    span: int  # length of the motion [ns]
+    period: int | None  # of control [ns]; None where torques are not held
+    method: str  # name, or auto
+    tolerance: float  # largest error estimate at the end [rad]
+    breaks: Array  # further times at which the torques jump [s], ascending
+    max_step: float  # longest step [s]
+    times: np.ndarray | None  # of the samples [ns]; None for those that suit the method
 
 
 def integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
 
     A function whose torques are held is called once a period and may have a memory: one run.
-
-    Args:
-        task: what is simulated.
-        reason: why this method was chosen, "" where the caller chose it.
-        progress: draw a bar on a terminal.
-
+    `reason` says why this method was chosen, "" where the caller chose it.
     """
     local = tolerance = task.tolerance
     spent = 0
@@ -142,15 +123,7 @@ class HalvedSteps:
 
 
 class SteppedMotion:
-    """One run of a motion.
-
-    Args:
-        task: what is simulated.
-        tolerance: largest local error of a step.
-        spent: evaluations of runs before this one.
-        progress: draw a bar on a terminal.
-
-    """
+    """One run of a motion, after others with so many evaluations that have been `spent`."""
 
     def __init__(self, task: Task, tolerance: float, spent: int, progress: bool) -> None:
         self._task, self._scene = task, task.scene
