@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions by steps with error control: any torque, control periods, limits, stiff scenes.
 
-A second solution by steps of half the length, which costs twice a step, tells the error at the end.
+A second solution goes through each step of a run by two of half the length, which costs twice a
+step: its distance tells the error at the end. No order is assumed, as none holds where a torque
+jumps, a clamp or a contact bends the motion, or friction is sharp. The steps halve where the run's
+own steps are, whatever chose them. Where the method has its order, the second solution is nearly
+exact, and the distance is the error; where each step loses its order, the error halves, and the
+distance is half of the error.
 """
 
 from __future__ import annotations
@@ -10,7 +15,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -43,6 +47,9 @@ Python they take one second and five; to compile the steps of a method takes fou
 
 _ATTEMPTS, _FINEST = 4, 1e-14
 """Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
+
+_MARGIN, _FLOOR = 2.0, 8 * 2.220446049250313e-16
+"""Of the distance: an error that halves with the steps is twice as large; of rounding, a step."""
 
 
 @dataclass(frozen=True)
@@ -83,45 +90,6 @@ def integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     return motion
 
 
-_MARGIN = 2.0
-"""Of the distance: an error that halves with the steps is twice as large."""
-_FLOOR = 8 * 2.220446049250313e-16
-
-
-class HalvedSteps:
-    """A second solution, which goes through each step of a run by two of half the length.
-
-    No order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion,
-    or friction is sharp. The steps halve where the run's own steps are, whatever chose them. Where
-    the method has its order, the second solution is nearly exact, and the distance is the error;
-    where each step loses its order, the error halves, and the distance is half of the error.
-
-    Args:
-        start: where the run begins.
-
-    Attributes:
-        steps: how many steps of the run it has gone through.
-
-    """
-
-    def __init__(self, start: Point) -> None:
-        self._y, self.steps = list(start.y), 0
-
-    def add(self, step: Step) -> None:
-        """Go through a step of the run, which is itself a pair of steps."""
-        method, h = step.method, (step.t + step.h) - step.t  # between its ends, which are rounded
-        self.steps += 1
-        try:
-            self._y = method.step_fixed(step.t, 0.25 * h, 4, self._y, step.drive)
-        except (ArithmeticError, ValueError):
-            self._y = [math.nan] * len(self._y)
-
-    def error(self, y: list[float]) -> float:
-        """Estimated error of the orientation of the run at y [rad]."""
-        floor = _FLOOR * math.sqrt(self.steps + 1.0)
-        return max(_MARGIN * orientation_distance(y, self._y), floor)
-
-
 class SteppedMotion:
     """One run of a motion, after others with so many evaluations that have been `spent`."""
 
@@ -130,20 +98,15 @@ class SteppedMotion:
         self._end = task.span / NANOSECONDS
         self._budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
         self._propagator = Propagator(
-            task.scene,
-            task.method,
-            tolerance,
-            compiled=False,
-            budget=self._budget,
-            max_step=task.max_step,
-            observe=self._pass,
-        )
+            task.scene, task.method, tolerance, compiled=False, budget=self._budget,
+            max_step=task.max_step, observe=self._pass,
+        )  # fmt: skip
         self._method = self._propagator.method
         self._start = self._at = self._propagator.begin(list(start_of(task.scene)))
-        self._check = HalvedSteps(self._at)
+        self._finer, self._steps = list(self._at.y), 0
         self._bar = Bar(f"{self._scene.name}, simulating", progress)
         self._held: list[tuple[float, Vector3]] = []
-        self._samples: list[tuple[float, Point, Vector3]] = []
+        self._rows: list[tuple[float, ...]] = []  # time, state, torques, joints
         self._wanted: list[float] = (self._times() / NANOSECONDS)[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
         self._time, self._period = 0.0, (0.0, 0.0)
@@ -152,8 +115,7 @@ class SteppedMotion:
 
     def run(self) -> Trajectory:
         """Go to the end or a limit."""
-        status, message, stop = 0, "reached the end", None
-        time = 0.0
+        status, time, stop = 0, 0.0, ""
         moment = (0.0, 0.0, 0.0) if self._propagator.dynamics.has_moment_topic else ()
         if self._task.period is not None:
             self._take_first()
@@ -168,11 +130,9 @@ class SteppedMotion:
             self._sample(math.floor(time * NANOSECONDS) / NANOSECONDS)
         except (CannotStep, ArithmeticError, ValueError) as error:
             status, time = -1, self._time
-            stop = unresolved(error, Geometry.of(self._scene), self._state(time, self._at))
-        if stop is not None:
-            message = f"stopped at t = {time:.12f} s: {stop}"
-        if status < 0:
-            self._take(self._time, self._at)
+            stop = unresolved(error, Geometry.of(self._scene), self._state(time))
+            self._take(time, self._at)
+        message = f"stopped at t = {time:.12f} s: {stop}" if stop else "reached the end"
         return self._trajectory(status, message)
 
     def _times(self) -> Array:
@@ -190,10 +150,8 @@ class SteppedMotion:
         if period is not None:
             for start in range(0, span, period):
                 time, stop = start / NANOSECONDS, min(start + period, span)
-                if isinstance(law, FeedbackTorque):
-                    held = law(time, self._state(time, self._at))
-                else:
-                    held = law(time)
+                at = (self._state(time),) if isinstance(law, FeedbackTorque) else ()
+                held = law(time, *at)
                 self._held.append((time, held))
                 yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held
             return
@@ -206,7 +164,12 @@ class SteppedMotion:
     def _pass(self, step: Step) -> None:
         """Go with the second solution through a step of the run, and take samples in it."""
         self._budget.charge(4 * step.method.pair_cost // 3)
-        self._check.add(step)
+        self._steps += 1
+        h = (step.t + step.h) - step.t  # between its ends, which are rounded
+        try:  # a step is itself a pair of steps
+            self._finer = step.method.step_fixed(step.t, 0.25 * h, 4, self._finer, step.drive)
+        except (ArithmeticError, ValueError):
+            self._finer = [math.nan] * len(self._finer)
         if self._spent + self._budget.spent > self._compile_after:
             self._compile(step.method)
         self._last, self._last_begin = step, self._period[0] + step.t
@@ -244,37 +207,32 @@ class SteppedMotion:
             self._take(self._wanted.pop(), self._at)
 
     def _take(self, time: float, at: Point) -> None:
-        if not self._samples or self._samples[-1][0] < time:
-            self._samples.append((time, at, self._propagator.acting(self._torque, time, at)))
+        if not self._rows or self._rows[-1][0] < time:
+            acting = self._propagator.acting(self._torque, time, at)
+            self._rows.append((time, *at.y[:7], *acting, *at.joints))
 
-    def _state(self, time: float, at: Point) -> State:
-        acting = self._propagator.acting(self._torque, time, at)
-        return State.of(round(time * NANOSECONDS), at.y, at.joints, acting)
+    def _state(self, time: float) -> State:
+        acting = self._propagator.acting(self._torque, time, self._at)
+        return State.of(round(time * NANOSECONDS), self._at.y, self._at.joints, acting)
 
     def _trajectory(self, status: int, message: str) -> Trajectory:
-        propagator, at = self._propagator, self._at
-        dynamics = propagator.dynamics
-        torque: Any = self._task.torque
-        if self._held:
-            times, torques = zip(*self._held, strict=True)
-            torque = TorqueTable(times, torques)
-        acting = np.array([acting for _, _, acting in self._samples]).reshape(-1, 3)
-        states = np.array([point.y[:7] for _, point, _ in self._samples]).reshape(-1, 7)
-        stored = dynamics.total_energy(at.y) - dynamics.total_energy(self._start.y)
+        propagator, y = self._propagator, self._at.y
+        energy, floor = propagator.dynamics.total_energy, _FLOOR * math.sqrt(self._steps + 1.0)
+        rows = np.array(self._rows).reshape(-1, 29)
         changes = [f"{to} from {at:g} s ({why})" for at, to, why in propagator.changes]
         return Trajectory(
             self._scene,
-            np.array([time for time, _, _ in self._samples]),
-            states[:, :4],
-            states[:, 4:],
-            acting,
-            joints=np.array([point.joints for _, point, _ in self._samples]).reshape(-1, 18),
+            rows[:, 0],
+            rows[:, 1:5],
+            rows[:, 5:8],
+            rows[:, 8:11],
+            joints=rows[:, 11:],
             status=status,
             message=message,
             method=", then ".join([self._method, *changes]),
-            error_estimate=self._check.error(at.y),
-            energy_residual=stored - at.y[-1],
+            error_estimate=max(_MARGIN * orientation_distance(y, self._finer), floor),
+            energy_residual=energy(y) - energy(self._start.y) - y[-1],
             evaluations=self._budget.spent,
-            step=self._time / max(self._check.steps, 1),
-            law=torque,
+            step=self._time / max(self._steps, 1),
+            law=TorqueTable(*zip(*self._held, strict=True)) if self._held else self._task.torque,
         )
