@@ -19,14 +19,7 @@ from sst_ros.integration.compiled_method import (
     Point,
     Vector,
 )
-from sst_ros.integration.methods import (
-    DOP853,
-    DORMAND_PRINCE,
-    METHODS,
-    RK4,
-    RODAS4,
-    Rosenbrock,
-)
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 
 GROW = 5.0
@@ -83,10 +76,8 @@ class BudgetSpent(CannotStep):
 class EvaluationBudget:
     """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
 
-    Args:
-        per_period: how many; None for no bound.
-        whole_run: they are those of a run, whatever its periods.
-
+    `per_period` is None for no bound; with `whole_run` they are those of a run, whatever its
+    periods.
     """
 
     def __init__(self, per_period: int | None = None, *, whole_run: bool = False) -> None:

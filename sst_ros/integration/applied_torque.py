@@ -168,15 +168,9 @@ class AppliedTorque:
         return low, high
 
     def linearise(
-        self,
-        t: float,
-        y: Sequence[float],
-        d: Sequence[float],
-        _numbers: Any,
-        slope: Any,
-        by_time: Any,
+        self, t: float, y: Sequence[float], d: Sequence[float], _: Any, slope: Any, by_time: Any,
         matrix: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Fill in derivative, df/dt and df/dy: exact by the state, by differences of the torque.
 
         See `CompiledMethod` for the arguments.

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,13 +20,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.host.output import slices
 from sst_ros.integration import codegen
-from sst_ros.integration.batch_result import (
-    NO_ASSEMBLY,
-    NO_RATE,
-    OUTSIDE,
-    BatchResult,
-    BatchStates,
-)
+from sst_ros.integration.batch_result import NO_ASSEMBLY, NO_RATE, OUTSIDE, BatchResult, BatchStates
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.integration.parametric_model import ParametricModel, Scenarios
@@ -47,16 +41,9 @@ _BLOCK = 2000
 """Starts solved at once: their arrays fit the cache."""
 
 
-class Advance(Protocol):
-    """Advances states by steps from step `first`; changes the arrays of `batch_source`.
-
-    `rows` are those whose last step is repeated; None for all scenarios.
-    """
-
-    def __call__(
-        self, first: int, count: int, step: float, *arrays: Any, rows: NDArray[np.intp] | None
-    ) -> None:
-        """Advance by `count` steps."""
+Advance = Callable[..., None]
+"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
+the arrays of `batch_source`. `rows` are those whose last step is repeated; None for all."""
 
 
 class Batch:

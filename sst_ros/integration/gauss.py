@@ -126,7 +126,13 @@ class Collocation:
         self._at = layout(ode, nodes, limits, slots)
         self._numbers = slots.values if slots else []
         module = codegen.load(texts, {}, numba=self._compiled, rounding=False)
-        self._integrate = _machine_code(module.integrate) if self._compiled else module.integrate
+        self._integrate: Callable[..., float] = module.integrate
+        if known:  # for two arrays: numba then need not look at the arguments in each call
+            import numba
+
+            array = numba.types.Array(numba.float64, 1, "C")
+            module.integrate.compile((array, array))
+            self._integrate = module.integrate.get_overload((array, array))
 
     def prepare(
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
@@ -148,7 +154,9 @@ class Collocation:
         """
         _refuse(count=count, iterations=iterations)
         at = self._at
-        block: Any = _aligned(at.numbers)
+        block: Any = np.zeros(at.numbers + 8)
+        # From the begin of a cache line on, as no register then lies across two.
+        block = block[-(block.ctypes.data // 8) % 8 :][: at.numbers]
         block[:HEAD] = count, iterations, h
         first = at.first("numbers")
         block[first : first + len(self._numbers)] = self._numbers
@@ -172,23 +180,6 @@ def tables(nodes: int) -> Array:
     basis = [legendre.Legendre.basis(k) for k in range(nodes)]
     integrals = np.stack([p.integ(lbnd=-1)(x) / 2.0 for p in basis], axis=1) @ inverse
     return np.vstack([(x + 1.0) / 2.0, w / 2.0, integrals.T])
-
-
-def _machine_code(function: Any) -> Callable[..., float]:
-    """Machine code for two arrays: numba then need not look at the arguments in each call."""
-    import numba
-
-    array = numba.types.Array(numba.float64, 1, "C")
-    function.compile((array, array))
-    found: Callable[..., float] = function.get_overload((array, array))
-    return found
-
-
-def _aligned(count: int) -> Array:
-    """Return zeros whose address is that of a cache line, as no register then lies across two."""
-    numbers = np.zeros(count + 8)
-    first = -(numbers.ctypes.data // 8) % 8
-    return numbers[first : first + count]
 
 
 def _refuse(**counts: int) -> None:

@@ -217,7 +217,6 @@ class ParametricModel:
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
         self.scene, self._profile = scenarios.document, profile
-        self._count = scenarios.count or 1
         self._tree, numbers = self._numbers(scenarios)
         varied = [place for place, value in numbers.items() if _varies(value)]
         self._varied = dict(zip(varied, (f"p{i}" for i in range(len(varied))), strict=True))

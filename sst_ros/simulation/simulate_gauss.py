@@ -58,11 +58,8 @@ class GaussMotion:
         finest: most steps that are tried.
 
     Attributes:
-        count: steps.
-        iterations: evaluations of all nodes in a step.
-        h: length of a step [s].
-        error: estimated error of the orientation at the end [rad]: the distance from a finer
-            solution.
+        count, iterations, h: steps, evaluations of all nodes in a step, length of a step [s].
+        error: estimated error of the orientation at the end [rad], from a finer solution.
         samples: states at the times of `grid`, shape (count + 1, numbers of the state).
 
     Raises:

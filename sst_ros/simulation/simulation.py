@@ -87,16 +87,18 @@ def refuse_bad_step(torque: Any, dt_ns: Any, count: Any, moment: Any) -> tuple[i
     length, number = _whole(dt_ns), _whole(count)
     if length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment):
         return length, number
-    problems = []
-    if not (callable(torque) or isinstance(torque, SineTorque)) and finite_vector(torque) is None:
-        allowed = "must be three finite numbers [N m], a SineTorque or a function of t [s]"
-        problems.append(Problem("torque", torque, allowed))
-    if finite_vector(moment) is None:
-        problems.append(Problem("moment", moment, "must be three finite numbers [N m]"))
-    if length <= 0:
-        problems.append(Problem("dt_ns", dt_ns, "must be > 0, in whole nanoseconds"))
-    if number <= 0:
-        problems.append(Problem("count", count, "must be > 0, a whole number"))
+    given = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
+    three = "must be three finite numbers [N m]"
+    problems = [
+        Problem(name, value, allowed)
+        for name, value, good, allowed in (
+            ("torque", torque, given, f"{three}, a SineTorque or a function of t [s]"),
+            ("moment", moment, finite_vector(moment), three),
+            ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
+            ("count", count, number > 0, "must be > 0, a whole number"),
+        )
+        if not good
+    ]
     if problems:
         raise InputError("step", problems)
     return length, number
@@ -104,8 +106,6 @@ def refuse_bad_step(torque: Any, dt_ns: Any, count: Any, moment: Any) -> tuple[i
 
 def _whole(value: Any) -> int:
     """Return a whole number of any type as int, 0 for anything else."""
-    if type(value) is int:
-        return value
     try:
         return 0 if isinstance(value, bool) else operator.index(value)
     except TypeError:

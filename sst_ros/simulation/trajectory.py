@@ -113,24 +113,21 @@ class Trajectory:
         self.torque = _own(torque)
         if joints is not None:
             self._joints = _own(joints)
-        self._refuse_misfits()
+        n, problems = len(self.t), []
+        if self.t.ndim != 1 or not np.isfinite(self.t).all() or np.any(np.diff(self.t) <= 0.0):
+            problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
+        for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
+            array = vars(self).get(name)
+            if array is not None and array.shape != (n, size):
+                allowed = f"must have the shape ({n}, {size})"
+                problems.append(Problem(name.strip("_"), array.shape, allowed))
+        if problems:
+            raise InputError("trajectory", problems)
         self.status, self.message, self.method = status, message, method
         self.error_estimate, self._residual = error_estimate, energy_residual
         self.evaluations, self.step = evaluations, step
         self.law: TorqueProfile | None = None if law is None else profile_of(law)
         self.dense = dense
-
-    def _refuse_misfits(self) -> None:
-        t, problems = self.t, []
-        if t.ndim != 1 or not np.isfinite(t).all() or (t[1:] <= t[:-1]).any():
-            problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
-        for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
-            array = vars(self).get(name)
-            if array is not None and array.shape != (len(t), size):
-                allowed = f"must have the shape ({len(t)}, {size})"
-                problems.append(Problem(name.strip("_"), array.shape, allowed))
-        if problems:
-            raise InputError("trajectory", problems)
 
     def with_states(self, y: Array) -> Trajectory:
         """Return the same run with other read-only states (n, 7 or 10), before anything is derived.
@@ -314,7 +311,9 @@ class Trajectory:
         require("matplotlib")
         from matplotlib.figure import Figure
 
-        shown = self._dense_enough()
+        shown = self
+        if 2 <= len(self.t) < _FEW and not isinstance(self.law, LostTorque):
+            shown = self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))
         figure = Figure(figsize=(8.0, 9.0), layout="constrained")
         panels = figure.subplots(4, 1, sharex=True)
         for axes, name in zip(panels, ("gamma", "gamma_dot", "torque"), strict=False):
@@ -353,12 +352,6 @@ class Trajectory:
             self.plot().savefig(picture, format="svg")
         svg = picture.getvalue()
         return f"<table>{cells}</table>{svg[max(svg.find('<svg'), 0) :]}"
-
-    def _dense_enough(self) -> Trajectory:
-        """Return a trajectory with samples enough for a picture."""
-        if not 2 <= len(self.t) < _FEW or isinstance(self.law, LostTorque):
-            return self
-        return self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))
 
 
 def _own(value: ArrayLike) -> Array:
