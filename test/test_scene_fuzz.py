@@ -6,23 +6,23 @@ What is taken is assembled, traced, differentiated and described as well.
 
 from __future__ import annotations
 
-from pathlib import Path
+import copy
+import functools
+import operator
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import FAST
-from trees import changed
 
 from sst_ros.cli.runs import check
 from sst_ros.errors import InputError
 from sst_ros.report.scene_summary import summary
-from sst_ros.scene.scene import Scene, names
+from sst_ros.scene.scene import Scene, names, text_of
 from sst_ros.scene.yaml_document import dump, read
 
-FOLDER = Path(__file__).parents[1] / "config" / "scenes"
-SOURCES = {name: (FOLDER / f"{name}.yaml").read_text(encoding="utf-8") for name in names()}
+SOURCES = {name: text_of(name)[0] for name in names()}
 TREES = {name: yaml.safe_load(source) for name, source in SOURCES.items()}
 FUZZ = settings(FAST, max_examples=60)
 
@@ -32,6 +32,15 @@ def paths(tree, path=()):
         for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
             yield (*path, key)
             yield from paths(value, (*path, key))
+
+
+def changed(place, value):
+    """A scene as a plain tree, with another value in one place."""
+    name, path = place
+    tree = copy.deepcopy(TREES[name])
+    inner = functools.reduce(operator.getitem, path[:-1], tree)
+    inner[path[-1]] = value
+    return written(tree)
 
 
 PLACES = [(name, path) for name, tree in TREES.items() for path in paths(tree)]
@@ -103,15 +112,13 @@ def written(tree):
 @FUZZ
 @given(st.sampled_from(PLACES), values)
 def test_another_value_in_one_place(path, place, value):
-    name, where = place
-    judged(written(changed(TREES[name], where, value)), path)
+    judged(changed(place, value), path)
 
 
 @settings(FAST, max_examples=15)
 @given(st.sampled_from(PLACES), numbers)
 def test_another_number_in_a_scene_that_is_described(path, place, value):
-    name, where = place
-    judged(written(changed(TREES[name], where, value)), path, described=True)
+    judged(changed(place, value), path, described=True)
 
 
 @FUZZ

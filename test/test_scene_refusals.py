@@ -6,11 +6,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sst_ros.cli.runs import check
-from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.yaml_document import read
@@ -35,7 +33,6 @@ LINK = "  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}"
 # What is changed, into what, and what the message must say after "origin: ".
 REFUSED = {
     "unknown key": ("duration: 1 ", "durration: 1 ", r"durration = '1': unk.* mean 'duration'"),
-    "removed key": ("duration: 1 ", "markers: {}\nduration: 1 ", r"markers = .*: unknown key"),
     "unknown inner key": ("radius: 0.4 ", "radus: 0.4 ", r"star\.radus = '0\.4': unknown key"),
     "duplicate key": ("duration: 1 ", "name: x\nduration: 1 ", r"name = 'x': is given twice.* 2"),
     "missing key": (ALPHA, "", r"star\.alpha_deg = None: is missing; must be 3 finite numbers > 0"),
@@ -44,13 +41,9 @@ REFUSED = {
     "vector for scalar": ("duration: 1 ", "duration: [1] ", r"duration = \['1'\]: must be a f"),
     "text for number": ("duration: 1 ", "duration: soon ", r"duration = 'soon': must be a finite"),
     "nan": ("duration: 1 ", "duration: nan ", r"duration = 'nan': must be .* > 0 \[s\]"),
-    ".nan": ("duration: 1 ", "duration: .nan ", r"duration = '\.nan': must be a finite number"),
-    "inf": ("duration: 1 ", "duration: inf ", r"duration = 'inf': must be a finite number"),
-    "-.inf": (V, "v: [[1, 0, 0], [0, 1, 0], [0, 0, -.inf]]", r"base\.v = .*: must be 3 x 3 finite"),
     "1e999": ("duration: 1 ", "duration: 1e999 ", r"duration = '1e999': must be a finite number"),
     "bool": ("duration: 1 ", "duration: true ", r"duration = 'true': must be a finite number"),
     "null": ("duration: 1 ", "duration: ~ ", r"duration = None: must be a finite number"),
-    "negative duration": ("duration: 1 ", "duration: -1 ", r"= '-1': must be .* > 0 \[s\]"),
     "zero duration": ("duration: 1 ", "duration: 0 ", r"duration = '0': must be .* > 0 \[s\]"),
     "not definite": (
         STAR, "inertia: {xx: 1, yy: 1, zz: -1}", r"star\.inertia = \[-1\.0, .*: .* must be > 0"
@@ -75,9 +68,29 @@ REFUSED = {
     "zero direction": (V, "v: [[1, 0, 0], [0, 0, 0], [0, 0, 1]]", r"base\.v = .*may be zero"),
     "zero radius": ("radius: 0.35 ", "radius: 0 ", r"base\.radius = '0': must be .* > 0 \[m\]"),
     "two links": (LINK, f"{LINK}\n{LINK}", r"intermediate_links = .*: must be a list of 1 or 3"),
-    "no links": (LINK, "  []", r"intermediate_links = .*: must be a list of 1 or 3 mappings"),
     "link is text": (LINK, "  - steel", r"intermediate_links\[0\] = 'steel': must be a mapping"),
     "links are text": (LINKS + LINK, "intermediate_links: steel", r"= 'steel': must be a list"),
+    "centre of nothing": (
+        "radius: 0.4 ", "radius: 0.4\n  centre: [0, 0, 0.1] #", r"star\.centre = .*: needs mass"
+    ),
+    "centre outside": (
+        "radius: 0.4 ", "radius: 0.4\n  mass: 1\n  centre: [0, 0, 0.5] #",
+        r"star\.centre = .*: must lie within 0\.4 m of O",
+    ),
+    "centre against the inertia": (
+        "radius: 0.4 ", "radius: 0.4\n  mass: 3\n  centre: [0.3, 0, 0.25] #",
+        r"star\.centre = .*: must fit the inertia about O",
+    ),
+    "centre without an inertia": (
+        LINK, "  - {mass: 0.1, centre: [0.1, 0, 0]}",
+        r"intermediate_links\[0\]\.centre = .*: must fit the inertia about O",
+    ),
+    "one inertia too large": (
+        STAR, "inertia: {xx: 0.39, yy: 0.39, zz: 2.6e10}", "no principal moment may exceed"
+    ),
+    "inertia of another unit": (
+        STAR, "inertia: {xx: 3e9, yy: 3e9, zz: 2e9}", r"xx = .*must not exceed 1e"
+    ),
     "unknown choice": (
         "duration: 1 ", "stroke: {at_end: bounce}\nduration: 1 ",
         r"stroke\.at_end = 'bounce': must be one of stop, ignore",
@@ -134,47 +147,22 @@ def test_refused(old, new, message):
     assert any(abs(problem.line - near) <= 2 for problem in caught.value.problems)
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("", "origin: document = None: must be a mapping"),
-        ("# nothing\n", "origin: document = None: must be a mapping"),
-        ("- 1\n- 2\n", r"origin: line 1: document = \['1', '2'\]: must be a mapping"),
-        ("scene", "origin: line 1: document = 'scene': must be a mapping"),
-        ("a: 1\n---\nb: 2\n", "but found another document.*must be YAML"),
-        ("name: \x00", "must be YAML"),
-        ("[" * 100_000, "no more than 20 levels are allowed"),
-        ("a: " + "{b: " * 100_000, "no more than 20 levels are allowed"),
-    ],
-    ids=[
-        "empty",
-        "comment",
-        "list",
-        "word",
-        "two documents",
-        "control character",
-        "deep list",
-        "deep mapping",
-    ],
-)
+NO_MAPPING = {
+    "empty": ("", "origin: document = None: must be a mapping"),
+    "comment": ("# nothing\n", "origin: document = None: must be a mapping"),
+    "list": ("- 1\n- 2\n", r"origin: line 1: document = \['1', '2'\]: must be a mapping"),
+    "word": ("scene", "origin: line 1: document = 'scene': must be a mapping"),
+    "two documents": ("a: 1\n---\nb: 2\n", "but found another document.*must be YAML"),
+    "control character": ("name: \x00", "must be YAML"),
+    "deep list": ("[" * 100_000, "no more than 20 levels are allowed"),
+    "deep mapping": ("a: " + "{b: " * 100_000, "no more than 20 levels are allowed"),
+}
+
+
+@pytest.mark.parametrize(("source", "message"), NO_MAPPING.values(), ids=NO_MAPPING)
 def test_documents_that_are_no_mapping_are_refused(source, message):
     with pytest.raises(InputError, match=message):
         read(Scene, source, "origin")
-
-
-def test_all_faults_are_told_at_once_in_order_of_their_lines():
-    source = SOURCE.replace("duration: 1 ", "duration: -1 ").replace("radius: 0.35", "radius: no")
-    source = source.replace(ALPHA, "alpha_deg: [1, 2, 3]") + "colour: red\n"
-    with pytest.raises(InputError) as caught:
-        read(Scene, source, "origin")
-    problems = caught.value.problems
-    keys = [problem.key for problem in problems]
-    assert keys == ["base.radius", "star.alpha_deg", "duration", "colour"]
-    assert [problem.line for problem in problems] == [
-        number
-        for number, line in enumerate(source.splitlines(), start=1)
-        if re.match(r"\s*(radius: no|alpha_deg: \[1|duration: -|colour)", line)
-    ]
 
 
 BODIES = SOURCE[: SOURCE.index("provenance:")]
@@ -302,36 +290,7 @@ def test_a_section_is_refused(section, message):
     assert len(BODIES.splitlines()) < problem.line <= len(lines)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("radius: 0.4 ", "radius: 0.4\n  centre: [0, 0, 0.1] #", r"star\.centre = .*: needs mass"),
-        (
-            "radius: 0.4 ",
-            "radius: 0.4\n  mass: 1\n  centre: [0, 0, 0.5] #",
-            r"star\.centre = .*: must lie within 0\.4 m of O",
-        ),
-        (
-            "radius: 0.4 ",
-            "radius: 0.4\n  mass: 3\n  centre: [0.3, 0, 0.25] #",
-            r"star\.centre = .*: must fit the inertia about O",
-        ),
-        (
-            "  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}",
-            "  - {mass: 0.1, centre: [0.1, 0, 0]}",
-            r"intermediate_links\[0\]\.centre = .*: must fit the inertia about O",
-        ),
-        ("yy: 0.39, zz: 0.26", "yy: 0.39, zz: 2.6e10", "no principal moment may exceed"),
-        ("xx: 0.39, yy: 0.39, zz: 0.26", "xx: 3e9, yy: 3e9, zz: 2e9", r"xx = .*must not exceed 1e"),
-    ],
-)
-def test_bodies_that_contradict_themselves_are_refused(old, new, message):
-    assert SOURCE.count(old) == 1
-    with pytest.raises(InputError, match=message):
-        read(Scene, SOURCE.replace(old, new), "origin")
-
-
-def test_a_fault_in_one_place_hides_none_in_another():
+def test_a_fault_in_one_place_hides_none_in_another_and_lines_rise():
     source = BODIES.replace("radius: 0.35 ", "radius: wide ").replace("duration: 1 ", "time: 1 ")
     source = source.replace("[120, 120, 120]", "[120, 120, 119]")
     source += "gravity: {acceleration: [0, 0, -9.8]}\nstroke: {at_end: no, restitution: 2}\n"
@@ -339,16 +298,18 @@ def test_a_fault_in_one_place_hides_none_in_another():
     source += "provenance: {durations: printed}\n"
     with pytest.raises(InputError) as caught:
         read(Scene, source, "origin")
-    keys = [problem.key for problem in caught.value.problems]
-    assert keys == [
-        "base.radius",
-        "star.alpha_deg",
-        "time",
-        "stroke.at_end",
-        "stroke.restitution",
-        "springs[1].stiffness",
-        "springs[1].rest",
-    ]
+    told = {
+        "base.radius": "radius: wide",
+        "star.alpha_deg": "alpha_deg",
+        "time": "time: 1",
+        "stroke.at_end": "stroke:",
+        "stroke.restitution": "stroke:",
+        "springs[1].stiffness": "springs:",
+        "springs[1].rest": "springs:",
+    }
+    assert [problem.key for problem in caught.value.problems] == list(told)
+    lines = source.splitlines()
+    assert all(told[fault.key] in lines[fault.line - 1] for fault in caught.value.problems)
 
 
 def test_what_contradicts_itself_across_sections_is_checked_once_each_of_them_is_valid():
@@ -361,34 +322,6 @@ def test_what_contradicts_itself_across_sections_is_checked_once_each_of_them_is
     assert keys == [f"intermediate_links[{k}].centre" for k in range(3)]
 
 
-def massless(*which):
-    source = SOURCE
-    if "actuated" in which:
-        source = re.sub(r"  - inertia: .*xz: .*", "  - {}", source)
-    if "intermediate" in which:
-        source = source.replace("  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}", "  - {}")
-    return read(Scene, source, "origin")
-
-
-def test_links_without_inertia_are_legal_and_cost_nothing():
-    counts = [
-        sum(Dynamics.of(scene).program.operations.values())
-        for scene in (
-            load("example2_heavy"),
-            massless("actuated"),
-            massless("intermediate"),
-            massless("actuated", "intermediate"),
-        )
-    ]
-    assert counts[0] == counts[1] > counts[2] > counts[3]
-    for scene in (massless("actuated"), massless("actuated", "intermediate")):
-        slope = Dynamics.of(scene).derivative(0.1, 0.2, 0.3, 0.9, 1.0, -1.0, 0.5, 1.0, 2.0, 3.0)
-        assert np.all(np.isfinite(slope))
-
-
-START = "gamma: [0.7853981633974483, 0.7853981633974483, 0.7853981633974483]"
-
-
 @pytest.mark.parametrize(
     ("gamma", "message"),
     [
@@ -399,8 +332,8 @@ START = "gamma: [0.7853981633974483, 0.7853981633974483, 0.7853981633974483]"
 )
 def test_a_scene_that_cannot_start_is_told_with_key_and_line(tmp_path, gamma, message):
     path = tmp_path / "start.yaml"
-    path.write_text(SOURCE.replace(START, f"gamma: {gamma}"), encoding="utf-8")
-    line = 1 + SOURCE.splitlines().index(next(x for x in SOURCE.splitlines() if START in x))
+    path.write_text(SOURCE.replace(GAMMA, f"gamma: {gamma}"), encoding="utf-8")
+    line = 1 + SOURCE.splitlines().index(next(x for x in SOURCE.splitlines() if GAMMA in x))
     with pytest.raises(
         InputError, match=rf"start\.yaml: line {line}: initial\.gamma = .*{message}"
     ):
