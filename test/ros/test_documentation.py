@@ -20,11 +20,7 @@ pytestmark = pytest.mark.ros
 CONFIG = Path(__file__).parents[2] / "config"
 IDS = [node.command for node in NODES]
 RIGHTS = ("publish", "subscribe", "reply", "request")
-WITHOUT_REASON = {
-    "/clock",
-    "/sst_simulator/external_moment",
-    "/sst_simulator/commands_stamped",
-}
+WITHOUT_REASON = {"/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"}
 """Topics that exist under conditions only: a parameter, or the scene."""
 PUBLISHED = {
     endpoint.at(f"/{node.name}"): endpoint.kind
@@ -45,45 +41,43 @@ def test_the_policies_are_those_of_the_declarations(node):
 def test_the_policies_have_the_form_of_sros2(node):
     """As in sros2's policy.xsd, version 0.2.0."""
     root = ET.fromstring(policy(node).encode())
-    assert (root.tag, root.attrib) == ("policy", {"version": "0.2.0"})
-    (enclaves,) = root
-    (enclave,) = enclaves
-    assert (enclaves.tag, enclave.tag) == ("enclaves", "enclave")
-    assert enclave.attrib["path"].startswith("/")
-    (profiles,) = enclave
-    (profile,) = profiles
-    assert (profiles.tag, profile.tag) == ("profiles", "profile")
-    assert profile.attrib == {"ns": "/", "node": node.name}
+    assert root.attrib == {"version": "0.2.0"}
+    path, groups = [root], list(root)
+    while groups[0].tag in ("enclaves", "enclave", "profiles", "profile"):
+        (only,) = groups
+        path, groups = [*path, only], list(only)
+    assert [one.tag for one in path] == ["policy", "enclaves", "enclave", "profiles", "profile"]
+    assert path[2].attrib["path"].startswith("/")
+    assert path[4].attrib == {"ns": "/", "node": node.name}
     rights = {"topics": {"publish", "subscribe"}, "services": {"reply", "request"}}
     rights["actions"] = {"execute"}
-    for group in profile:
-        assert set(group.attrib) <= rights[group.tag]
-        assert set(group.attrib.values()) == {"ALLOW"}
+    for group in groups:
+        assert set(group.attrib) <= rights[group.tag] and set(group.attrib.values()) == {"ALLOW"}
         assert len(group) and {entry.tag for entry in group} == {group.tag[:-1]}
         assert all(entry.text.startswith("/") and not entry.attrib for entry in group)
 
 
 def allowed(node):
-    result = {right: set() for right in RIGHTS}
-    for group in ET.fromstring(policy(node).encode()).iter():
-        for right in RIGHTS:
-            if group.get(right) == "ALLOW":
-                result[right].update(entry.text for entry in group)
-    return result
+    return {
+        right: {
+            entry.text
+            for group in ET.fromstring(policy(node).encode()).iter()
+            if group.get(right) == "ALLOW"
+            for entry in group
+        }
+        for right in RIGHTS
+    }
 
 
-def used(observer, name):
-    graph = observer.node
+def used(graph, name):
     listed = (
         graph.get_publisher_names_and_types_by_node,
         graph.get_subscriber_names_and_types_by_node,
         graph.get_service_names_and_types_by_node,
         graph.get_client_names_and_types_by_node,
     )
-    return {
-        right: {topic for topic, _ in found(name, "/")}
-        for right, found in zip(RIGHTS, listed, strict=True)
-    }
+    pairs = zip(RIGHTS, listed, strict=True)
+    return {right: {topic for topic, _ in found(name, "/")} for right, found in pairs}
 
 
 @pytest.mark.slow
@@ -110,11 +104,10 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, 
         def all_there(name=node.name, needed=needed):
             if name not in observer.node.get_node_names():
                 return False
-            real = used(observer, name)
-            return all(needed[right] <= real[right] for right in RIGHTS)
+            return all(needed[right] <= real for right, real in used(observer.node, name).items())
 
         observer.until(all_there, f"all of {node.name}")
-        for right, names in used(observer, node.name).items():
+        for right, names in used(observer.node, node.name).items():
             assert names <= expected[right], (node.name, right)
 
 

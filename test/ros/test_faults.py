@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile
 from ros.conftest import COMMANDS, NAMES, NODE, STAMPED, children, is_running, named, torques
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import Scene, load_scene
@@ -28,41 +28,23 @@ ZERO = (0.0, 0.0, 0.0)
 GOOD = (0.1, 0.2, 0.3)
 
 
-@pytest.fixture
-def variant(tmp_path):
-    """Write a scene with sections of another kind; give its path."""
-
-    def write(**sections):
-        path = tmp_path / "variant.yaml"
-        path.write_text(dump(load_scene("example2")) + "".join(sections.values()))
-        return path
-
-    return write
+PLAIN = [[1.0, 2.0], [1.0] * 4, [], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]]
+NAMED = [
+    named([math.nan, 0.0, 0.0]),
+    named([0.0, -math.inf, 0.0]),
+    named([0.0, 0.0]),
+    named([0.0] * 3, names=[*NAMES[:2], "elbow"]),
+    named([0.0] * 2, names=NAMES[:2]),
+]
 
 
 @pytest.mark.parametrize(
     ("good", "bad", "because", "said"),
     [
-        (
-            torques(*GOOD),
-            [torques(*data) for data in (
-                [1.0, 2.0], [1.0] * 4, [], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]
-            )],
-            "wrong size 3, not finite 2",
-            "must be 3 finite torques",
-        ),
-        (
-            named(GOOD[::-1], names=NAMES[::-1]),
-            [
-                named([math.nan, 0.0, 0.0]),
-                named([0.0, -math.inf, 0.0]),
-                named([0.0, 0.0]),
-                named([0.0] * 3, names=[*NAMES[:2], "elbow"]),
-                named([0.0] * 2, names=NAMES[:2]),
-            ],
-            "not finite 2, wrong size 1, wrong names 2",
-            "must be gamma_1, gamma_2, gamma_3, each once",
-        ),
+        (torques(*GOOD), [torques(*data) for data in PLAIN], "wrong size 3, not finite 2",
+         "must be 3 finite torques"),
+        (named(GOOD[::-1], names=NAMES[::-1]), NAMED, "not finite 2, wrong size 1, wrong names 2",
+         "must be gamma_1, gamma_2, gamma_3, each once"),
     ],
     ids=["plain", "stamped"],
 )  # fmt: skip
@@ -115,19 +97,16 @@ def test_no_command_is_said_and_a_stale_one_let_go_of(nodes, observer):
     assert "no command within command_timeout" in err
 
 
-def test_beyond_the_limit_of_the_scene_is_clamped_and_told(nodes, observer, variant):
-    limited = variant(actuators="actuators: {torque_limit: 0.5}\n")
-    nodes.run("simulator", scene=limited, command_timeout=0.0)
-    observer.preview()
+def test_limit_and_external_moment_are_those_of_the_scene(nodes, observer, tmp_path):
+    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
+    more = "actuators: {torque_limit: 0.5}\nmoment: {topic: true}\n"
+    (path := tmp_path / "variant.yaml").write_text(dump(load_scene("example2")) + more)
+    nodes.run("simulator", scene=path, command_timeout=0.0)
     observer.command(7.0, -7.0, 0.1)
     observer.until(lambda: (0.5, -0.5, 0.1) in observer.torques(), "the clamped command")
     said = observer.told("commands_clamped", 1)
     assert said["level"] == b"\x01" and "clamped to the scene's torque limit" in said["said"]
 
-
-def test_an_external_moment_where_the_scene_takes_one(nodes, observer, variant):
-    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", scene=variant(moment="moment: {topic: true}\n"), command_timeout=0.0)
     moments = observer.publisher(WrenchStamped, f"{NODE}/external_moment")
     message = WrenchStamped()
     message.wrench.torque.z = 0.25
@@ -221,22 +200,36 @@ def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer
     assert '<link name="base_link">' in drawn[0].data
 
 
-def test_the_player_ends_by_the_simulators_fault(nodes, profile):
-    nodes.run("simulator")
+def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(nodes, observer, profile):
+    process = nodes.run("simulator", scene="example2_heavy", wait_for_command=True)
+    observer.preview()
     player = nodes.run("torque_player", csv=profile("0,50,0,0", "60,0,0,0"))
     status, _, err = nodes.ended(player)
     assert status == 1 and "the simulator stopped: fault: stopped at" in err
+    said = observer.told("phase", "fault")
+    assert said["level"] == b"\x02" and "gamma_1 > 1.570796 rad" in said["fault"]
+    assert not observer.pause(False).success
+    observer.until(observer.samples, "samples")
+    observer.until(lambda: observer.stamp(observer.states[-1]) == 0, "the held state")
+    held, sample = observer.states[-1], observer.samples()[-1]
+    assert list(held.position) == list(sample.position)
+    assert any(sample.velocity) and not any(held.velocity) and not any(held.effort)
+    assert observer.call(Trigger, f"{NODE}/reset").success
+    observer.told("phase", "waiting")
+    assert observer.said("fault")[-1] == ""
+    _, _, err = nodes.stop(process)
+    assert "held until ~/reset" in err and "gamma_1 > 1.570796 rad" in err
 
 
 @pytest.mark.parametrize("command", ["simulator", "recorder", "torque_player"])
 def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
-    given = {"recorder": {"output": tmp_path / "bag"}}.get(command, {})
-    process = nodes.run(command, **given)
+    is_recorder = command == "recorder"
+    process = nodes.run(command, **({"output": tmp_path / "bag"} if is_recorder else {}))
     observer.until(lambda: f"sst_{command}" in observer.node.get_node_names(), "the node")
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGINT)
     status, _, err = nodes.stop(process, signal.SIGTERM)
-    assert status == (1 if command == "recorder" else 0), err  # its bag is empty
+    assert status == is_recorder, err  # its bag is empty
 
 
 def _memory(pid):

@@ -2,6 +2,7 @@
 """The controller against the simulator, in lockstep and running free, and against bad input."""
 
 import dataclasses
+import re
 import signal
 
 import numpy as np
@@ -14,24 +15,29 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros import demo
+from sst_ros.control.controller import Measurement
 from sst_ros.control.reference_motions import reference_motion
+from sst_ros.errors import SstError
 from sst_ros.recording import recording
 from sst_ros.report import tracking
+from sst_ros.runtime.settings import ControllerNodeParameters
+from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.loads import DesiredMotion, Spiral, ToAngles
 from sst_ros.scene.scene import Actuators, Stroke, Workspace
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_inverse_dynamics"
-HOME = scene.load("example2").initial.gamma
+PLANT = scene.load("example2_heavy")
+HOME = PLANT.initial.gamma
 MOVE = DesiredMotion(spiral=Spiral(phi=0.25, theta=3.0, psi=0.4, duration=0.3))
 
 
-def written(folder, name="example2_heavy", **changed):
-    """A scene with another motion, as a file."""
+def written(folder, **changed):
+    """The scene of the plant with another motion, as a file."""
     changed = {"motion": MOVE, "torque": None, "provenance": (), **changed}
     path = folder / "scene.yaml"
-    path.write_text(yaml_document.dump(dataclasses.replace(scene.load(name), **changed)))
+    path.write_text(yaml_document.dump(dataclasses.replace(PLANT, **changed)))
     return path
 
 
@@ -108,25 +114,6 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
-def deaf(tmp_path_factory, nodes_of_module, observer_of_module):
-    """A controller that waits for trajectories, and all that it has published."""
-    nodes, observer = nodes_of_module, observer_of_module
-    path = written(tmp_path_factory.mktemp("deaf"), actuators=Actuators(torque_limit=8.0))
-    commands = observer.listen(Float64MultiArray, COMMANDS)
-    # Its states come with the cases, which take long on a busy machine.
-    controller = nodes.run("inverse_dynamics", scene=path, motion="topic", timeout=1000.0)
-    states = observer.publisher(JointState, "/joint_states")
-    publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
-    refusals, reason = 0, ""
-    while "points" not in reason:  # until a state has come, that is the reason of the refusal
-        refusals += 1
-        states.publish(idle())
-        publisher.publish(trajectory())
-        reason = observer.told("trajectories_refused", refusals)["last_refusal"]
-    return observer, controller, states, publisher, commands
-
-
 def idle(stamp_ns=0):
     message = JointState(name=NAMES, position=list(HOME), velocity=[0.0] * 3)
     message.header.stamp.nanosec = stamp_ns
@@ -134,17 +121,27 @@ def idle(stamp_ns=0):
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_trajectory_is_refused_before_any_torque(deaf, case):
-    observer, controller, states, publisher, commands = deaf
+def test_a_bad_trajectory_is_refused_and_changes_nothing(case):
     message, reason = BAD[case]
-    before = int(observer.told("trajectories_refused", lambda _: True)["trajectories_refused"])
-    states.publish(idle())
-    publisher.publish(message)
-    said = observer.told("trajectories_refused", before + 1)
-    assert reason in said["last_refusal"], said
-    assert said["stage"] == "waiting for a trajectory"
-    states.publish(idle())
-    observer.told("samples", 0)
+    model = dataclasses.replace(PLANT, motion=None, actuators=Actuators(torque_limit=8.0))
+    follower = TrajectoryFollower(model, ControllerNodeParameters(motion="topic"))
+    with pytest.raises(SstError, match=re.escape(reason)):
+        follower.take(message, Measurement(HOME, (0.0, 0.0, 0.0)))
+    assert follower.stage is Stage.WAITING
+
+
+def test_a_refusal_is_told_before_any_torque(nodes, observer, tmp_path):
+    commands = observer.listen(Float64MultiArray, COMMANDS)
+    controller = nodes.run("inverse_dynamics", scene=written(tmp_path), motion="topic", timeout=1e3)
+    states = observer.publisher(JointState, "/joint_states")
+    publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
+    for refused, reason in enumerate(("must come first", "points"), start=1):
+        publisher.publish(trajectory())
+        said = observer.told("trajectories_refused", refused)
+        assert reason in said["last_refusal"] and said["samples"] == "0"
+        observer.publish_until(
+            states, idle(), lambda: observer.said("stage")[-1].startswith("waiting for a"), "state"
+        )
     assert commands == [] and controller.poll() is None
 
 
@@ -153,8 +150,8 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     reference = observer.listen(JointState, f"{NODE}/reference")
     # A check of a trajectory takes long on a busy machine.
     nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
-    given = {"mode": "computed_torque", "feedforward_at": "middle", "stamped": True}
-    controller = nodes.run("inverse_dynamics", scene=path, motion="topic", **given)
+    given = {"mode": "computed_torque", "stamped": True, "motion": "topic"}
+    controller = nodes.run("inverse_dynamics", scene=path, feedforward_at="middle", **given)
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     first, second = trajectory((2.0, AWAY[::-1])), trajectory((0.2, HOME))
     first.joint_names = NAMES[::-1]
@@ -245,16 +242,6 @@ def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
     assert say("waiting", 22_000_000) == list(motion.at(0.02).gamma)
     assert say("running", 42_000_000) == list(motion.at(0.04).gamma)
     assert say("waiting", 62_000_000) != list(motion.at(0.06).gamma)
-
-
-def test_it_refuses_to_begin_where_the_manipulator_is_not(nodes, observer, tmp_path):
-    commands = observer.listen(Float64MultiArray, COMMANDS)
-    controller = nodes.run("inverse_dynamics", scene=written(tmp_path))
-    states, elsewhere = observer.publisher(JointState, "/joint_states"), idle()
-    elsewhere.position[1] += 0.06
-    observer.publish_until(states, elsewhere, lambda: controller.poll() is not None, "the end")
-    status, _, err = nodes.ended(controller)
-    assert (status, commands) == (1, []) and "where the motion begins" in err
 
 
 def test_what_is_not_finite_ends_it_with_zero_torque(nodes, observer, tmp_path):

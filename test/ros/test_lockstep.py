@@ -17,7 +17,6 @@ from sst_ros.recording import recording
 from sst_ros.state import Joints
 
 pytestmark = pytest.mark.ros
-JOINTS = Joints._fields
 AT_ONCE = {"sync": "lockstep", "real_time_factor": 0.0}
 PERIOD_NS = 2_000_000
 EXAMPLE = Path(__file__).parents[2] / "examples" / "controller.py"
@@ -30,15 +29,10 @@ def pd_torque(gamma, gamma_dot):
 
 
 @pytest.fixture
-def load():
+def load(nodes):
     """A function that keeps all processors busy until the end of the test."""
-    busy = []
-    yield lambda: busy.extend(
-        subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)
-    )
-    for process in busy:
-        process.kill()
-        process.wait()
+    busy = [sys.executable, "-c", "while True: pass"]
+    return lambda: [nodes.start("", executable=busy) for _ in range(3)]
 
 
 @pytest.fixture
@@ -91,10 +85,9 @@ def test_simulate_simulation_and_the_bag_of_nodes_have_the_same_bits(closed_loop
     assert np.array_equal(recorded.ticks.torque, bag.torque[1:])
     assert np.array_equal(recorded.ticks.end_ns, recorded.time_ns[1:])
     single = {
-        **{name: [getattr(state.joints, name) for state in states] for name in JOINTS},
+        **{name: [getattr(state.joints, name) for state in states] for name in Joints._fields},
+        **{name: [getattr(state, name) for state in states] for name in ("quaternion", "torque")},
         "t": [state.time_ns / 1e9 for state in states],
-        "quaternion": [state.quaternion for state in states],
-        "torque": [state.torque for state in states],
     }
     for name, values in single.items():
         assert np.array_equal(getattr(whole, name), values), name
@@ -128,13 +121,9 @@ def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
     controller = subprocess.Popen([sys.executable, str(EXAMPLE)])
     try:
         nodes.run("simulator", scene="example2", sync=sync, wait_for_command=True)
+        at_goal = pytest.approx(GOAL, abs=0.02)
         observer.until(
-            lambda: (
-                observer.states
-                and observer.states[-1].position[:3] == pytest.approx(GOAL, abs=0.02)
-            ),
-            "angles at the goal",
-            90.0,
+            lambda: observer.states and observer.states[-1].position[:3] == at_goal, "goal", 90.0
         )
     finally:
         controller.terminate()

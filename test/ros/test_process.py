@@ -3,36 +3,27 @@
 
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
 import rclpy
+from programs import python
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from ros.conftest import torques
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 
 from sst_ros.errors import SstError
 from sst_ros.nodes import process, signals, topics
 
 NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-
-LISTEN = """
-import rclpy
-from std_msgs.msg import String
-rclpy.init()
-node = rclpy.create_node("listener")
-node.create_subscription(String, "said", lambda message: None, 1000)
-print("listening", flush=True)
-rclpy.spin(node)
-"""
+MS = 1_000_000
 
 SPEAKER = """
 import time
+from pathlib import Path
 import rclpy
 from rclpy.duration import Duration
 from std_msgs.msg import String
@@ -41,7 +32,7 @@ process.configure_middleware()
 rclpy.init()
 node = rclpy.create_node("speaker")
 publisher = node.create_publisher(String, "said", 1000)
-end = time.monotonic() + 30.0
+end = time.monotonic() + 60.0
 while publisher.get_subscription_count() == 0 and time.monotonic() < end:
     time.sleep(0.01)
 """
@@ -52,25 +43,7 @@ for _ in range(4):
     print(publisher.wait_for_all_acked(Duration(seconds=2.5)), flush=True)
 """
 
-
-QUIET = """
-import gc, time
-import rclpy
-from sensor_msgs.msg import JointState
-from sst_ros.nodes.simulator import Simulator
-rclpy.init(args=["simulator", "--ros-args", "-p", "scene:=swing", "-p", "compiled:=true"])
-simulator, samples = Simulator(), []
-node = rclpy.create_node("observer")
-node.create_subscription(JointState, "joint_states", samples.append, 10)
-end = time.monotonic() + 30.0
-while not any(sample.header.frame_id == "" for sample in samples) and time.monotonic() < end:
-    rclpy.spin_once(node, timeout_sec=0.1)
-print(gc.isenabled(), len(gc.get_objects()))
-simulator.close()
-"""
-
 BURST = """
-from pathlib import Path
 tasks = [task for task in Path("/proc/self/task").iterdir()
          if (task / "comm").read_text().startswith("dds.ev")]
 def wakes():
@@ -84,6 +57,46 @@ for _ in range(500):
 print(wakes() - before)
 """
 
+QUIET = """
+import gc, time
+import rclpy
+from sensor_msgs.msg import JointState
+from sst_ros.nodes.simulator import Simulator
+rclpy.init(args=["simulator", "--ros-args", "-p", "scene:=swing", "-p", "compiled:=true"])
+simulator, samples = Simulator(), []
+node = rclpy.create_node("observer")
+node.create_subscription(JointState, "joint_states", samples.append, 10)
+end = time.monotonic() + 60.0
+while not any(sample.header.frame_id == "" for sample in samples) and time.monotonic() < end:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(gc.isenabled(), len(gc.get_objects()))
+simulator.close()
+"""
+
+HANGS = """
+import ctypes, threading
+import rclpy
+from rclpy.node import Node
+from sst_ros.nodes import process
+
+class Hangs(Node):
+    def destroy_node(self):
+        # As in a deadlock of Fast DDS rclpy holds the interpreter's lock: PyDLL does, too.
+        ctypes.PyDLL(None).sleep(60)
+
+class Worker:
+    def __init__(self):
+        self.node, self.done = Hangs("worker"), threading.Event()
+        self.done.set()
+
+    def close(self):
+        print("closed", flush=True)
+
+process._CLEAN_UP_S = 1.0
+rclpy.init()
+process.spin(Worker())
+"""
+
 
 @pytest.fixture
 def no_profile(monkeypatch):
@@ -92,37 +105,29 @@ def no_profile(monkeypatch):
 
 
 @pytest.fixture
-def context(domain):
-    own = rclpy.Context()
-    rclpy.init(context=own, domain_id=domain)
-    yield own
-    rclpy.try_shutdown(context=own)
+def node(domain):
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    yield rclpy.create_node("reader", context=context)
+    rclpy.try_shutdown(context=context)
 
 
-def run(text, status=0):
-    """Run a text in a process of its own."""
-    argv = [sys.executable, "-c", text]
-    ended = subprocess.run(argv, capture_output=True, text=True, timeout=100, check=False)
-    assert ended.returncode == status, ended.stderr
-    return ended
+@pytest.fixture
+def listener(node, no_profile):
+    """The reader of a speaker: the middleware answers without an executor."""
+    return node.create_subscription(String, "said", lambda _: None, 1000)
 
 
-def speak(words):
-    """Run a speaker beside a listener, each in a process of its own."""
-    argv = [sys.executable, "-c", LISTEN]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as listener:
-        try:
-            assert listener.stdout.readline() == "listening\n"
-            return run(SPEAKER + words)
-        finally:
-            listener.kill()
-
-
-def test_readers_are_asked_often_what_has_arrived(domain, no_profile):
-    """By default they are asked every 3 s: 2.5 s of waiting would pass in vain."""
-    spoken = speak(SPEAK)
+def test_readers_are_asked_often_what_has_arrived(listener):
+    """By default they are asked every 3 s: the 2.5 s of waiting would pass in vain."""
+    spoken = python(SPEAKER + SPEAK)
     assert spoken.stdout.split() == ["True"] * 4
     assert spoken.stderr == ""
+
+
+def test_a_publication_does_not_wake_the_thread_for_events(listener):
+    """By default each of them does: more than 500 times here."""
+    assert int(python(SPEAKER + BURST).stdout) < 250
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -142,36 +147,22 @@ def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch
     assert Path(given[1]).is_file()
 
 
-def test_a_publication_does_not_wake_the_thread_for_events(domain, no_profile):
-    """By default each of them does: more than 500 times here."""
-    spoken = speak(BURST)
-    assert int(spoken.stdout) < 250
-
-
 def test_garbage_of_the_start_is_not_looked_through_again(domain):
-    enabled, objects = run(QUIET).stdout.split()[:2]
+    enabled, objects = python(QUIET).stdout.split()[:2]
     assert enabled == "False"
     assert int(objects) < 3000  # before: 12,000, with numba 63,000
-
-
-MS = 1_000_000
-
-
-@pytest.fixture
-def node(context):
-    return rclpy.create_node("reader", context=context)
 
 
 @pytest.fixture
 def looks(monkeypatch):
     made, original = [], topics.take
-
-    def take(subscription):
-        made.append(subscription)
-        return original(subscription)
-
-    monkeypatch.setattr(topics, "take", take)
+    monkeypatch.setattr(topics, "take", lambda reader: made.append(reader) or original(reader))
     return made
+
+
+@pytest.fixture
+def reader(node):
+    return topics.Reader(node, topics.SIMULATOR["commands"])
 
 
 def publish(node, *torque):
@@ -186,15 +177,13 @@ def publish(node, *torque):
     return publisher
 
 
-def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(node, looks):
-    reader = topics.Reader(node, topics.SIMULATOR["commands"])
+def test_a_topic_without_a_publisher_is_looked_at_every_20_ms(reader, looks):
     for tick in range(100):
         assert not reader.read(tick * MS)
     assert len(looks) == 5
 
 
-def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks):
-    reader = topics.Reader(node, topics.SIMULATOR["commands"])
+def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, reader, looks):
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
     assert not reader.read(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
@@ -210,9 +199,8 @@ def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, looks)
     assert len(reader.read(at + 32 * MS)) == 1
 
 
-def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node):
+def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node, reader):
     """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
-    reader = topics.Reader(node, topics.SIMULATOR["commands"])
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     assert not reader.read(time.monotonic_ns())
@@ -245,56 +233,26 @@ def stop(monkeypatch):
     return request
 
 
-def test_a_signal_ends_a_node_while_a_callback_waits_for_it(context, stop):
-    worker = Worker(context, lambda own: own.closed.wait(60.0))
-
-    def signal():
-        worker.entered.wait(60.0)
-        stop.set()
-
-    threading.Thread(target=signal).start()
+def test_a_signal_ends_a_node_while_a_callback_waits_for_it(node, stop):
+    worker = Worker(node.context, lambda own: own.closed.wait(60.0))
+    threading.Thread(target=lambda: worker.entered.wait(60.0) and stop.set()).start()
     began = time.monotonic()
     process.spin(worker)
     assert worker.closed.is_set() and time.monotonic() - began < 30.0  # it would wait for 60 s
 
 
-def test_the_failure_of_a_callback_is_that_of_the_process(context, stop):
+def test_the_failure_of_a_callback_is_that_of_the_process(node, stop):
     def fail(own):
         raise SstError("the disk is full")
 
-    worker = Worker(context, fail)
+    worker = Worker(node.context, fail)
     with pytest.raises(SstError, match="the disk is full"):
         process.spin(worker)
     assert worker.closed.is_set()
 
 
-HANGS = """
-import ctypes, threading
-import rclpy
-from rclpy.node import Node
-from sst_ros.nodes import process
-
-class Hangs(Node):
-    def destroy_node(self):
-        # As in a deadlock of Fast DDS rclpy holds the interpreter's lock: PyDLL does, too.
-        ctypes.PyDLL(None).sleep(60)
-
-class Worker:
-    def __init__(self):
-        self.node, self.done = Hangs("worker"), threading.Event()
-        self.done.set()
-
-    def close(self):
-        print("closed", flush=True)
-
-process._CLEAN_UP_S = 1.0
-rclpy.init()
-process.spin(Worker())
-"""
-
-
 def test_a_node_ends_though_its_middleware_hangs(domain):
     began = time.monotonic()
-    ended = run(HANGS, status=1)
+    ended = python(HANGS, status=1)
     assert time.monotonic() - began < 50.0  # it would wait for 60 s
     assert ended.stdout == "closed\n" and "in destroy_node" in ended.stderr

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples and torques that a simulator publishes; two of them side by side."""
 
-import math
 import signal
 
 import pytest
@@ -12,6 +11,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
+from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import nanoseconds
 
@@ -42,43 +42,37 @@ def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
     assert list(run[-1].velocity) == [*expected.gamma_dot, *expected.mu_dot, *expected.beta_dot]
 
 
-def test_orientation_euler_angles_and_torques_belong_to_the_same_instants(nodes, observer):
+def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
+    """Torques of every tick come every 50 ms and at the end."""
     orientation = observer.listen(QuaternionStamped, f"{NODE}/orientation")
     euler = observer.listen(Vector3Stamped, f"{NODE}/euler_zyz")
     applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", wait_for_command=True, duration=0.05, publish_rate=250)
+    nodes.run("simulator", wait_for_command=True, duration=0.131)
     observer.until(lambda: orientation and euler and applied, "preview of every topic")
     observer.command(1.0, 0.0, 0.0)
-    observer.until(lambda: len(observer.stamps(euler)) == 14, "the 14 samples")
-    observer.until(lambda: sum(len(m.points) for m in applied) == 50, "torques of the 50 ticks")
-
-    stamps = observer.stamps(orientation)
-    assert stamps == observer.stamps(euler)
-    ends = [
-        observer.stamp(message) + nanoseconds(point.time_from_start)
-        for message in applied
-        for point in message.points
-    ]
-    assert ends == [stamps[0] + 1_000_000 * (k + 1) for k in range(50)]
-    q = orientation[-1].quaternion
-    assert orientation[-1].header.frame_id == "base_link"
-    assert math.hypot(q.x, q.y, q.z, q.w) == pytest.approx(1.0, abs=1e-15)
-    e = (2 * (q.x * q.z + q.y * q.w), 2 * (q.y * q.z - q.x * q.w), 1 - 2 * (q.x**2 + q.y**2))
-    angles = euler[-1].vector
-    assert angles.x == pytest.approx(math.atan2(e[1], e[0]), abs=1e-14)
-    assert angles.y == pytest.approx(math.acos(e[2]), abs=1e-14)
-
-
-def test_torques_are_published_every_50_ms_and_at_the_end(nodes, observer):
-    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", wait_for_command=True, duration=0.131)
-    observer.until(lambda: applied, "preview")
-    observer.command(1.0, 0.0, 0.0)
+    stamps = observer.stamps
+    observer.until(lambda: len(stamps(euler)) == len(stamps(orientation)) == 67, "the 67 samples")
     observer.until(lambda: sum(len(m.points) for m in applied) == 131, "torques of the 131 ticks")
+
+    start = stamps(orientation)[0]
+    assert (
+        stamps(orientation)
+        == stamps(euler)
+        == [start + 1_000_000 * min(2 * k, 131) for k in range(67)]
+    )
     messages = [message for message in applied if message.points]
     assert [len(message.points) for message in messages] == [50, 50, 31]
-    begins = observer.stamps(messages)
-    assert begins == [begins[0] + k * 50_000_000 for k in range(3)]
+    assert stamps(messages) == [start + k * 50_000_000 for k in range(3)]
+    ends = [
+        observer.stamp(message) + nanoseconds(point.time_from_start)
+        for message in messages
+        for point in message.points
+    ]
+    assert ends == [start + 1_000_000 * (k + 1) for k in range(131)]
+    q, angles = orientation[-1].quaternion, euler[-1].vector
+    assert orientation[-1].header.frame_id == "base_link"
+    expected = zyz_angles(rotation_matrix((q.x, q.y, q.z, q.w)))
+    assert (angles.x, angles.y, angles.z) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -7,6 +7,7 @@ import math
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from runtime.bench import HandClock
 
 from sst_ros.errors import InputError
 from sst_ros.runtime.pacing import Pacer
@@ -16,14 +17,11 @@ MS = 1_000_000
 CHANGEABLE = SimulatorParameters.CHANGEABLE
 
 
-class Hand:
+class Hand(HandClock):
     """A clock that a sleeper moves on, to the nanosecond."""
 
-    def __init__(self):
-        self.now, self.slept = 5 * MS, []
-
-    def now_ns(self):
-        return self.now
+    def __init__(self, now=5 * MS):
+        self.now, self.slept = now, []
 
     def sleep(self, seconds):
         self.slept.append(seconds)
@@ -36,11 +34,20 @@ def hand():
 
 
 @pytest.fixture
-def pacer(hand):
-    """Deadlines 1 ms apart, from now on."""
-    found = Pacer(MS, 1.0, hand)
-    found.start()
-    return found
+def paced(hand):
+    """A pacer with deadlines 1 ms apart, if not told otherwise, from now on."""
+
+    def begin(period_ns=MS, speed=1.0, tolerance_ns=0):
+        found = Pacer(period_ns, speed, hand, tolerance_ns)
+        found.start()
+        return found
+
+    return begin
+
+
+@pytest.fixture
+def pacer(paced):
+    return paced()
 
 
 def never():
@@ -90,41 +97,30 @@ def test_what_is_excused_is_no_miss_and_costs_only_what_it_is_late(hand, pacer):
         assert (hand.now, pacer.missed) == (before + 2 * MS + late, 0)
 
 
-def test_deadlines_that_have_always_come_need_no_excuse(hand):
-    pacer = Pacer(MS, 0.0, hand)
-    pacer.start()
-    pacer.excuse(2)
-    assert pacer.wait(never, 2)
-    assert hand.slept == []
-
-
 @pytest.mark.parametrize("speed", [0.5, 3.0, 7.0])
-def test_speed_stretches_the_periods_without_drift(hand, speed):
-    pacer = Pacer(MS, speed, hand)
-    pacer.start()
+def test_speed_stretches_the_periods_without_drift(hand, paced, speed):
+    pacer = paced(speed=speed)
     for _ in range(7000):
         pacer.wait(never)
     assert hand.now == 5 * MS + round(7000 * MS / speed)
 
 
-def test_as_fast_as_possible_never_sleeps(hand):
-    pacer = Pacer(MS, 0.0, hand)
-    pacer.start()
-    assert all(pacer.wait(never) for _ in range(100))
+def test_as_fast_as_possible_never_sleeps(hand, paced):
+    pacer = paced(speed=0.0)
+    pacer.excuse(2)
+    assert all(pacer.wait(never, 2) for _ in range(100))
     assert hand.slept == []
     assert not pacer.wait(lambda: True)
 
 
-def test_a_long_wait_can_be_interrupted(hand):
-    pacer = Pacer(10_000 * MS, 1.0, hand)
-    pacer.start()
+def test_a_long_wait_can_be_interrupted(hand, paced):
+    pacer = paced(10_000 * MS)
     assert not pacer.wait(lambda: hand.now > 105 * MS)
     assert hand.now <= 155 * MS
 
 
-def test_a_change_of_speed_makes_no_burst(hand):
-    pacer = Pacer(MS, 0.001, hand)
-    pacer.start()
+def test_a_change_of_speed_makes_no_burst(hand, paced):
+    pacer = paced(speed=0.001)
     hand.now += 999 * MS
     pacer.change(1.0)
     before = hand.now
@@ -132,9 +128,8 @@ def test_a_change_of_speed_makes_no_burst(hand):
     assert hand.now == before + MS and pacer.missed == 0
 
 
-def test_a_coarse_clock_is_run_through_and_a_leap_dropped(hand):
-    pacer = Pacer(MS, 1.0, hand, tolerance_ns=200 * MS)
-    pacer.start()
+def test_a_coarse_clock_is_run_through_and_a_leap_dropped(hand, paced):
+    pacer = paced(tolerance_ns=200 * MS)
     hand.now += 10 * MS
     for _ in range(10):
         pacer.wait(never)
@@ -171,8 +166,7 @@ def test_what_is_accepted_is_in_bounds(name, value):
 
 @given(st.floats(1e-3, 1000.0), st.sampled_from([1, 1000, 100_000]))
 def test_every_real_time_factor_has_deadlines(factor, rate):
-    clock = Hand()
-    clock.now = 1_700_000_000_000_000_000
+    clock = Hand(1_700_000_000_000_000_000)
     pacer = Pacer(10**9 // rate, 1.0, clock)
     pacer.change(factor)
     asked = [False] * 3 + [True]

@@ -251,23 +251,17 @@ def test_a_fault_is_latched_until_a_reset(start):
     bench.until(lambda: output.acted[-1] == ZERO)  # the command is forgotten
 
 
-def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick(start):
-    bench = start(HEAVY, publish_rate=10, wait_for_command=True, commands=[HIT])
-    bench.to(Phase.FAULT)
-    bench.end()
+def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick_and_ends_a_run_with_a_duration():
+    given = {"publish_rate": 10, "wait_for_command": True, "duration": 10.0}
+    bench = run_here(HEAVY, commands=[HIT], **given)
     loop, output = bench.loop, bench.output
+    assert loop.phase is Phase.FAULT and loop.failed
     ticks = loop.simulation.time_ns // 1_000_000
     assert ticks % 100 and "gamma_1 > 1.570796 rad" in loop.fault
     assert output.acted == [HIT] * ticks
     assert loop.counters.ticks == ticks
     assert output.stamps[-1] == output.stamps[0] + ticks * 1_000_000
     assert output.samples[-1][1] == loop.simulation.state
-
-
-def test_a_fault_ends_a_run_with_a_duration():
-    loop = run_here(HEAVY, duration=10.0, wait_for_command=True, commands=[HIT]).loop
-    assert loop.phase is Phase.FAULT and loop.failed
-    assert "gamma_1 > 1.570796 rad" in loop.fault
 
 
 def test_set_state_is_checked(start):

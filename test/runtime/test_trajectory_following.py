@@ -30,7 +30,6 @@ START_NS = 1_700_000_000_123_456_789
 MOVE = DesiredMotion(spiral=Spiral(phi=0.02, theta=0.5, psi=0.03, duration=0.05))
 MODEL = dataclasses.replace(scene.load("example2_heavy"), motion=MOVE, torque=None)
 
-
 HERE = Measurement(MODEL.initial.gamma, REST)
 
 
@@ -38,24 +37,36 @@ def seen(state):
     return Measurement(state.joints.gamma, state.joints.gamma_dot)
 
 
-def test_it_follows_holds_and_ends_with_zero_torque():
-    follower = TrajectoryFollower(
-        MODEL, ControllerNodeParameters(hold=0.01, feedforward_at="middle")
-    )
-    simulation = Simulation(MODEL)
-    assert follower.stage is Stage.READY and follower.tracking() is None
-    first = follower.preview(seen(simulation.state))
-    stages, commands = [], []
+def follow(**settings):
+    return TrajectoryFollower(MODEL, ControllerNodeParameters(**settings))
+
+
+def answers(follower, samples, measured=HERE):
+    """What is answered to samples of these numbers, where the manipulator does not move."""
+    return [follower.answer(START_NS + k * PERIOD_NS, measured) for k in samples]
+
+
+def closed_loop(follower, at=lambda k: None):
+    """Commands, and the stage at each; the state at the end."""
+    simulation, told = Simulation(MODEL), []
     for k in range(40):
+        at(k)
         command = follower.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
         if command is None:
             break
-        stages.append(follower.stage)
-        commands.append(command)
+        told.append((command, follower.stage))
         simulation.step(command.torque, PERIOD_NS)
+    return *zip(*told, strict=True), simulation.state
+
+
+def test_it_follows_holds_and_ends_with_zero_torque():
+    follower = follow(hold=0.01, feedforward_at="middle")
+    assert follower.stage is Stage.READY and follower.tracking() is None
+    first = follower.preview(seen(Simulation(MODEL).state))
+    commands, stages, _ = closed_loop(follower)
     assert commands[0].torque == first.torque
-    assert stages == [Stage.FOLLOWING] * 25 + [Stage.HOLDING] * 5 + [Stage.ENDED]
-    assert commands[-1].torque == (0.0, 0.0, 0.0) and follower.samples == 31
+    assert stages == (Stage.FOLLOWING,) * 25 + (Stage.HOLDING,) * 5 + (Stage.ENDED,)
+    assert commands[-1].torque == REST and follower.samples == 31
     judged = follower.tracking()
     assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / tracking.BAND
     rms, largest = follower.errors
@@ -64,20 +75,19 @@ def test_it_follows_holds_and_ends_with_zero_torque():
 
 
 def test_samples_that_come_twice_or_late_are_told_apart():
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
-    for k, answered in ((1, True), (2, True), (2, False), (1, False), (5, True)):
-        assert (follower.answer(START_NS + k * PERIOD_NS, HERE) is not None) == answered
+    follower = follow()
+    told = answers(follower, (1, 2, 2, 1, 5))
+    assert [one is not None for one in told] == [True, True, False, False, True]
     assert (follower.samples, follower.irregular) == (3, 1)
 
 
 def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
     monkeypatch.setattr(tracking, "_KEPT", 100)
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(hold=1e6))
-    for k in range(600):
-        follower.answer(START_NS + k * PERIOD_NS, HERE)
+    follower = follow(hold=1e6)
+    answers(follower, range(600))
     tracemalloc.start()
     for k in range(600, 1200):
-        follower.answer(START_NS + k * PERIOD_NS, HERE)
+        answers(follower, [k])
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 70_000  # 600 rows of a record are 106 000
@@ -85,12 +95,12 @@ def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
 
 
 def test_a_reset_of_the_simulator_begins_the_motion_anew():
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters(mode="pd", integral_rate=1.0))
+    follower = follow(mode="pd", integral_rate=1.0)
     here = Measurement(tuple(np.add(MODEL.initial.gamma, 0.01)), REST)
-    told = [follower.answer(START_NS + k * PERIOD_NS, here) for k in range(5)]
+    told = answers(follower, range(5), here)
     follower.restart()
     assert follower.stage is Stage.READY and follower.tracking() is None
-    again = [follower.answer(START_NS + (100 + k) * PERIOD_NS, here) for k in range(5)]
+    again = answers(follower, range(100, 105), here)
     assert [one.torque for one in again] == [one.torque for one in told]
 
 
@@ -134,49 +144,39 @@ def test_bad_parameters_are_refused(given):
 
 
 def test_it_begins_only_near_the_start_of_the_motion():
-    off = dataclasses.replace(
-        MODEL, initial=Initial(gamma=tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0))))
-    )
-    state = Simulation(off).state
-    near = ControllerNodeParameters(start_tolerance=0.07)
-    assert TrajectoryFollower(MODEL, near).answer(START_NS, seen(state)) is not None
-    for ask in (lambda p: p.preview(seen(state)), lambda p: p.answer(START_NS, seen(state))):
+    gamma = tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0)))
+    off = seen(Simulation(dataclasses.replace(MODEL, initial=Initial(gamma=gamma))).state)
+    assert follow(start_tolerance=0.07).answer(START_NS, off) is not None
+    for ask in (lambda p: p.preview(off), lambda p: p.answer(START_NS, off)):
         with pytest.raises(InputError, match="where the motion begins"):
-            ask(TrajectoryFollower(MODEL, ControllerNodeParameters()))
+            ask(follow())
 
 
 def test_what_is_not_finite_is_nowhere_near():
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
+    follower = follow()
     with pytest.raises(InputError, match="where the motion begins"):
         follower.preview(dataclasses.replace(HERE, gamma=(np.nan,) * 3))
-    follower.answer(START_NS, HERE)
+    answers(follower, [0])
     with pytest.raises(ControlStopped, match="must be finite"):
-        follower.answer(START_NS + PERIOD_NS, dataclasses.replace(HERE, gamma_dot=(np.nan,) * 3))
+        answers(follower, [1], dataclasses.replace(HERE, gamma_dot=(np.nan,) * 3))
 
 
 def test_a_stop_comes_to_rest_on_the_path_and_holds():
-    settings = ControllerNodeParameters(mode="computed_torque", stop_time=0.02, hold=1.0)
-    follower, simulation = TrajectoryFollower(MODEL, settings), Simulation(MODEL)
-    references = []
-    for k in range(40):
-        if k == 10:
-            follower.stop()
-        command = follower.answer(START_NS + k * PERIOD_NS, seen(simulation.state))
-        references.append(command.desired)
-        simulation.step(command.torque, PERIOD_NS)
-    path = reference_motion(MODEL)
-    moving, rest = references[9], references[-1]
-    assert moving == path.at(0.018)
+    follower = follow(mode="computed_torque", stop_time=0.02, hold=1.0)
+    commands, stages, state = closed_loop(follower, lambda k: k == 10 and follower.stop())
+    references = [command.desired for command in commands]
+    path, rest = reference_motion(MODEL), references[-1]
+    assert references[9] == path.at(0.018)
     assert rest.gamma == pytest.approx(path.at(0.028).gamma, abs=1e-15)
-    assert rest.gamma_dot == (0.0, 0.0, 0.0)
+    assert rest.gamma_dot == REST
     rates = np.array([one.gamma_dot for one in references[9:]])
     assert (np.abs(np.diff(rates[:, 2])) < 0.2 * abs(rates[0, 2])).all()  # without a jump
-    assert np.array(simulation.state.joints.gamma) == pytest.approx(rest.gamma, abs=1e-4)
-    assert follower.stage is Stage.HOLDING
+    assert np.array(state.joints.gamma) == pytest.approx(rest.gamma, abs=1e-4)
+    assert len(references) == 40 and stages[-1] is Stage.HOLDING
 
 
 def test_a_stop_before_the_run_forgets_the_trajectory():
-    follower = TrajectoryFollower(MODEL, ControllerNodeParameters())
+    follower = follow()
     follower.stop()
     assert follower.stage is Stage.READY  # the scene's own motion stays
 
@@ -242,9 +242,7 @@ def test_a_goal_goes_on_or_ends(expected, case):
 
 
 def test_without_tolerances_a_goal_ends_with_its_last_point():
-    free = dataclasses.replace(
-        DEFAULTS, path_tolerance=0.0, goal_tolerance=0.0, stopped_velocity_tolerance=0.0
-    )
+    free = ControllerNodeParameters(motion="topic", stopped_velocity_tolerance=0.0)
     assert outcome(0.999, 9.0, 9.0, free) is None
     assert outcome(1.0, 9.0, 9.0, free) is DONE
 
