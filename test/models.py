@@ -7,7 +7,7 @@ home with plain inertias, so counterexamples shrink towards it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
-from sst_ros.mechanism import kinematics, virtual_work
+from sst_ros.mechanism import kinematics, virtual_work, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star
+from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star, load
 from sst_ros.state import Assembly
 
 COUNT = 64
@@ -167,3 +167,13 @@ def samples(draw) -> Sample:
     sample = sample_of(numbers, isotropic=draw(st.booleans()))
     assume(sample is not None)
     return sample
+
+
+def folding_star() -> tuple[Scene, np.ndarray]:
+    """Example 1 with a star that folds, and R at its parallel singularities, shape (n, 3, 3)."""
+    scene = load("example1")
+    scene = replace(scene, star=replace(scene.star, alpha_deg=(210.0, 75.0, 75.0)))
+    geometry = Geometry.of(scene)
+    s, _ = workspace.triangle_directions(geometry, 6)
+    grid = workspace.over_orientations(geometry, s, 36)
+    return scene, workspace.parallel_singularities(grid).rotation

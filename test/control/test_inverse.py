@@ -12,17 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lagrange import Lagrange
 from mechanism.test_loads import laden, loaded
-from models import FAST, samples, seeded_samples
+from models import FAST, folding_star, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.mechanism import virtual_work, workspace
+from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.generic_math import symmetric_rows
-from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.virtual_work import EquationOfMotion
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
@@ -126,14 +125,9 @@ def test_near_a_serial_singularity_a_torque_is_finite_or_refused():
 
 
 def test_a_parallel_singularity_is_told():
-    scene = load("example1")
-    star = dataclasses.replace(scene.star, alpha_deg=(210.0, 75.0, 75.0))
-    scene = dataclasses.replace(scene, star=star)
-    geometry = Geometry.of(scene)
-    s, _ = workspace.triangle_directions(geometry, 6)
-    poses = workspace.parallel_singularities(workspace.over_orientations(geometry, s, 36))
+    scene, poses = folding_star()
     assert len(poses)
-    for rotation in poses.rotation:
+    for rotation in poses:
         q = tuple(quaternion_of(rotation).tolist())
         with pytest.raises(SingularConfiguration, match="parallel") as told:
             InverseDynamics(scene).torque(q, (0.0,) * 3, (1.0, 2.0, 3.0))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from models import FAST
+from models import FAST, folding_star
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -22,7 +22,7 @@ from sst_ros.control.plan import check_motion, examine_motion, maximum, minimum
 from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.control.time_scaling import time_scaling
 from sst_ros.errors import MotionRefused, SingularConfiguration
-from sst_ros.mechanism import kinematics, workspace
+from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
@@ -43,24 +43,18 @@ from sst_ros.simulation.torque_profile import TorqueTable
 HOME = (math.pi / 4,) * 3
 EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))
 WAY, TIME = 0.3, 0.5
-SHIPPED = ("point_to_point", "spiral")
+FREE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
 
 
-def with_motion(scene, motion, **more):
-    kinds = {
-        ToAngles: "to_angles", ToOrientation: "to_orientation", Sweep: "sweep", Spiral: "spiral"
-    }  # fmt: skip
-    return replace(scene, motion=DesiredMotion(**{kinds[type(motion)]: motion}), **more)
+def planned(scene, check=examine_motion):
+    return check(reference_motion(scene), scene)
 
 
-def planned(scene):
-    return examine_motion(reference_motion(scene), scene)
-
-
-def swing(duration=TIME, **more):
+def swing(**limits):
     """Example 1's one degree of freedom: all gamma go WAY on together."""
-    goal = ToAngles(gamma=tuple(angle + WAY for angle in HOME), duration=duration)
-    return with_motion(EXAMPLE1, goal, **more)
+    goal = ToAngles(gamma=tuple(angle + WAY for angle in HOME), duration=TIME)
+    actuators = Actuators(**limits) if limits else None
+    return replace(EXAMPLE1, motion=DesiredMotion(to_angles=goal), actuators=actuators)
 
 
 def swing_torque(time):
@@ -82,28 +76,25 @@ def summit(function, count=4000):
     return function(found.x), found.x
 
 
+SUMMIT, _ = summit(lambda time: swing_torque(time)[0])
+VELOCITY, ACCELERATION = 15.0 / 8.0 * WAY / TIME, 10.0 / math.sqrt(3.0) * WAY / TIME**2
+"""Peaks of minimum jerk."""
+
+
 def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
-    plan = planned(swing())
-    for name, function in (
-        ("torque", lambda time: swing_torque(time)[0]),
-        ("power", lambda time: math.prod(swing_torque(time))),
-    ):
-        value, time = summit(function)
-        for demand in plan.demands:
-            found = getattr(demand, name)
+    square = quad(lambda time: swing_torque(time)[0] ** 2, 0.0, TIME, epsabs=1e-14)[0]
+    root = 0.5 - math.sqrt(3.0) / 6.0
+    for demand in planned(swing()).demands:
+        for found, function in (
+            (demand.torque, lambda time: swing_torque(time)[0]),
+            (demand.power, lambda time: math.prod(swing_torque(time))),
+        ):
+            value, time = summit(function)
             assert found.value == pytest.approx(value, rel=1e-12)
             assert found.time == pytest.approx(time, abs=1e-6)
-    square = quad(lambda time: swing_torque(time)[0] ** 2, 0.0, TIME, epsabs=1e-14)[0]
-    for demand in plan.demands:
         assert demand.torque_rms == pytest.approx(math.sqrt(square / TIME), rel=1e-6)
-
-
-def test_rates_of_minimum_jerk_are_15_8ths_and_10_over_root_3():
-    for demand in planned(swing()).demands:
-        assert demand.velocity.value == pytest.approx(15.0 / 8.0 * WAY / TIME, rel=1e-14)
-        peak = 10.0 / math.sqrt(3.0) * WAY / TIME**2
-        assert abs(demand.acceleration.value) == pytest.approx(peak, rel=1e-14)
-        root = 0.5 - math.sqrt(3.0) / 6.0
+        assert demand.velocity.value == pytest.approx(VELOCITY, rel=1e-14)
+        assert abs(demand.acceleration.value) == pytest.approx(ACCELERATION, rel=1e-14)
         at = {round(share * TIME, 6) for share in (root, 1.0 - root)}
         assert round(demand.acceleration.time, 6) in at
 
@@ -125,30 +116,23 @@ def test_extremes_between_samples_are_found(phase, frequency, count):
     assert maximum(function, times, values).value >= truth.max() - 1e-12
 
 
-def test_the_speed_of_pure_inertia_is_the_root_of_the_torques_ratio():
-    limit = 2.0
-    plan = planned(swing(actuators=Actuators(torque_limit=limit)))
-    value, _ = summit(lambda time: swing_torque(time)[0])
-    found = time_scaling(plan)
-    assert found.highest == pytest.approx(math.sqrt(limit / abs(value)), rel=1e-12)
-    assert (found.lowest, found.binding) == (0.0, "torque")
-
-
-def test_the_speed_under_limits_of_rate_and_acceleration_is_a_quotient_and_a_root():
-    velocity, acceleration = 15.0 / 8.0 * WAY / TIME, 10.0 / math.sqrt(3.0) * WAY / TIME**2
-    found = time_scaling(planned(swing(actuators=Actuators(velocity_limit=3.0))))
-    assert found.highest == pytest.approx(3.0 / velocity, rel=1e-12)
-    assert found.binding == "velocity"
-    found = time_scaling(
-        planned(swing(actuators=Actuators(velocity_limit=3.0, acceleration_limit=9.0)))
-    )
-    assert found.highest == pytest.approx(math.sqrt(9.0 / acceleration), rel=1e-12)
-    assert found.binding == "acceleration"
-
-
-def test_without_limits_any_speed_will_do():
-    found = time_scaling(planned(swing()))
-    assert found.highest == math.inf and found.binding == ""
+@pytest.mark.parametrize(
+    ("limits", "highest", "binding"),
+    [
+        ({"torque_limit": 2.0}, math.sqrt(2.0 / abs(SUMMIT)), "torque"),
+        ({"velocity_limit": 3.0}, 3.0 / VELOCITY, "velocity"),
+        (
+            {"velocity_limit": 3.0, "acceleration_limit": 9.0},
+            math.sqrt(9.0 / ACCELERATION),
+            "acceleration",
+        ),
+        ({}, math.inf, ""),
+    ],
+)
+def test_the_speed_of_pure_inertia_is_a_quotient_or_a_root(limits, highest, binding):
+    found = time_scaling(planned(swing(**limits)))
+    assert found.highest == pytest.approx(highest, rel=1e-12)
+    assert (found.lowest, found.binding) == (0.0, binding)
 
 
 def rubbing(duration, limit):
@@ -159,9 +143,14 @@ def rubbing(duration, limit):
     )
     goal = (turn * Rotation.from_rotvec([0.2, -0.1, 0.3])).as_quat()
     motion = ToOrientation(orientation=tuple(goal.tolist()), duration=duration)
-    hung = replace(load("gravity_payload"), springs=(), friction=rub)
-    hung = replace(hung, initial=Initial(gamma=HOME), actuators=Actuators(torque_limit=limit))
-    return with_motion(hung, motion)
+    return replace(
+        load("gravity_payload"),
+        springs=(),
+        friction=rub,
+        initial=Initial(gamma=HOME),
+        actuators=Actuators(torque_limit=limit),
+        motion=DesiredMotion(to_orientation=motion),
+    )
 
 
 def test_the_highest_speed_is_where_the_check_turns():
@@ -185,8 +174,8 @@ def resonant(factor=1.0):
     springs = tuple(Spring(joint=f"gamma_{k}", stiffness=20.0, rest=HOME[0]) for k in (1, 2, 3))
     own = factor * math.sqrt(20.0 / inertia(EXAMPLE1, 0.0))
     motion = Sweep(amplitude=(0.1,) * 3, frequency=(own,) * 3, fade=20.0 / own, duration=60.0 / own)
-    scene = replace(EXAMPLE1, springs=springs, actuators=Actuators(torque_limit=1.2))
-    return with_motion(scene, motion)
+    motion, actuators = DesiredMotion(sweep=motion), Actuators(torque_limit=1.2)
+    return replace(EXAMPLE1, springs=springs, actuators=actuators, motion=motion)
 
 
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
@@ -199,20 +188,18 @@ def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
 
 
 def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
-    away = ToAngles(gamma=(1.7, 0.9, 0.9), duration=1.0)
-    free = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
-    scene = with_motion(EXAMPLE1, away, workspace=free["workspace"])
+    away = DesiredMotion(to_angles=ToAngles(gamma=(1.7, 0.9, 0.9), duration=1.0))
+    scene = replace(EXAMPLE1, motion=away, workspace=FREE["workspace"])
     with pytest.raises(MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"):
-        check_motion(reference_motion(scene), scene)
+        planned(scene, check_motion)
     elastic = replace(scene, stroke=Stroke(at_end="elastic", stiffness=1e3))
     assert planned(elastic).problems
-    ignoring = replace(scene, stroke=free["stroke"])
-    assert not check_motion(reference_motion(ignoring), ignoring).problems
+    assert not planned(replace(scene, **FREE), check_motion).problems
 
 
 def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
-    out = Spiral(phi=1.0, theta=0.3, duration=1.0)
-    scene = with_motion(EXAMPLE1, out)
+    out = DesiredMotion(spiral=Spiral(phi=1.0, theta=0.3, duration=1.0))
+    scene = replace(EXAMPLE1, motion=out)
     plan = planned(scene)
     told = {problem.key: problem.value for problem in plan.problems}
     assert any(key.startswith("beta") for key in told)
@@ -228,54 +215,43 @@ def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
 
 
 def test_limits_are_held_between_samples_and_told_with_the_instant():
-    limit = abs(summit(lambda time: swing_torque(time)[0])[0])
-    fits = swing(actuators=Actuators(torque_limit=limit * (1.0 + 1e-12)))
-    assert not check_motion(reference_motion(fits), fits).problems
-    tight = swing(actuators=Actuators(torque_limit=limit * (1.0 - 1e-9)))
+    limit = abs(SUMMIT)
+    assert not planned(swing(torque_limit=limit * (1.0 + 1e-12)), check_motion).problems
     with pytest.raises(MotionRefused) as told:
-        check_motion(reference_motion(tight), tight)
+        planned(swing(torque_limit=limit * (1.0 - 1e-9)), check_motion)
     assert [problem.key for problem in told.value.problems] == ["torque_1", "torque_2", "torque_3"]
-    rates = Actuators(velocity_limit=1.1, acceleration_limit=6.9)
-    keys = {problem.key.partition("_")[0] for problem in planned(swing(actuators=rates)).problems}
+    fast = planned(swing(velocity_limit=1.1, acceleration_limit=6.9))
+    keys = {problem.key.partition("_")[0] for problem in fast.problems}
     assert keys == {"velocity", "acceleration"}
 
 
 def test_a_turn_through_a_parallel_singularity_is_refused():
-    star = replace(EXAMPLE1.star, alpha_deg=(210.0, 75.0, 75.0))
-    scene = replace(
-        EXAMPLE1, star=star, stroke=Stroke(at_end="ignore"), workspace=Workspace(at_edge="ignore")
-    )
-    geometry = Geometry.of(scene)
-    s, _ = workspace.triangle_directions(geometry, 6)
-    poses = workspace.parallel_singularities(workspace.over_orientations(geometry, s, 36))
-    ends = [
-        quaternion_of(poses.rotation[1] @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix())
-        for angle in (-0.1, 0.123)
-    ]
-    first, last = (tuple(end.tolist()) for end in ends)
+    scene, poses = folding_star()
+    ends = (Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (-0.1, 0.123))
+    first, last = (tuple(quaternion_of(poses[1] @ end).tolist()) for end in ends)
+    motion = geodesic_motion(Geometry.of(scene), first, last, 1.0)
     with pytest.raises(
         SingularConfiguration, match=r"parallel singularity at t = 0\.\d+ s"
     ) as told:
-        check_motion(geodesic_motion(geometry, first, last, 1.0), scene)
+        check_motion(motion, replace(scene, **FREE))
     assert abs(told.value.measure) < 1e-9
 
 
 def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
     """Through t_1 = w_1: the arc of the star folds over the base's."""
-    scene = replace(EXAMPLE1, workspace=Workspace(at_edge="ignore"), stroke=Stroke(at_end="ignore"))
-    geometry = Geometry.of(scene)
     first, last = (
         tuple(Rotation.from_euler("yx", [0.5, 0.5 * math.pi + off]).as_quat().tolist())
         for off in (-0.2, 0.2)
     )
     with pytest.raises(SingularConfiguration, match="serial singularity"):
-        check_motion(geodesic_motion(geometry, first, last, 1.0), scene)
+        motion = geodesic_motion(Geometry.of(EXAMPLE1), first, last, 1.0)
+        check_motion(motion, replace(EXAMPLE1, **FREE))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", ["point_to_point", "spiral"])
 def test_shipped_motions_are_feasible_and_end_where_they_should(name):
     scene = load(name)
-    plan = check_motion(reference_motion(scene), scene)
+    plan = planned(scene, check_motion)
     assert scene.duration == plan.motion.duration
     assert time_scaling(plan).highest > 1.0
     assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
@@ -315,9 +291,8 @@ def test_written_torques_do_the_motion(tmp_path):
     goal = reference_motion(scene).at(1.0).gamma
     for period_ns in (8_000_000, 2_000_000):
         path = tmp_path / f"{period_ns}.csv"
-        assert cli.main(
-            ["plan", "check", "point_to_point", "--csv", str(path), "--period", f"{period_ns}e-9"]
-        ) == 0  # fmt: skip
+        words = ["--csv", str(path), "--period", f"{period_ns}e-9"]
+        assert cli.main(["plan", "check", "point_to_point", *words]) == 0
         profile = TorqueTable.read(path)
         last = profile.times[-1]
         assert last == pytest.approx(1.0, abs=1e-12)
