@@ -11,7 +11,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from sst_ros.control.reference_motions import reference_motion
@@ -127,16 +127,8 @@ def empty_bag(folder: Path, name: str = "bag") -> Path:
     return bag
 
 
-@contextmanager
-def _node(command: str, **given: object) -> Iterator[subprocess.Popen[str]]:
-    """Start a node; it does not outlive the block."""
-    process = child_process.start(command, given, stdout=subprocess.PIPE)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+def _node(command: str, **given: object) -> AbstractContextManager[subprocess.Popen[str]]:
+    return child_process.run_beside(command, given, stdout=subprocess.PIPE)
 
 
 def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:

@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import itertools
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,21 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.recording.recording import Recording
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
+from sst_ros.scene.loads import JOINTS as ALL_JOINTS
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import nanoseconds
 
-STORE = get_typestore(Stores.ROS2_KILTED)
+STORE = message_types()
 START_NS = 1_700_000_000_123_456_789
 TICK_NS = 1_000_000
 TICKS_A_SAMPLE = 2
-NAMES = [f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3)]
+NAMES = list(ALL_JOINTS)
 
 JOINTS = "/joint_states"
 ORIENTATION, EULER = "/sst_simulator/orientation", "/sst_simulator/euler_zyz"
@@ -46,8 +49,7 @@ KINDS = {
 
 
 def make(kind: str, **fields: Any) -> Any:
-    package, _, name = kind.partition("/")
-    return STORE.types[f"{package}/msg/{name}"](**fields)
+    return STORE.types[kind if "/msg/" in kind else kind.replace("/", "/msg/")](**fields)
 
 
 def time(ns: int, kind: str = "Time") -> Any:
@@ -90,24 +92,14 @@ def state_entries(state, stamp_ns: int, received_ns: int, sample: int) -> list[E
 
 
 def torque_entry(torques: list, start_ns: int, received_ns: int, sample: int) -> Entry:
+    unused = dict.fromkeys(("positions", "velocities", "accelerations"), np.empty(0))
+    ends = [time(i * TICK_NS, "Duration") for i in range(1, len(torques) + 1)]
     points = [
-        make(
-            "trajectory_msgs/JointTrajectoryPoint",
-            positions=np.empty(0),
-            velocities=np.empty(0),
-            accelerations=np.empty(0),
-            effort=np.array(torque),
-            time_from_start=time((i + 1) * TICK_NS, "Duration"),
-        )
-        for i, torque in enumerate(torques)
+        make(f"{KINDS[APPLIED]}Point", **unused, effort=np.array(torque), time_from_start=end)
+        for torque, end in zip(torques, ends, strict=True)
     ]
-    content = make(
-        "trajectory_msgs/JointTrajectory",
-        header=header(start_ns),
-        joint_names=NAMES[:3],
-        points=points,
-    )
-    return Entry(APPLIED, received_ns, content, sample)
+    parts = {"header": header(start_ns), "joint_names": NAMES[:3], "points": points}
+    return Entry(APPLIED, received_ns, make(KINDS[APPLIED], **parts), sample)
 
 
 def command_entry(received_ns: int, torque: Any) -> Entry:
@@ -118,14 +110,8 @@ def command_entry(received_ns: int, torque: Any) -> Entry:
 
 def diagnostics_entry(received_ns: int, **values: object) -> Entry:
     pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(v)) for key, v in values.items()]
-    status = make(
-        "diagnostic_msgs/DiagnosticStatus",
-        level=0,
-        name="/sst_simulator: run",
-        message="",
-        hardware_id="",
-        values=pairs,
-    )
+    texts = {"level": 0, "name": "/sst_simulator: run", "message": "", "hardware_id": ""}
+    status = make("diagnostic_msgs/DiagnosticStatus", **texts, values=pairs)
     content = make("diagnostic_msgs/DiagnosticArray", header=header(received_ns), status=[status])
     return Entry(DIAGNOSTICS, received_ns, content)
 
@@ -188,7 +174,7 @@ def tracked(entries: list[Entry], desired) -> list[Entry]:
     more = []
     for entry in entries:
         if entry.topic == JOINTS and entry.sample >= 0:
-            stamp = entry.content.header.stamp.sec * 10**9 + entry.content.header.stamp.nanosec
+            stamp = nanoseconds(entry.content.header.stamp)
             wanted = np.array(desired((stamp - START_NS) / 1e9))
             measured = np.array([entry.content.position[:3], entry.content.velocity[:3]])
             effort = entry.content.effort[:3]
@@ -218,32 +204,31 @@ def write(
             name = topic if topic == DIAGNOSTICS else namespace + topic
             return writer.add_connection(name, kind, typestore=STORE)
 
-        _send(entries, connect, writer.write)
+        for message in _serialize(entries, connect):
+            writer.write(*message)
     return path
 
 
 def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:
     """Write messages as the recorder does; with `flush_every`, a chunk for so many messages."""
     writer = BagWriter(path)
-
-    def flush(number: int) -> None:
-        if flush_every and number % flush_every == flush_every - 1:
+    for number, message in enumerate(_serialize(entries, writer.connect), 1):
+        writer.write(*message)
+        if flush_every and number % flush_every == 0:
             writer._flushed = -1e9
             writer.save()
-
-    _send(entries, writer.connect, writer.write, flush)
     writer.close()
     return path
 
 
-def _send(entries: list[Entry], connect: Any, send: Any, then: Any = lambda _: None) -> None:
+def _serialize(entries: list[Entry], connect: Any) -> Iterator[tuple[Any, int, bytes]]:
     connections: dict[str, Any] = {}
-    for number, entry in enumerate(entries):
+    for entry in entries:
         topic, kind = entry.topic, KINDS[entry.topic]
         if topic not in connections:
             connections[topic] = connect(topic, kind)
-        send(connections[topic], entry.received_ns, bytes(STORE.serialize_cdr(entry.content, kind)))
-        then(number)
+        data = bytes(STORE.serialize_cdr(entry.content, kind))
+        yield connections[topic], entry.received_ns, data
 
 
 def without(entries: list[Entry], *topics: str) -> list[Entry]:

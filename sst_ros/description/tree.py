@@ -24,27 +24,16 @@ from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME
 
 BASE, STAR = BASE_FRAME, "star"
-
 LEGS = (1, 2, 3)
-
 STARS = (STAR, "star_from_2", "star_from_3")
 """{E} as seen from legs 1, 2 and 3."""
 
-Colour = tuple[float, float, float]
-
+Colour: TypeAlias = tuple[float, float, float]
 GLOBE: Colour = (0.93, 0.94, 0.96)
-
 TRIANGLE: Colour = (0.35, 0.38, 0.42)
-
 STAR_COLOUR: Colour = (0.90, 0.62, 0.00)
-
 STEEL: Colour = (0.60, 0.63, 0.67)
-
-LEG_COLOURS: tuple[Colour, Colour, Colour] = (
-    (0.00, 0.45, 0.70),
-    (0.84, 0.37, 0.00),
-    (0.00, 0.62, 0.45),
-)
+LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45))
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
 STEP = np.radians(6.0)
@@ -101,13 +90,12 @@ def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str,
 
 
 def _leg(geometry: Geometry, k: int) -> tuple[Joint, Joint, Joint]:
-    v, w, e = geometry.v[k], geometry.w[k], geometry.e[k]
+    v, w, e, leg = geometry.v[k], geometry.w[k], geometry.e[k], LEGS[k]
     base = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
     # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z and e.
     z = np.array([0.0, 0.0, 1.0])
     star = np.stack([z, np.cross(e, z), e], axis=1).T
     back = (-float(e[0]), -float(e[1]), -float(e[2]))
-    leg = LEGS[k]
     return (
         Joint(f"gamma_{leg}", BASE, name_actuated(leg), base, (0.0, 0.0, 1.0)),
         Joint(f"mu_{leg}", name_actuated(leg), name_intermediate(leg), np.eye(3), (-1.0, 0.0, 0.0)),
@@ -179,15 +167,29 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
     """Return the shapes of every link that has some, by the link's name."""
     geometry = Geometry.of(scene)
     base, star = scene.base.radius, scene.star.radius
-    thick = 0.02 * base
-    found = {BASE: _base(geometry, base, thick), STAR: _star(scene, geometry, thick)}
-    x, z = np.eye(3)[[0, 2]]
-    for k, leg in enumerate(LEGS):
-        colour = LEG_COLOURS[k]
+    thick, (x, y, z) = 0.02 * base, np.eye(3)
+    sides = zip(geometry.v, geometry.w, geometry.arc.tolist(), strict=True)
+    found: dict[str, list[Shape]] = {
+        BASE: [
+            Ball(np.zeros(3), base - thick, GLOBE, 0.92),
+            *(Arc(v, w, angle, base, 0.7 * thick, TRIANGLE) for v, w, angle in sides),
+            *(Ball(base * v, 1.6 * thick, TRIANGLE) for v in geometry.v),
+        ],
+        # In {E} the carriage k is at s turned about e by +beta.
+        STAR: [
+            *(Arc(z, e, geometry.beta_max, star, thick, STAR_COLOUR) for e in geometry.e),
+            Ball(star * z, 2.2 * thick, STAR_COLOUR),
+        ],
+    }
+    if scene.payload is not None:
+        centre = np.array(scene.payload.centre)
+        rod = Rod(star * z, centre, 0.8 * thick, STEEL)
+        found[STAR] += [rod, Ball(centre, 2.8 * thick, STEEL)]
+    for leg, colour in zip(LEGS, LEG_COLOURS, strict=True):
         # A quarter arc from the motor at w to the carriage at r, just above the base.
         middle = base + 1.5 * thick
         found[name_actuated(leg)] = [
-            Arc(x, -np.eye(3)[1], np.pi / 2, middle, thick, colour),
+            Arc(x, -y, np.pi / 2, middle, thick, colour),
             Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
         ]
         found[name_intermediate(leg)] = [
@@ -200,25 +202,3 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
 def end_point(scene: Scene, star: Array) -> Array:
     """Position of E in {B} [m], shape (..., 3), of rotations of the star (..., 3, 3)."""
     return np.asarray(scene.star.radius * star[..., :, 2])
-
-
-def _base(geometry: Geometry, radius: float, thick: float) -> list[Shape]:
-    sides = zip(geometry.v, geometry.w, geometry.arc.tolist(), strict=True)
-    return [
-        Ball(np.zeros(3), radius - thick, GLOBE, 0.92),
-        *(Arc(v, w, angle, radius, 0.7 * thick, TRIANGLE) for v, w, angle in sides),
-        *(Ball(radius * v, 1.6 * thick, TRIANGLE) for v in geometry.v),
-    ]
-
-
-def _star(scene: Scene, geometry: Geometry, thick: float) -> list[Shape]:
-    radius, z = scene.star.radius, np.array([0.0, 0.0, 1.0])
-    reach = geometry.beta_max
-    # In {E} the carriage k is at s turned about e by +beta.
-    found: list[Shape] = [Arc(z, e, reach, radius, thick, STAR_COLOUR) for e in geometry.e]
-    found.append(Ball(radius * z, 2.2 * thick, STAR_COLOUR))
-    if scene.payload is not None:
-        centre = np.array(scene.payload.centre)
-        found.append(Rod(radius * z, centre, 0.8 * thick, STEEL))
-        found.append(Ball(centre, 2.8 * thick, STEEL))
-    return found

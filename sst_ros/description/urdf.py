@@ -47,9 +47,8 @@ from sst_ros.scene.scene import LARGEST, Friction, Scene
 from sst_ros.state import Vector3
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
-
 STATES = ("position", "velocity", "effort")
-
+PAYLOAD = "payload"
 EVERY_CYCLE = "-1"
 """Threshold of the change of a command below which the plug-in sends none: the simulator drops a
 command that is not repeated within command_timeout."""
@@ -64,14 +63,24 @@ _ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radiu
 
 def urdf(scene: Scene) -> str:
     """Write a scene as a URDF document."""
+    return _text(_robot(scene))
+
+
+def _text(root: ET.Element) -> str:
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _robot(scene: Scene) -> ET.Element:
     geometry = Geometry.of(scene)
     joints, drawn = tree(geometry), shapes(scene)
-    owned = bodies(scene)
-    root = ET.Element("robot", name=_name(scene.name))
-    root.append(ET.Comment(_NOTE.format(name=_name(scene.name))))
-    if assumed := ", ".join(body.name for body in owned if body.assumed):
+    own = {body.name: body for body in bodies(scene)}
+    # An XML name has no spaces.
+    name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
+    root = ET.Element("robot", name=name)
+    root.append(ET.Comment(_NOTE.format(name=name)))
+    if assumed := ", ".join(body.name for body in own.values() if body.assumed):
         root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
-    own = {body.name: body for body in owned}
     for name in (BASE, *(joint.child for joint in joints)):
         _link(root, name, own.pop(name, None), drawn.get(name, ()))
     for body in own.values():
@@ -83,8 +92,7 @@ def urdf(scene: Scene) -> str:
         fixed = ET.SubElement(root, "joint", name=f"{body.name}_fixed", type="fixed")
         ET.SubElement(fixed, "parent", link=body.link)
         ET.SubElement(fixed, "child", link=body.name)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+    return root
 
 
 def urdf_with_ros2_control(
@@ -103,7 +111,7 @@ def urdf_with_ros2_control(
         states: topic of its joint states.
 
     """
-    root = ET.fromstring(urdf(scene), ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    root = _robot(scene)
     tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
     hardware = ET.SubElement(tag, "hardware")
     ET.SubElement(hardware, "plugin").text = PLUGIN
@@ -120,11 +128,7 @@ def urdf_with_ros2_control(
         for state, start_value in zip(STATES, (*start, 0.0), strict=True):
             interface = ET.SubElement(joint, "state_interface", name=state)
             ET.SubElement(interface, "param", name="initial_value").text = repr(float(start_value))
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-PAYLOAD = "payload"
+    return _text(root)
 
 
 @dataclass(frozen=True)
@@ -165,8 +169,15 @@ def bodies(scene: Scene) -> list[Body]:
         ):
             if link.mass or link.inertia is not None:
                 found.append(_body(name, link.mass, link.centre, link.tensor, radius))
-        if scene.actuators is not None and scene.actuators.rotor_inertia:
-            found.append(_rotor(scene, leg))
+        if (motor := scene.actuators) is not None and motor.rotor_inertia:
+            # A thin disc behind its gear: only its inertia about w matters.
+            behind = motor.gear_ratio**2 * motor.rotor_inertia
+            tensor = np.diag([behind / 2.0, behind / 2.0, behind])
+            mass = _mass(tensor, base.radius)
+            rotor = Body(
+                f"rotor_{leg}", name_actuated(leg), mass, np.zeros(3), tensor, assumed=True
+            )
+            found.append(rotor)
     return found
 
 
@@ -175,15 +186,6 @@ def _body(name: str, mass: float, centre: Vector3, about_o: Array, radius: float
         return Body(name, name, _mass(about_o, radius), np.zeros(3), about_o, assumed=True)
     c = np.array(centre)
     return Body(name, name, mass, c, about_o - mass * (c @ c * np.eye(3) - np.outer(c, c)))
-
-
-def _rotor(scene: Scene, leg: int) -> Body:
-    """Return a rotor behind its gear as a thin disc: only its inertia about w matters."""
-    assert scene.actuators is not None
-    behind = scene.actuators.gear_ratio**2 * scene.actuators.rotor_inertia
-    tensor = np.diag([behind / 2.0, behind / 2.0, behind])
-    mass = _mass(tensor, scene.base.radius)
-    return Body(f"rotor_{leg}", name_actuated(leg), mass, np.zeros(3), tensor, assumed=True)
 
 
 def _mass(tensor: Array, radius: float) -> float:
@@ -273,8 +275,3 @@ def _exact(values: Iterable[float]) -> str:
 
 def _short(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
-
-
-def _name(name: str) -> str:
-    """Return the scene's name as an XML name."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)

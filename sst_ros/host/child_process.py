@@ -7,12 +7,14 @@ import contextlib
 import fcntl
 import itertools
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import Popen
 from typing import Any
 
 from sst_ros.errors import SstError
@@ -20,11 +22,12 @@ from sst_ros.errors import SstError
 PARENT = "SST_ROS_PARENT"
 """Variable with the number of the process without which a node is to end."""
 
+_END_S = 10.0
 _DOMAINS = 100
 _next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
 
 
-def start(command: str, given: dict[str, object], **more: Any) -> subprocess.Popen[str]:
+def start(command: str, given: dict[str, object], **more: Any) -> Popen[str]:
     """Start a node that ends when this process does, however that comes.
 
     Args:
@@ -34,12 +37,27 @@ def start(command: str, given: dict[str, object], **more: Any) -> subprocess.Pop
 
     """
     keep_domain()
-    return subprocess.Popen(
+    return Popen(
         [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)],
         env={**os.environ, PARENT: str(os.getpid())},
         text=True,
         **more,
     )
+
+
+@contextmanager
+def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[Popen[str]]:
+    """Have a node beside a block; it is told to end, and killed if that takes 10 s."""
+    with start(command, given, **more) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            try:
+                process.communicate(timeout=_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def keep_domain() -> None:

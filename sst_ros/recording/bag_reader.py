@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -259,7 +260,6 @@ class McapFile:
         self.damage: list[Damage] = []
         self.cut = False
         self.unverified = self.count = self.lost = 0
-        self._schemas: dict[int, str] = {}
         self._origin_ns = 0
 
     @property
@@ -278,18 +278,23 @@ class McapFile:
 
     def messages(self) -> Iterator[RawMessage]:
         """Yield all messages that are intact, in the order of the file."""
+        schemas: dict[int, str] = {}
+        written = 0
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
             index, data_end = self._read_index(file)
-            for record in index:
-                self._describe_channel(record)
             chunks = [one for one in index if isinstance(one, ChunkIndex)]
-            for records in self._read_at(file, chunks) if chunks else self._read_on(file):
-                for record in records:
-                    if not isinstance(record, Message):
-                        self._describe_channel(record)
-                    elif channel := self.channels.get(record.channel_id):
+            stored = self._read_at(file, chunks) if chunks else self._read_on(file)
+            for record in itertools.chain(index, stored):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    self.channels[record.id] = record.topic, schemas.get(record.schema_id, "")
+                elif isinstance(record, Statistics):
+                    written = record.message_count
+                elif isinstance(record, Message):
+                    if channel := self.channels.get(record.channel_id):
                         self.count += 1
                         yield *channel, record.log_time, record.data
                     else:
@@ -297,10 +302,7 @@ class McapFile:
                         self.damage.append(Damage(0, reason, 1))
             if index and not self.damage:
                 self._check_data(file, data_end)
-        self.lost = sum(one.messages for one in self.damage)
-        for record in index:
-            if isinstance(record, Statistics):
-                self.lost = max(self.lost, record.message_count - self.count)
+        self.lost = max(sum(one.messages for one in self.damage), written - self.count)
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
         """Return the records of the index and where it begins; none where it is not intact."""
@@ -328,10 +330,8 @@ class McapFile:
             self.damage.append(Damage(footer_at, _one_line(error)))
             return [], 0
 
-    def _read_at(
-        self, file: IO[bytes], chunks: Sequence[ChunkIndex]
-    ) -> Iterator[Sequence[McapRecord]]:
-        """Yield the records of each chunk, where the index says that it begins."""
+    def _read_at(self, file: IO[bytes], chunks: Sequence[ChunkIndex]) -> Iterator[McapRecord]:
+        """Yield the records in each chunk, where the index says that it begins."""
         for one in sorted(chunks, key=lambda one: one.chunk_start_offset):
             # Each channel of the chunk has a message index: 15 bytes, and 16 for a message.
             indexed = one.message_index_length - 15 * len(one.message_index_offsets)
@@ -339,9 +339,11 @@ class McapFile:
             file.seek(one.chunk_start_offset)
             content = io.BytesIO(file.read(one.chunk_length))
             records = StreamReader(content, skip_magic=True, emit_chunks=True).records
-            yield self._open(records, Damage(one.chunk_start_offset, "", indexed // 16, *times))
+            yield from self._open(
+                records, Damage(one.chunk_start_offset, "", indexed // 16, *times)
+            )
 
-    def _read_on(self, file: IO[bytes]) -> Iterator[Sequence[McapRecord]]:
+    def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
         """Yield the records from the beginning to where they end, or to what is no record."""
         file.seek(len(MCAP0_MAGIC))
         records = StreamReader(file, skip_magic=True, emit_chunks=True).records
@@ -357,12 +359,12 @@ class McapFile:
             if isinstance(record, Chunk):
                 times = record.message_start_time, record.message_end_time
                 broken = Damage(offset, "", 0, *times)
-                yield self._open(iter([record]), broken)
+                yield from self._open(iter([record]), broken)
             elif isinstance(record, MessageIndex):
                 if broken is not None and broken.reason:
                     broken.messages += len(record.records)
             else:
-                yield [record]
+                yield record
         if self.cut:
             yield from self._read_cut_chunk(file, offset)
         else:
@@ -386,7 +388,7 @@ class McapFile:
         self.damage.append(place)
         return ()
 
-    def _read_cut_chunk(self, file: IO[bytes], offset: int) -> Iterator[Sequence[McapRecord]]:
+    def _read_cut_chunk(self, file: IO[bytes], offset: int) -> Iterator[McapRecord]:
         """Yield the whole records of an uncompressed chunk that the file ends in."""
         file.seek(offset)
         with contextlib.suppress(Exception):  # the file ends anywhere
@@ -394,14 +396,7 @@ class McapFile:
                 return
             chunk = Chunk.read(ReadDataStream(file))
             if not chunk.compression and len(chunk.data) < chunk.uncompressed_size:
-                for record in StreamReader(io.BytesIO(chunk.data), skip_magic=True).records:
-                    yield [record]
-
-    def _describe_channel(self, record: McapRecord) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            self.channels[record.id] = (record.topic, self._schemas.get(record.schema_id, ""))
+                yield from StreamReader(io.BytesIO(chunk.data), skip_magic=True).records
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
         """Check the data section, which ends at `end`: also what lies between its chunks."""

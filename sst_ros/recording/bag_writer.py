@@ -50,7 +50,6 @@ class _McapStorage:
         self._sequence: Counter[int] = Counter()
 
     def add_msgtype(self, connection: Connection) -> None:
-        """Add the definition of a message type."""
         definition = connection.msgdef
         encoding = "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
         self._schemas[connection.msgtype] = self._writer.register_schema(
@@ -58,7 +57,6 @@ class _McapStorage:
         )
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Add a topic."""
         offered = {"offered_qos_profiles": offered_qos_profiles}
         schema = self._schemas[connection.msgtype]
         self._channels[connection.id] = self._writer.register_channel(
@@ -66,24 +64,20 @@ class _McapStorage:
         )
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Add a message."""
         self._sequence[connection.id] += 1
         channel, sequence = self._channels[connection.id], self._sequence[connection.id]
         self._writer.add_message(channel, timestamp, bytes(data), timestamp, sequence)
 
     def flush(self) -> None:
-        """End the chunk and write all to the file."""
         self._writer.flush()
 
     def close(self, version: int, metadata: str) -> None:
-        """Write the index."""
         del version
         self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
         self._writer.finish()
         self._file.close()
 
     def abort(self) -> None:
-        """Close the file as it is."""
         self._file.close()
 
 
@@ -93,7 +87,6 @@ class _McapBagWriter(Writer):
     STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
 
     def flush(self) -> None:
-        """Write all messages to the file."""
         if isinstance(self.storage, _McapStorage):
             self.storage.flush()
 

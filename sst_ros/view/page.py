@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 import time
 import webbrowser
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jinja2
@@ -93,8 +94,12 @@ class Page:
         self._server.stop()
 
     def _live(self) -> None:
-        for count in _count_frames(self._stop):
+        due = time.monotonic()
+        for count in itertools.count():
             self._update(count)
+            due = max(due + PERIOD_S, time.monotonic())  # late frames are dropped
+            if self._stop.wait(max(0.0, due - time.monotonic())):
+                return
 
     def _update(self, count: int) -> None:
         scene = self._source.scene
@@ -111,10 +116,8 @@ class Page:
             if self._state is not None:
                 drawing.show(self._state)
             if count % _SHOW_EVERY == 0:
-                status = self._source.status()
-                controls.show(self._state, status)
-                if self._state is not None:
-                    panel.show(self._state, status)
+                for shown in (panel, controls):
+                    shown.show(self._state, self._source.status())
             if count % _DRAW_EVERY == 0:
                 panel.draw()
 
@@ -126,13 +129,12 @@ class Page:
         server.gui.reset()
         _arrange(server)
         self._scene, self._state = scene, None
-        self._parts = (
-            SceneDrawing(server, scene),
-            _Panel(server, scene),
+        controls = (
             _ReplayControls(server, source)
             if isinstance(source, Replay)
-            else _RunControls(server, scene, source),
+            else _RunControls(server, scene, source)
         )
+        self._parts = SceneDrawing(server, scene), _Panel(server, scene), controls
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
         size = max(scene.base.radius, scene.star.radius)
@@ -157,16 +159,6 @@ def _arrange(server: PageServer) -> None:
     server.scene.set_up_direction("+z")
 
 
-def _count_frames(stop: threading.Event) -> Iterator[int]:
-    """Count at the rate of the page until it is stopped; late frames are dropped."""
-    count, due = 0, time.monotonic()
-    while not stop.is_set():
-        yield count
-        count += 1
-        due = max(due + PERIOD_S, time.monotonic())
-        stop.wait(max(0.0, due - time.monotonic()))
-
-
 class _Panel:
     """The numbers beside the picture: state, joints, status, and plots of gamma and torque."""
 
@@ -182,7 +174,6 @@ class _Panel:
         with gui.add_folder("status of the run", order=6.0):
             self._status = gui.add_html("")
         self._rows: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
-        self._show_head(None, RunStatus())
 
     def add(self, state: ViewState) -> None:
         """Add a state to the plots; a time that goes back begins new ones."""
@@ -193,9 +184,14 @@ class _Panel:
         if not self._rows or state.time - self._rows[-1][0] >= _WINDOW_S / _POINTS:
             self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
 
-    def show(self, state: ViewState, status: RunStatus) -> None:
-        """Show the numbers of a state."""
-        self._show_head(state, status)
+    def show(self, state: ViewState | None, status: RunStatus) -> None:
+        """Show name, phase and time, and the numbers of a state."""
+        phase = status.phase or "no simulator"
+        colour = _LEVELS[2 if phase.startswith("fault") else status.level]
+        time = "–" if state is None or state.time is None else f"{state.time:.2f} s"
+        self._head.content = str(_PANEL.head(self._scene, phase, colour, time))
+        if state is None:
+            return
         rows = (
             ("γ", "deg", np.degrees(state.gamma)),
             ("γ̇", "rad/s", state.gamma_dot),
@@ -211,15 +207,8 @@ class _Panel:
             for key, (label, unit, form) in _DIAGNOSTICS.items()
             if status.values.get(key)
         ]
-        colour = _LEVELS[status.level]
-        self._status.content = str(_PANEL.status(colour, status.message, values))
-
-    def _show_head(self, state: ViewState | None, status: RunStatus) -> None:
-        """Show name, description, phase and time."""
-        phase = status.phase or "no simulator"
-        colour = _LEVELS[2 if phase.startswith("fault") else status.level]
-        time = "–" if state is None or state.time is None else f"{state.time:.2f} s"
-        self._head.content = str(_PANEL.head(self._scene, phase, colour, time))
+        text = _PANEL.status(_LEVELS[status.level], status.message, values)
+        self._status.content = str(text)
 
     def draw(self) -> None:
         """Draw the plots."""
@@ -233,18 +222,14 @@ class _Panel:
 
 def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
     """Add a plot of three legs whose axis shows a range at least."""
-    empty = np.array([0.0, 1.0])
     lines: list[uplot.Series] = [{"label": "t [s]"}]
     for k, colour in enumerate(_COLOURS):
         lines.append({"label": f"{label[0]}{'₁₂₃'[k]}", "stroke": colour, "width": 2.0})
-    ends = {
-        end: {"soft": value, "mode": 1, "pad": 0.1}
-        for end, value in zip(("min", "max"), range_, strict=True)
-    }
+    low, high = ({"soft": value, "mode": 1, "pad": 0.1} for value in range_)
     return server.gui.add_uplot(
-        (empty, *(np.zeros(2) for _ in range(3))),
+        (np.array([0.0, 1.0]), *np.zeros((3, 2))),
         tuple(lines),
-        scales={"x": {"time": False}, "y": {"range": ends}},
+        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
         axes=({"label": "t [s]", "labelSize": 16, "size": 26}, {"label": label, "size": 44}),
         legend={"show": False},
         height=130,

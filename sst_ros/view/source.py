@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -21,7 +20,6 @@ from sst_ros.state import Vector3
 
 _PUBLISH_RATE = 100
 """Samples a second of a simulator that is only looked at [Hz]: more than a screen shows."""
-_END_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -176,23 +174,9 @@ class Replay:
         self._since = now
 
 
-@contextmanager
-def simulator(scene: str, speed: float = 1.0) -> Iterator[None]:
+def simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
-    given: dict[str, object] = {
-        "scene": scene,
-        "publish_rate": _PUBLISH_RATE,
-        "real_time_factor": speed,
-        "duration": 0.0,
-    }
-    process = child_process.start("simulator", given, stdout=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+    given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
+    return child_process.run_beside(
+        "simulator", given | {"duration": 0.0}, stdout=subprocess.DEVNULL
+    )

@@ -8,6 +8,7 @@ from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.extras import MissingDependency
 from sst_ros.recording.recording import export, read_signals
+from sst_ros.state import nanoseconds
 
 pd = pytest.importorskip("pandas")
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow: pip install .[record]")
@@ -27,10 +28,6 @@ def kept(bags, example2):
 @pytest.fixture(scope="module")
 def lossy(tmp_path_factory, bags, kept):
     return bags.write(tmp_path_factory.mktemp("lossy") / "bag", kept)
-
-
-def nanoseconds(time):
-    return time.sec * 10**9 + time.nanosec
 
 
 def expected_samples(bags, entries):
