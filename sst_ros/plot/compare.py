@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import workspace
 from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
-from sst_ros.plot.style import LINES, leg_names, legend, positive, stack, styled
+from sst_ros.plot.style import LINES, legend, positive, stack, styled
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -39,21 +38,16 @@ class Overlay(NamedTuple):
     make: Callable[[Drawn], Figure]
 
 
-def _overlay(
-    quantity: str, letter: str, unit: str, scale: float = 1.0
-) -> Callable[[Drawn], Figure]:
+def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn], Figure]:
     """Return what draws a quantity of the legs of all runs."""
+    return lambda runs: draw_legs(
+        label,
+        [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs],
+    )
 
-    def curve(run: Signals) -> tuple[Array, Array]:
-        if quantity == "tau":
-            return tick_torques(run)
-        return run.seconds(), scale * run.legs(quantity)
 
-    def make(runs: Drawn) -> Figure:
-        labels = [f"{name} [{unit}]" for name in leg_names(letter)]
-        return draw_legs(labels, ((name, *curve(run), style) for run, name, style in runs))
-
-    return make
+def _torques(runs: Drawn) -> Figure:
+    return draw_legs("τ [N m]", [(name, *tick_torques(run), look) for run, name, look in runs])
 
 
 def _difference(runs: Drawn) -> Figure:
@@ -87,12 +81,12 @@ def _sphere(runs: Drawn) -> Figure:
 
 JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
 PICTURES = {
-    "gamma": Overlay("Actuator angles", (JOINTS,), _overlay("gamma", "γ", "deg", DEGREES)),
-    "gamma_dot": Overlay("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇", "rad/s")),
+    "gamma": Overlay("Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)),
+    "gamma_dot": Overlay("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")),
     "tracking_error": Overlay(
-        "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ", "rad")
+        "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ [rad]")
     ),
-    "torques": Overlay("Applied torques", (TICKS,), _overlay("tau", "τ", "N m")),
+    "torques": Overlay("Applied torques", (TICKS,), _torques),
     "difference": Overlay("Differences from the first run", (JOINTS,), _difference),
     "sphere": Overlay("Path of E in the workspace", (TURN, SCENE.key), _sphere),
 }
@@ -113,7 +107,7 @@ def draw_comparison(
         raise InputError("plot", [Problem("compare", len(runs), allowed)])
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in known(only, PICTURES) or list(PICTURES):
+    for name in known(only, PICTURES):
         title, needs, make = PICTURES[name]
         all_runs = list(zip(runs, labels(runs), LINES, strict=False))
         drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
@@ -137,30 +131,27 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
         cannot be compared.
 
     """
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
     first, names = runs[0], labels(runs)
-    return DataFrame([_compare(first, run) for run in runs[1:]], index=names[1:])
-
-
-def _compare(first: Signals, run: Signals) -> dict[str, float]:
-    here, there = _common(first, run)
-    absent = {*first.missing, *run.missing}
-    of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
-    row: dict[str, float] = {"samples": len(here), "of": of}
-    for quantity, name, unit in (("gamma", "γ", "rad"), ("gamma_dot", "rate", "rad/s")):
-        apart = np.empty(0)
-        if JOINTS not in absent:
-            apart = run.legs(quantity)[there] - first.legs(quantity)[here]
-            apart = apart[np.isfinite(apart)]
-        row[f"{name} max [{unit}]"] = float(np.abs(apart).max()) if len(apart) else np.nan
-        row[f"{name} rms [{unit}]"] = float(np.sqrt(np.mean(apart**2))) if len(apart) else np.nan
-    turn = np.empty(0)
-    if TURN not in absent:
-        q = ("q_x", "q_y", "q_z", "q_w")
-        turn = angle_between(first.take(*q)[here], run.take(*q)[there])
-        turn = turn[np.isfinite(turn)]
-    return row | {"turn max [rad]": float(turn.max()) if len(turn) else np.nan}
+    rows: list[dict[str, float]] = []
+    for run in runs[1:]:
+        here, there = _common(first, run)
+        absent = {*first.missing, *run.missing}
+        of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
+        row: dict[str, float] = {"samples": len(here), "of": of}
+        for quantity, name, unit in (("gamma", "γ", "rad"), ("gamma_dot", "rate", "rad/s")):
+            apart = Series(dtype=float)
+            if JOINTS not in absent:
+                apart = Series(np.ravel(run.legs(quantity)[there] - first.legs(quantity)[here]))
+            row[f"{name} max [{unit}]"] = apart.abs().max()
+            row[f"{name} rms [{unit}]"] = (apart**2).mean() ** 0.5
+        turn = Series(dtype=float)
+        if TURN not in absent:
+            q = ("q_x", "q_y", "q_z", "q_w")
+            turn = Series(angle_between(first.take(*q)[here], run.take(*q)[there]))
+        rows.append(row | {"turn max [rad]": turn.max()})
+    return DataFrame(rows, index=names[1:])
 
 
 def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -32,7 +32,7 @@ from sst_ros.plot.style import (
     styled,
 )
 from sst_ros.recording.recording import Signals
-from sst_ros.recording.topic_tables import SCENE, Integers
+from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
@@ -80,15 +80,15 @@ def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
     return label, leg_names(letter), lambda run: scale * run.legs(quantity)
 
 
-def draw_legs(
-    labels: Sequence[str], series: Iterable[tuple[str, Array, Array, Mapping[str, Any]]]
-) -> Figure:
+def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]]) -> Figure:
     """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg."""
-    figure, panels = stack(labels)
+    letter, _, unit = label.partition(" ")
+    figure, panels = stack([f"{name} {unit}" for name in leg_names(letter)])
     for name, seconds, values, style in series:
         for axes, column in zip(panels, values.T, strict=True):
             axes.plot(seconds, column, label=name, **style)
     legend(panels[0])
+    span(panels, np.concatenate([seconds for _, seconds, _, _ in series]))
     return figure
 
 
@@ -102,23 +102,21 @@ def solution(run: Signals) -> Solution:
     return Solution("run", run.seconds()[rows], quaternion[rows], shown)
 
 
-def _angle(which: int) -> Callable[[Signals, Scene | None], Figure]:
+def _angle(which: int) -> Callable[[Signals, Scene], Figure]:
     return lambda run, _: motion.angle([solution(run)], which)
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
     desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
-    seconds = run.seconds()
-    figure = draw_legs(
-        [f"{name} [deg]" for name in leg_names("γ")],
+    looks = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
+    return draw_legs(
+        "γ [deg]",
         [
-            ("desired", seconds, desired, {"color": GREY, "linewidth": 3.2}),
-            ("measured", seconds, measured, {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}),
+            ("desired", run.seconds(), desired, {"color": GREY, "linewidth": 3.2}),
+            ("measured", run.seconds(), measured, looks),
         ],
     )
-    span(figure.axes, seconds)
-    return figure
 
 
 def _torques(run: Signals, _: Scene) -> Figure:
@@ -135,24 +133,20 @@ def _torques(run: Signals, _: Scene) -> Figure:
         dots = {"color": VERMILION, "linestyle": "none", "marker": ".", "markersize": 1.5}
         if inside.any():
             series.append(("commanded", at[inside], values[inside], dots))
-    figure = draw_legs([f"{name} [N m]" for name in leg_names("τ")], series)
-    span(figure.axes, seconds)
-    return figure
+    return draw_legs("τ [N m]", series)
 
 
 def tick_torques(run: Signals) -> tuple[Array, Array]:
-    """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held."""
+    """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held.
+
+    A gap between ticks is nan.
+    """
     start = run.time_ns("ticks")
-    length = run.take("length", table="ticks")[:, 0].astype(np.int64)
-    return few(*held(start, start + length, run.legs("tau", "ticks")))
-
-
-def held(start_ns: Integers, end_ns: Integers, values: Array) -> tuple[Array, Array]:
-    """Return times [s] and values that draw a zero-order hold; a gap between ticks is nan."""
-    times = np.stack([start_ns, end_ns], axis=1).ravel() / NANOSECONDS
-    steps = np.repeat(values, 2, axis=0)
-    gaps = 2 * (np.flatnonzero(start_ns[1:] != end_ns[:-1]) + 1)
-    return np.insert(times, gaps, times[gaps]), np.insert(steps, gaps, np.nan, axis=0)
+    end = start + run.take("length", table="ticks")[:, 0].astype(np.int64)
+    seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
+    torques = np.repeat(run.legs("tau", "ticks"), 2, axis=0)
+    gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
+    return few(np.insert(seconds, gaps, seconds[gaps]), np.insert(torques, gaps, np.nan, axis=0))
 
 
 def _energy(run: Signals, scene: Scene) -> Figure:
@@ -272,7 +266,7 @@ def draw_run(
     """
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in known(only, PICTURES) or list(PICTURES):
+    for name in known(only, PICTURES):
         picture = PICTURES[name]
         if absent := [key for key in picture.needs if key in run.missing]:
             missing[name] = "the bag has no " + ", no ".join(absent)
@@ -300,8 +294,8 @@ def save(
     return paths
 
 
-def known(only: Iterable[str], names: Iterable[str]) -> list[str]:
-    """Return the names that are asked for.
+def known(only: Sequence[str], names: Iterable[str]) -> list[str]:
+    """Return the names that are asked for, all where none is.
 
     Raises:
         InputError: one of them is none of `names`.
@@ -311,4 +305,4 @@ def known(only: Iterable[str], names: Iterable[str]) -> list[str]:
     problems = [Problem("only", name, allowed) for name in only if name not in names]
     if problems:
         raise InputError("plot", problems)
-    return list(only)
+    return list(only or names)
