@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -42,9 +42,6 @@ ESTIMATES = (
     "hold error if torques are those of the start",
     "the same, of the middle",
 )
-
-Series: TypeAlias = "Mapping[str, tuple[Array, Array] | None]"
-"""Times or computing times and values by name; None for what was not recorded."""
 
 
 @styled
@@ -86,40 +83,28 @@ class Panel(NamedTuple):
     over_time: bool = True
 
 
-def _missing(values: Array | None) -> str:
+def _missing(values: Array) -> str:
     """Return why a panel of values is left out; empty where some of them are known."""
-    return "" if values is not None and np.isfinite(values).any() else NOT_RECORDED
+    return "" if np.isfinite(values).any() else NOT_RECORDED
 
 
-def _curve(
-    title: str, label: str, seconds: Array, values: Array | None, reason: str = "", **looks: Any
-) -> Panel:
-    """Return a panel of one curve, small values in a power of ten; left out for a `reason`.
-
-    `around` is the value that it should have, which a line shows.
-    """
-    around = looks.pop("around", None)
-    absent = reason or _missing(values)
-    if values is None or absent:
-        return Panel(title, Axes.set_axis_off, absent)
+def _draw_curve(
+    axes: Axes, seconds: Array, values: Array, label: str, around: float | None = None, **looks: Any
+) -> None:
+    """Draw one curve; small values in a power of ten, or with a line at what they should be."""
     shown, unit = (values, "") if around is not None else scale_down(values)
-
-    def draw(axes: Axes) -> None:
-        axes.set_ylabel(label.replace("[", f"[{unit}"))
-        axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
-        if around is not None:
-            axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
-            widen(axes, np.append(shown, around), 0.04)
-
-    return Panel(title, draw, absent)
+    axes.set_ylabel(label.replace("[", f"[{unit}"))
+    axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
+    if around is not None:
+        axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
+        widen(axes, np.append(shown, around), 0.04)
 
 
-def _draw_used(axes: Axes, estimates: Series, reports: int) -> None:
+def _draw_used(axes: Axes, estimates: Mapping[str, tuple[Array, Array]], reports: int) -> None:
     """Draw errors [rad] over computing time [s] by name; curves of `reports` points are marked."""
     axes.set_xlabel("computing time of all steps [ms]")
     axes.set_ylabel("error of the orientation [rad]")
-    for (name, curve), style in zip(estimates.items(), LINES, strict=False):
-        used, values = curve or (np.empty(0), np.empty(0))
+    for (name, (used, values)), style in zip(estimates.items(), LINES, strict=False):
         marker = "o" if len(used) == reports else ""
         axes.plot(1e3 * used, positive(values), label=name, marker=marker, markersize=4, **style)
     axes.set_yscale("log")
@@ -134,13 +119,11 @@ def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
     reach = max(1.0, 1.05 * float(np.abs(off).max()))
     axes.hist(off, bins=np.linspace(-reach, reach, 81).tolist(), color=BLUE, log=True)
     axes.set_ylim(bottom=0.5)
-    shares = {"p99": 99.0, "p99.9": 99.9}
     numbers = {"nominal": nominal_us, "min": period_us.min(), "mean": period_us.mean()}
     numbers["max"] = period_us.max()
-    for (name, share), colour, line in zip(
-        shares.items(), (VERMILION, GREEN), ("--", ":"), strict=True
-    ):
-        numbers[name] = float(np.percentile(period_us, share))
+    for share, colour, line in ((99.0, VERMILION, "--"), (99.9, GREEN, ":")):
+        name = f"p{share:g}"
+        numbers[name] = np.percentile(period_us, share)
         place = numbers[name] - nominal_us
         axes.axvline(place, color=colour, linestyle=line, linewidth=1.5, label=name)
     text = "\n".join(f"{name} {value:.1f} µs" for name, value in numbers.items())
@@ -148,7 +131,7 @@ def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
     axes.legend(fontsize=8, loc="upper right")
 
 
-def _draw_losses(axes: Axes, losses: Series, end: float) -> None:
+def _draw_losses(axes: Axes, losses: Mapping[str, tuple[Array, Array] | None], end: float) -> None:
     """Draw running counts of losses over time [s] by name; None for what was not recorded."""
     axes.set_ylabel("count")
     most = 0.0
@@ -172,7 +155,7 @@ def draw_overview(
     run: Recording, integration: Comparison, timing: Timing, summary: dict[str, Any]
 ) -> Figure:
     """Draw a run on one page; the footnote names what has no data."""
-    panels = _panels(run, integration, timing)
+    panels = [*_panels(run, integration, timing)]
     shown = [panel for panel in panels if not panel.missing]
     rows = -(-len(shown) // 2)
     figure = Figure(figsize=(12.0, 3.3 * rows + 0.5))
@@ -193,7 +176,7 @@ def draw_overview(
     return figure
 
 
-def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence[Panel]:
+def _panels(run: Recording, integration: Comparison, timing: Timing) -> Iterator[Panel]:
     seconds, latency, effort = run.seconds, timing.latency, run.effort_difference
     losses: dict[str, tuple[Array, Array] | None] = {
         name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
@@ -212,56 +195,37 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Sequence
     found = np.fmax.accumulate(integration.error.orientation)
     errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
     drawn = any((np.isfinite(positive(y)) & np.isfinite(x)).any() for x, y in errors)
-    late = timing.late_us / 1e3
-    same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
-    periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
-    by_name = dict(zip(ESTIMATES, errors, strict=True))
-    beside_one: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
     dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
-    return [
-        Panel(
-            "Integration error, against the same torques",
-            partial(_draw_comparison, seconds=seconds, comparison=integration),
-            "" if integration.compared else "nothing could be compared",
-        ),
-        _curve("Energy residual", "energy residual [J]", seconds, timing.energy),
-        _curve(
-            "Real-time factor (recorder clock)",
-            "real-time factor",
-            timing.pace_s,
-            timing.pace,
-            **beside_one,
-        ),
-        Panel(
-            "Period between received samples", periods, _missing(timing.period_us), over_time=False
-        ),
-        Panel("Cumulative losses", partial(_draw_losses, losses=losses, end=seconds[-1])),
-        _curve(
-            "Latency: reception of a command to the step that applies it",
-            "latency [µs]",
-            latency.time_s,
-            latency.received_us,
-            **dots,
-        ),
-        _curve("Delay of samples", "delay, less the shortest [ms]", seconds, late),
-        _curve(
-            "Effort of joint_states against applied torque",
-            "largest difference [N m]",
-            seconds,
-            effort,
-            same,
-        ),
-        Panel(
-            "Error against computing time used, over the run",
-            partial(_draw_used, estimates=by_name, reports=len(at)),
-            "" if drawn else NOT_RECORDED,
-            over_time=False,
-        ),
-        _curve(
-            "Computing time of a step, mean since the start",
-            "time [µs]",
-            at[timed],
-            step_us[timed],
-            marker="o",
-        ),
-    ]
+
+    def curve(title: str, label: str, x: Array, y: Array, reason: str = "", **looks: Any) -> Panel:
+        draw = partial(_draw_curve, seconds=x, values=y, label=label, **looks)
+        return Panel(title, draw, reason or _missing(y))
+
+    yield Panel(
+        "Integration error, against the same torques",
+        partial(_draw_comparison, seconds=seconds, comparison=integration),
+        "" if integration.compared else "nothing could be compared",
+    )
+    yield curve("Energy residual", "energy residual [J]", seconds, timing.energy)
+    looks: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
+    pace = "Real-time factor (recorder clock)"
+    yield curve(pace, "real-time factor", timing.pace_s, timing.pace, **looks)
+    periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
+    missing = _missing(timing.period_us)
+    yield Panel("Period between received samples", periods, missing, over_time=False)
+    yield Panel("Cumulative losses", partial(_draw_losses, losses=losses, end=seconds[-1]))
+    title = "Latency: reception of a command to the step that applies it"
+    yield curve(title, "latency [µs]", latency.time_s, latency.received_us, **dots)
+    late = "delay, less the shortest [ms]"
+    yield curve("Delay of samples", late, seconds, timing.late_us / 1e3)
+    title = "Effort of joint_states against applied torque"
+    same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
+    yield curve(title, "largest difference [N m]", seconds, effort, same)
+    yield Panel(
+        "Error against computing time used, over the run",
+        partial(_draw_used, estimates=dict(zip(ESTIMATES, errors, strict=True)), reports=len(at)),
+        "" if drawn else NOT_RECORDED,
+        over_time=False,
+    )
+    title = "Computing time of a step, mean since the start"
+    yield curve(title, "time [µs]", at[timed], step_us[timed], marker="o")

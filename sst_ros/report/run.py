@@ -166,24 +166,26 @@ def summarise(
 ) -> dict[str, Any]:
     """Collect all figures of the report but those of `timing`."""
     tracked = tracking.of(run)
-    found = None if tracked is None else tracked.metrics
+    found = tracked and tracked.metrics
     summary = {
         "scene": run.scene.name,
         "bag": str(run.path),
         **_read_diagnostics(run),
         **_loss(run),
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
-        "tracking_error_rms_rad": None if found is None else found.rms.tolist(),
-        "tracking_error_max_rad": None if found is None else found.largest.tolist(),
-        "settling_time_s": None if found is None else found.settling,
-        **_largest("integration_error", integration.error, run.seconds),
+        "tracking_error_rms_rad": found and found.rms.tolist(),
+        "tracking_error_max_rad": found and found.largest.tolist(),
+        "settling_time_s": found and found.settling,
+        **_largest("integration_error", integration.error),
+        "integration_error_gamma_largest_at_s": _peak(integration.error.gamma, run.seconds)[1],
         **_largest("integration_reference_error", integration.own),
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
     }
     if ideal:
-        summary |= _largest("ideal_difference", ideal.error, run.seconds)
+        summary |= _largest("ideal_difference", ideal.error)
+        summary["ideal_difference_gamma_largest_at_s"] = _peak(ideal.error.gamma, run.seconds)[1]
         summary |= _largest("ideal_reference_error", ideal.own)
         summary["hold_order"] = hold_order(run)
     off, when = _peak(run.effort_difference, run.seconds)
@@ -242,15 +244,10 @@ def _loss(run: Recording) -> dict[str, Any]:
     }
 
 
-def _largest(name: str, deviation: Deviation, seconds: Array | None = None) -> dict[str, Any]:
-    """Largest value of each quantity, and when gamma's was reached."""
-    result: dict[str, Any] = {
-        f"{name}_{quantity}_{unit}": _peak(getattr(deviation, quantity))[0]
-        for quantity, unit in QUANTITIES.items()
-    }
-    if seconds is not None:
-        result[f"{name}_gamma_largest_at_s"] = _peak(deviation.gamma, seconds)[1]
-    return result
+def _largest(name: str, deviation: Deviation) -> dict[str, Any]:
+    """Largest value of each quantity."""
+    found = deviation._asdict().items()
+    return {f"{name}_{key}_{QUANTITIES[key]}": _peak(values)[0] for key, values in found}
 
 
 def _peak(values: Array, seconds: Array | None = None) -> tuple[float | None, float | None]:
@@ -309,8 +306,8 @@ def _notes(run: Recording, integration: Comparison, ideal: Comparison | None) ->
 
 def _number(reported: dict[str, str], key: str) -> float | None:
     try:
-        value = float(reported[key])
-    except (KeyError, ValueError):
+        value = float(reported.get(key, "nan"))
+    except ValueError:
         return None
     return value if math.isfinite(value) else None
 
