@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -55,102 +55,83 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
     return figure
 
 
-class _Measure(NamedTuple):
-    """A quantity on the map: its values (n,), its colours, and the colour bar's unit."""
-
-    title: str
-    values: Array
-    colours: str
-    unit: str
-
-    @property
-    def condition(self) -> bool:
-        """Whether it is cond J: logarithmic, from 1, and the least is the best."""
-        return self.unit == "cond J"
-
-
 def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
     view = View(chart.geometry)
     poses = workspace.parallel_singularities(chart)
-    share = f"E reaches {100 * _reach(chart, faces):.0f} % of the triangle"
+    a, b, c = (chart.s[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
+    share = f"E reaches {100 * reach:.0f} % of the triangle"
     worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
     least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
     figure.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
     turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
     margin = np.degrees(chart.best_margin)
-    panels = (
-        _Measure("Free turn of the star about OE", turn, "viridis", "deg"),
-        _Measure("Best condition of J over that turn", chart.best_cond_j, "magma_r", "cond J"),
-        _Measure("Distance to the nearest limit, best turn", margin, "viridis", "deg"),
-    )
-    for axes, panel in zip(figure.subplots(1, 3), panels, strict=True):
-        _panel(axes, view, chart, faces, panel)
-        axes.set_title(panel.title, fontsize=10.5, color=INK, loc="center")
-        if not panel.condition:
-            continue
-        ends = workspace.serial_singularities(chart.geometry)
-        marked = [
-            (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
-            (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
-        ]
-        for found, marker, size, colour, label in marked:
-            if len(found):
-                x, y = view.flat(found.rotation[:, :, 2])
-                axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
-                axes.plot([], [], "o", markersize=4, color=colour, label=label)
-                axes.legend(loc="upper right", fontsize=8, frameon=False)
-
-
-def _reach(chart: OrientationMap, faces: NDArray[np.intp]) -> float:
-    """Part of the triangle's area that E can be on."""
-    a, b, c = (chart.s[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return float(np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area))
+    left, axes, right = figure.subplots(1, 3)
+    for panel, name, values in (
+        (left, "Free turn of the star about OE", turn),
+        (axes, "Best condition of J over that turn", chart.best_cond_j),
+        (right, "Distance to the nearest limit, best turn", margin),
+    ):
+        _panel(panel, view, chart, faces, values, condition=panel is axes)
+        panel.set_title(name, fontsize=10.5, color=INK, loc="center")
+    ends = workspace.serial_singularities(chart.geometry)
+    for found, marker, size, colour, label in (
+        (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
+        (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
+    ):
+        if len(found):
+            x, y = view.flat(found.rotation[:, :, 2])
+            axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
+            axes.plot([], [], "o", markersize=4, color=colour, label=label)
+            axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
 def _panel(
-    axes: Axes, view: View, chart: OrientationMap, faces: NDArray[np.intp], panel: _Measure
+    axes: Axes,
+    view: View,
+    chart: OrientationMap,
+    faces: NDArray[np.intp],
+    values: Array,
+    *,
+    condition: bool,
 ) -> None:
+    """Draw values (n,): angles [deg], or cond J: logarithmic, from 1, and the least is the best."""
     x, y = view.flat(chart.s)
-    mesh, values = Triangulation(x, y, faces), panel.values
+    mesh = Triangulation(x, y, faces)
     axes.tripcolor(mesh, np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
     known = np.isfinite(values)
     if known.any():
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        norm = LogNorm(1.0, WORST_COND) if panel.condition else Normalize(0.0, high)
+        norm = LogNorm(1.0, WORST_COND) if condition else Normalize(0.0, high)
         # Values go on past the edge of the workspace, and the picture is cut there.
         nearest = cKDTree(chart.s[known]).query(chart.s)[1]
         whole = np.where(known, values, values[known][nearest])
         inside = chart.measures.margin.max(axis=1)
         edge = axes.tricontourf(mesh, inside, levels=[0.0, np.pi], alpha=0.0)
-        looks: Looks = {
-            "cmap": panel.colours,
-            "norm": norm,
-            "shading": "gouraud",
-            "rasterized": True,
-        }
-        filled = axes.tripcolor(mesh, whole, **looks)
-        lines = _contours(axes, mesh, whole, panel.condition)
+        looks: Looks = {"norm": norm, "shading": "gouraud", "rasterized": True}
+        filled = axes.tripcolor(mesh, whole, cmap="magma_r" if condition else "viridis", **looks)
+        lines = _contours(axes, mesh, whole, condition)
         inset = LinearTriInterpolator(mesh, np.arcsin((chart.s @ chart.geometry.w.T).min(axis=1)))
         for label in lines[1:]:
             label.set_visible(bool(inset(*label.get_position()).filled(0.0) > LABEL_INSET))
         if not known.all():
             for part in (filled, *lines):
                 part.set_clip_path(edge.get_paths()[0], axes.transData)
-        above = "max" if panel.condition and high > WORST_COND else "neither"
+        above = "max" if condition and high > WORST_COND else "neither"
         bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, extend=above)
-        bar.set_label(panel.unit, fontsize=9)
+        bar.set_label("cond J" if condition else "deg", fontsize=9)
         bar.ax.tick_params(labelsize=8)
-        if panel.condition:
+        if condition:
             bar.set_ticks([1, 1.5, 2, 3, 5, 10], labels=["1", "1.5", "2", "3", "5", "10"])
             bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        goal = low if panel.condition else high
+        goal = low if condition else high
         near = np.abs(values - goal) <= 0.01 * abs(goal)
         best = int(np.nanargmax(np.where(near, chart.best_margin, np.nan)))
         place = x[best], y[best]
         axes.plot(*place, "*", markersize=13, color="white", markeredgecolor=INK)
-        text = f"least {goal:.2f}" if panel.condition else f"most {goal:.0f}°"
+        text = f"least {goal:.2f}" if condition else f"most {goal:.0f}°"
         box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
         beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
         axes.annotate(text, place, (0, 8), color=INK, **beside)

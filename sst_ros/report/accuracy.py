@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +76,7 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
             "ends": study.ends,
             "compiled": study.compiled,
             "reference": study.reference.how,
-            "reference_own_error": asdict(study.reference.own),
+            "reference_own_error": study.reference.own._asdict(),
             "formulation_difference_relative": study.formulation,
             "advice": study.advice._asdict(),
             "advice_measured_error_rad": study.measured and study.measured[0],
@@ -89,12 +88,6 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
 
 def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
     """Return the fastest setting of each scene for each target: method, setting, time."""
-    found = [
-        (study, target, best)
-        for study in studies
-        for target in TARGETS
-        if (best := study.best(target) if target >= study.floor else None) is not None
-    ]
     rows = [
         {
             "scene": study.scene,
@@ -104,9 +97,16 @@ def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
             "wall_s": best.wall_min_s,
             "share": best.wall_min_s / study.seconds,
         }
-        for study, target, best in found
+        for study in studies
+        for target, best in _choose(study).items()
     ]
     return data_frame(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
+
+
+def _choose(study: WorkPrecision) -> dict[float, Series[Any]]:
+    """Return the fastest setting for each of TARGETS that has one and is not below the floor."""
+    found = {target: study.best(target) for target in TARGETS if target >= study.floor}
+    return {target: row for target, row in found.items() if row is not None}
 
 
 def fastest(study: WorkPrecision, target: float = TARGET) -> str:
@@ -182,14 +182,11 @@ def facts(study: WorkPrecision) -> Iterator[str]:
 
 def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
     """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
-    found, rows = summary(studies), []
+    rows = []
     for each in studies:
-        own = found[found.scene == each.scene].set_index("target")
-        cells = {
-            f"{t:.0e} rad": f"{own.setting[t]}: {_time(own.wall_s[t])}" if t in own.index else None
-            for t in TARGETS
-        }
+        words = {t: f"{setting(row)}: {_time(row.wall_min_s)}" for t, row in _choose(each).items()}
         run = "at rest" if each.rests else f"{each.seconds:g} s"
+        cells = {f"{target:.0e} rad": words.get(target) for target in TARGETS}
         rows.append({"scene": each.scene, "run": run, **cells})
     costs = data_frame({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
     return render(
@@ -221,8 +218,7 @@ def figure(study: WorkPrecision) -> Figure:
         _draw_grid(axes, rows, quantity, least)
         axes.set_ylabel(label)
         axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
-    found = {target: study.best(target) for target in TARGETS if target >= floor}
-    best = {target: row for target, row in found.items() if row is not None}
+    best = _choose(study)
     ring = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
     for target, row in best.items():
         panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")

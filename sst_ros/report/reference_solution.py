@@ -14,9 +14,9 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,8 +61,7 @@ EXACT = replace(
 size would show; here they do, exactly."""
 
 
-@dataclass(frozen=True)
-class StateError:
+class StateError(NamedTuple):
     """Distance from the reference: orientation [rad], gamma [rad], gamma_dot [rad/s]."""
 
     orientation: float
@@ -80,8 +79,10 @@ class InitialValueProblem:
         system: right-hand side, torques and work included.
         drive: its constant inputs, all zero.
         start: state at time zero, shape (n,).
-        interval_ns: time between the instants of comparison [ns].
+        interval_ns, interval: time between the instants of comparison [ns], [s].
         count: number of intervals.
+        times: instants of comparison [s], shape (count + 1,).
+        seconds: time span [s].
         ends: why the span ends before the scene's duration; empty where it does not.
         clamped: the torques exceed the limit of the actuators.
         kinked: the right-hand side has kinks.
@@ -105,21 +106,9 @@ class InitialValueProblem:
         self.clamped = limit is not None and largest > limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
         self.interval_ns, self.count, self.ends = self._horizon()
-
-    @property
-    def interval(self) -> float:
-        """Time between the instants of comparison [s]."""
-        return self.interval_ns / NANOSECONDS
-
-    @property
-    def seconds(self) -> float:
-        """Time span [s]."""
-        return self.count * self.interval_ns / NANOSECONDS
-
-    @property
-    def times(self) -> Array:
-        """Instants of comparison [s], shape (count + 1,)."""
-        return self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
+        self.interval = self.interval_ns / NANOSECONDS
+        self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
+        self.seconds = float(self.times[-1])
 
     def errors(
         self, solution: Array | NDArray[np.longdouble], reference: NDArray[np.longdouble]
@@ -195,8 +184,7 @@ class InitialValueProblem:
         return interval_ns, math.floor(whole * NANOSECONDS * (1 + 1e-9) / interval_ns), ends
 
 
-@dataclass(frozen=True)
-class ReferenceSolution:
+class ReferenceSolution(NamedTuple):
     """States at the instants of comparison, their own error, and how they were found."""
 
     states: LongArray

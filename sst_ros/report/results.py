@@ -41,8 +41,7 @@ def data_frame(
         MissingDependency: pandas is not installed.
 
     """
-    listed = list(rows)
-    names = None if columns is None else list(columns)
+    listed, names = list(rows), columns and list(columns)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
         values = [row.get(name) for row in listed]
@@ -107,7 +106,6 @@ def provenance(*, compiled: bool | None = None) -> str:
 
 def made_on() -> dict[str, Any]:
     """Return versions, machine and date of a report."""
-    versions = {name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")}
     try:
         own = metadata.version("sst_ros")
     except metadata.PackageNotFoundError:  # run from a source tree that is not installed
@@ -115,7 +113,7 @@ def made_on() -> dict[str, Any]:
     return {
         "sst_ros": own,
         "python": platform.python_version(),
-        **versions,
+        **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
         "numba": numba_version(),
         "processor": processor(),
         "platform": platform.platform(),

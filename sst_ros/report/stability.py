@@ -151,12 +151,12 @@ def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) ->
 
     """
     found = examine_stability(scene, only, shown=True)
-    said = page(found)
+    said, runs = page(found), data_frame(run._asdict() for run in found.runs)
     print(said)
-    steps, runs = records(found.steps.replace(math.inf, None)), records(_run_table(found))
-    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs}
+    steps = records(found.steps.replace(math.inf, None))
+    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": records(runs)}
     figures = {"stability": figure(found)}
-    write(out, "stability", csv=_run_table(found), document=document, page=said, figures=figures)
+    write(out, "stability", csv=runs, document=document, page=said, figures=figures)
     return found.passed
 
 
@@ -282,72 +282,69 @@ def _rougher(scene: Scene, _: Trajectory) -> Scene | str:
     return dataclasses.replace(scene, friction=JointFriction(**joints))
 
 
-def _at_limit(quantity: Callable[[workspace.Measures], Array]) -> Change:
+Quantity: TypeAlias = "Callable[[workspace.Measures], Array]"
+"""Something that is measured of poses, shape (n,)."""
+
+
+def _at_limit(quantity: Quantity) -> Change:
     """Start at the nearest pose in which a distance to a limit is zero, going into it."""
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
-        found = _first_zeros(scene, motion, quantity)
-        if not len(found.angle):
+        start = rotation_matrix(motion.quaternion[0])
+        axes, angles = _first_zeros(Geometry.of(scene), start, quantity)
+        if not len(angles):
             return "no turn of the star meets it"
-        poses = found.poses(found.angle)
+        poses = _turn(start, axes, angles)
         # Where another limit is met as well, or before, that one ends the run.
-        beyond = _measure(found.geometry, poses).margin < -1e-9
-        nearest = int(np.lexsort((found.angle, beyond))[0])
-        return _start(scene, poses[nearest], SPIN * found.axis[nearest])
+        beyond = _measure(Geometry.of(scene), poses).margin < -1e-9
+        nearest = int(np.lexsort((angles, beyond))[0])
+        return _start(scene, poses[nearest], SPIN * axes[nearest])
 
     return change
 
 
 def _beside_singularity(scene: Scene, motion: Trajectory) -> Scene | str:
     """Start at rest beside the nearest pose with det J1 = 0 or det J2 = 0."""
+    geometry, start = Geometry.of(scene), rotation_matrix(motion.quaternion[0])
     candidates: list[tuple[bool, float, Array]] = []
     for quantity in (lambda found: found.det_j1, lambda found: found.det_j2):
-        found = _first_zeros(scene, motion, quantity)
-        poses = found.poses(np.maximum(found.angle - BESIDE, 0.0))
-        outside = ~_measure(found.geometry, poses).admissible
-        candidates += zip(outside.tolist(), found.angle.tolist(), poses, strict=True)
+        axes, angles = _first_zeros(geometry, start, quantity)
+        poses = _turn(start, axes, np.maximum(angles - BESIDE, 0.0))
+        outside = ~_measure(geometry, poses).admissible
+        candidates += zip(outside.tolist(), angles.tolist(), poses, strict=True)
     if not candidates:
         return "no turn of the star meets one"
     _, _, pose = min(candidates, key=lambda candidate: candidate[:2])
     return _start(scene, pose, np.zeros(3))
 
 
-class _Zeros(NamedTuple):
-    """Turns of the star from its start about axes (n, 3) by angles (n,) [rad]."""
+def _first_zeros(geometry: Geometry, start: Array, quantity: Quantity) -> tuple[Array, Array]:
+    """Turn the star about many axes up to where a quantity becomes zero.
 
-    geometry: Geometry
-    start: Array
-    axis: Array
-    angle: Array
+    Returns:
+        Axes (n, 3) and angles (n,) [rad] where it does.
 
-    def poses(self, angle: Array) -> Array:
-        """Orientations after turns by other angles about the axes, shape (n, 3, 3)."""
-        turns = Rotation.from_rotvec(angle[:, None] * self.axis).as_matrix()
-        return np.asarray(turns @ self.start)
-
-
-def _first_zeros(
-    scene: Scene, motion: Trajectory, quantity: Callable[[workspace.Measures], Array]
-) -> _Zeros:
-    """Turn the star about many axes up to where a quantity becomes zero; those where it does."""
-    geometry = Geometry.of(scene)
-    start = rotation_matrix(motion.quaternion[0])
+    """
     axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     angles = np.linspace(0.0, np.pi, TURNS)
-    every = _Zeros(geometry, start, np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
-    values = quantity(_measure(geometry, every.poses(every.angle))).reshape(len(axes), TURNS)
+    every = _turn(start, np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
+    values = quantity(_measure(geometry, every)).reshape(len(axes), TURNS)
     sign = np.sign(values[0, 0])
     beyond = sign * values <= 0.0
     meets = beyond.any(axis=1) & ~beyond[:, 0]
-    first = beyond.argmax(axis=1)[meets]
-    found = _Zeros(geometry, start, axes[meets], angles[first - 1])
+    axes, first = axes[meets], beyond.argmax(axis=1)[meets]
     low, high = angles[first - 1], angles[first]
     for _ in range(40):
         middle = 0.5 * (low + high)
-        inside = sign * quantity(_measure(geometry, found.poses(middle))) > 0.0
+        inside = sign * quantity(_measure(geometry, _turn(start, axes, middle))) > 0.0
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    return found._replace(angle=low)
+    return axes, low
+
+
+def _turn(start: Array, axes: Array, angles: Array) -> Array:
+    """Orientations after turns about axes (n, 3) by angles (n,) [rad], shape (n, 3, 3)."""
+    return np.asarray(Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start)
 
 
 def _measure(geometry: Geometry, rotation: Array) -> workspace.Measures:
@@ -377,10 +374,6 @@ ROWS: dict[str, tuple[str, Change]] = {
     "singularity": (f"from {BESIDE:g} rad beside the nearest singularity", _beside_singularity),
 }
 """Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""
-
-
-def _run_table(found: StabilityReport) -> DataFrame:
-    return data_frame((run._asdict() for run in found.runs), StressRun._fields)
 
 
 def step_lines(found: StabilityReport) -> Iterator[str]:

@@ -44,15 +44,7 @@ GROWTH = 1e-6
 
 
 class StepAdvice(NamedTuple):
-    """A recommendation.
-
-    Attributes:
-        text: a sentence or two.
-        method: what `auto` takes, as `Trajectory.method` has it; empty where the scene cannot
-            start.
-        step: mean length of its steps [s]; nan where there is none.
-
-    """
+    """A recommendation in words, and what `auto` takes: method and mean step [s], nan for none."""
 
     text: str
     method: str = ""

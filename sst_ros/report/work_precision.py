@@ -14,7 +14,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -391,8 +391,7 @@ def _result(
         if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
             failure = f"off by {largest.orientation:.1g} rad"
         else:
-            errors = (*asdict(final).values(), *asdict(largest).values())
-            row |= dict(zip(ERRORS, errors, strict=True))
+            row |= dict(zip(ERRORS, (*final, *largest), strict=True))
             energy, row["closure_residual"] = problem.residuals(states[-1])
             row["energy_residual_J"] = energy if math.isfinite(energy) else None
             row["below_floor"] = largest.orientation < ABOVE_REFERENCE * truth.own.orientation

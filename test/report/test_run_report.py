@@ -5,7 +5,6 @@ import base64
 import dataclasses
 import importlib
 import json
-import math
 import re
 import sys
 from pathlib import Path
@@ -68,14 +67,6 @@ def whole(tmp_path_factory, bags, example2):
     return write_run_report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
 
 
-def _numbers(value):
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        return [number for entry in value for number in _numbers(entry)]
-    return [value] if isinstance(value, (int, float)) else []
-
-
 def test_the_summary_is_written_whole_and_finite(whole):
     summary, out = whole
 
@@ -84,7 +75,6 @@ def test_the_summary_is_written_whole_and_finite(whole):
 
     text = (out / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=refuse) == summary
-    assert len(_numbers(summary)) > 30 and all(map(math.isfinite, _numbers(summary)))
     counts = {"ticks": 300, "ticks_missed": 0, "samples_published": 151, "samples_recorded": 151}
     periods = {"sample_period_s": 0.002, "tick_period_s": 0.001, "step_mean_us": 160.5}
     none = {"samples_lost": 0, "stamp_gaps": 0, "effort_difference_max_N_m": 0.0, "fault": ""}
@@ -114,7 +104,6 @@ def test_the_pictures_are_pictures(whole):
     names = [*(f"fig{name}.png" for name in figures), "torques.png", "error.png"]
     assert summary["pictures"] == names
     for name in names:
-        assert (out / name).stat().st_size > 10_000
         pixels = image.imread(out / name)
         assert pixels.shape[0] > 500 and pixels.shape[1] > 800
         coloured = np.ptp(pixels[:, :, :3], axis=2) > 0.2
@@ -145,10 +134,10 @@ def test_the_page_shows_text_as_text(whole):
     assert "&lt;script&gt;" in page and not re.search("<script>|<b>|<i>", page)
 
 
-def test_loss_is_counted_and_survived(read, bags, example2):
+def test_loss_is_counted_and_survived(read, bags, lively):
     lost = {20, 21, 60, 150}  # the last one can only be missed by what was published
-    kept = [e for e in bags.without(example2, bags.COMMANDS) if e.sample not in lost]
-    summary = evaluate_run(read(kept)).summary
+    found = evaluate_run(read([e for e in lively if e.sample not in lost]))
+    summary = found.summary
     assert summary["samples_published"] == 151 and summary["samples_recorded"] == 147
     assert (summary["samples_lost"], summary["stamp_gaps"]) == (4, 2)
     assert summary["samples_missing_between_stamps"] == 3
@@ -157,21 +146,28 @@ def test_loss_is_counted_and_survived(read, bags, example2):
     assert summary["integration_error_gamma_rad"] < 1e-11
     assert any("began again 2 times" in note for note in summary["notes"])
     assert "Note: torques are missing" in summary_table(summary)
+    assert summary["energy_residual_max_J"] < 1e-12
+    assert found.timing.lost_s == pytest.approx([0.040, 0.042, 0.120])
+    assert found.timing.gaps_s == pytest.approx([0.038, 0.118])
+    assert len(found.timing.period_us) == 144
 
 
 def test_what_is_not_recorded_is_unknown(read, bags, example2):
-    found = evaluate_run(read(bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)))
-    summary = found.summary
-    assert summary["ticks"] is summary["real_time_factor"] is summary["phase"] is None
-    assert summary["samples_lost"] == 0
+    kept = bags.without(example2, bags.DIAGNOSTICS, bags.EULER, bags.COMMANDS)
+    summary = evaluate_run(read(kept)).summary
+    unknown = ("ticks", "real_time_factor", "phase", "command_latency_mean_us")
+    assert [summary[key] for key in unknown] == [None] * 4
+    assert summary["samples_lost"] == summary["commands_followed"] == 0
     assert summary["topics_missing"] == ["euler_zyz", "diagnostics", "commands"]
-    assert any("no diagnostics" in note for note in summary["notes"])
-    assert any("euler_zyz is not recorded" in note for note in summary["notes"])
+    for words, where in (
+        ("no diagnostics", "notes"),
+        ("euler_zyz is not recorded", "notes"),
+        ("no commands are recorded", "unknown"),
+        ("no diagnostics", "unknown"),
+    ):
+        assert any(words in line for line in summary[where])
     line = next(line for line in summary_table(summary).splitlines() if "ticks done" in line)
     assert line.split()[-1] == "-"
-    assert summary["command_latency_mean_us"] is None and summary["commands_followed"] == 0
-    assert any("no commands are recorded" in words for words in summary["unknown"])
-    assert any("no diagnostics" in words for words in summary["unknown"])
 
 
 def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
@@ -195,10 +191,24 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path, written, example2)
         write_run_report(written(example2), tmp_path / "file")
 
 
-def test_a_good_run_is_ok_in_few_lines(read, bags, example2):
-    plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate_run(read([*plain, *commands(bags, 1, 600_000)])).summary
-    said = text_of(summary)
+@pytest.fixture
+def commanded(read, bags, example2):
+    """Summary and text of a run with a command every so many ticks, received so much after it."""
+
+    def evaluate(period, received_ns):
+        plain = bags.without(example2, bags.COMMANDS)
+        summary = evaluate_run(read([*plain, *commands(bags, period, received_ns)])).summary
+        return summary, text_of(summary)
+
+    return evaluate
+
+
+def text_of(summary):
+    return summary_text(summary | {"page": ["page.png"], "pictures": []}, "out")
+
+
+def test_a_good_run_is_ok_in_few_lines(commanded):
+    summary, said = commanded(1, 600_000)
     lines = said.splitlines()
     assert (summary["verdict"], summary["reasons"]) == ("OK", [])
     assert lines[0] == "OK: example2" and 12 <= len(lines) <= 18
@@ -207,30 +217,29 @@ def test_a_good_run_is_ok_in_few_lines(read, bags, example2):
     assert "negative" not in said and "minimum -" not in said
 
 
-def text_of(summary):
-    return summary_text(summary | {"page": ["page.png"], "pictures": []}, "out")
-
-
-def test_a_slow_controller_is_warned_of(read, bags, example2):
-    plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate_run(read([*plain, *commands(bags, 40, 600_000)])).summary
-    first = text_of(summary).splitlines()[0]
-    assert first.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
+def test_a_slow_controller_is_warned_of(commanded):
+    summary, said = commanded(40, 600_000)
+    assert said.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
     assert summary["command_age_mean_s"] == pytest.approx(0.0187, abs=0.002)
 
 
-def test_a_negative_delay_has_its_meaning(read, bags, example2):
-    plain = bags.without(example2, bags.COMMANDS)
-    summary = evaluate_run(read([*plain, *commands(bags, 1, 1_900_000)])).summary
+def test_a_negative_delay_has_its_meaning(commanded):
+    summary, said = commanded(1, 1_900_000)
     assert summary["command_latency_min_us"] < 0.0
-    said = text_of(summary)
     assert "the recorder received a command after the step that applied it" in said
 
 
-def test_losses_and_errors_are_reasons(read, bags, example2):
+def test_an_altered_effort_and_lost_samples_are_reasons_and_show_when_they_were(
+    read, bags, example2
+):
     change = more_effort(1e-9 * np.eye(9)[1])
     entries = bags.edited(bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change)
-    summary = evaluate_run(read([e for e in entries if e.sample not in {20, 21, 60}])).summary
+    run = read([e for e in entries if e.sample not in {20, 21, 60}])
+    off, summary = run.effort_difference, evaluate_run(run).summary
+    assert np.isnan(off[0]) and run.seconds[off > 0.0].tolist() == [0.15]
+    assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
+    assert summary["effort_difference_largest_at_s"] == 0.15
+    assert "(at 0.15 s)" in summary_table(summary)
     said = "; ".join(summary["reasons"])
     assert summary["verdict"] == "WARNING" and "3 samples lost" in said
     assert "2 gaps between applied torques" in said and "efforts differ" in said
@@ -256,8 +265,10 @@ def test_the_command_prints_verdict_and_files_and_all_when_asked(
     assert "Largest over the run" in capsys.readouterr().out
 
 
-def test_periods_and_latency_are_what_they_were_made(read, lively):
-    found = timing.measure(read(lively))
+@pytest.mark.parametrize("clock_ns", [0, -(10**15)])
+def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, clock_ns):
+    entries = [dataclasses.replace(e, received_ns=e.received_ns + clock_ns) for e in lively]
+    found = timing.measure(read(entries))
     numbers = timing.numbers(found)
     assert found.nominal_us == 2000.0 and len(found.period_us) == 150
     assert numbers["period_min_us"] == 1970.0 and numbers["period_max_us"] == 2030.0
@@ -271,14 +282,6 @@ def test_periods_and_latency_are_what_they_were_made(read, lively):
     assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
     assert numbers["energy_residual_max_J"] < 1e-12
     assert not len(found.lost_s) and not len(found.gaps_s) and numbers["unknown"] == []
-
-
-def test_lost_samples_and_dropped_ticks_have_their_times(read, lively):
-    found = timing.measure(read([entry for entry in lively if entry.sample not in (20, 21, 60)]))
-    assert found.lost_s == pytest.approx([0.040, 0.042, 0.120])
-    assert found.gaps_s == pytest.approx([0.038, 0.118])
-    assert len(found.period_us) == 145
-    assert timing.numbers(found)["energy_residual_max_J"] < 1e-12
 
 
 def test_a_dropped_tick_shows(read, bags, example2):
@@ -302,23 +305,6 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
-def test_an_altered_effort_of_joint_states_shows_when_it_was(read, bags, example2):
-    run = read(bags.edited(example2, bags.JOINTS, 75, more_effort(1e-9 * np.eye(9)[1])))
-    off = run.effort_difference
-    assert np.isnan(off[0]) and np.flatnonzero(off > 0.0).tolist() == [75]
-    summary = evaluate_run(run).summary
-    assert summary["effort_difference_max_N_m"] == pytest.approx(1e-9, rel=1e-6)
-    assert summary["effort_difference_largest_at_s"] == 0.15
-    assert "(at 0.15 s)" in summary_table(summary)
-
-
-def test_stamps_of_another_clock_do_not_matter(read, lively):
-    entries = [dataclasses.replace(e, received_ns=e.received_ns - 10**15) for e in lively]
-    numbers = timing.numbers(timing.measure(read(entries)))
-    assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
-    assert numbers["period_max_us"] == 2030.0
-
-
 def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bags, example2):
     """The torque of every other tick answers the sample of two milliseconds before it."""
     entries = list(example2)
@@ -340,17 +326,20 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bag
     assert numbers["command_latency_mean_us"] == pytest.approx(1050.0, abs=1e-2)
 
 
+def panel_of(run, title):
+    """A panel of the overview."""
+    found = evaluate_run(run)
+    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
+    return next(axes for axes in drawn.axes if axes.get_title("left").startswith(title))
+
+
 def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, example2):
     entries = list(example2)
     for k in (1, 2):
         said = {"phase": "running", "ticks": 100 * k, "step_mean_us": 50.0}
         said |= {"error_estimate": 10.0 ** -(12 - k), "hold_error_start": 1e-3 * k}
         entries.append(bags.diagnostics_entry(bags.START_NS + k * 100_000_000, **said))
-    run = read(entries)
-    found = evaluate_run(run)
-    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
-    titles = {axes.get_title("left"): axes for axes in drawn.axes}
-    panel = titles["Error against computing time used, over the run"]
+    panel = panel_of(read(entries), "Error against computing time used, over the run")
     curves = {line.get_label(): line.get_xydata() for line in panel.lines}
     error = curves["integration error"]
     estimate = curves["its estimate by the simulator"]
@@ -363,14 +352,11 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, e
 
 def test_a_slow_run_shows_its_real_time_factor_beside_one(read, bags, example2):
     """At a thousandth of real time numbers are what they are, and the line at 1 is in sight."""
+    start = bags.START_NS
     slow = [
-        dataclasses.replace(e, received_ns=bags.START_NS + 2000 * (e.received_ns - bags.START_NS))
-        for e in example2
+        dataclasses.replace(e, received_ns=start + 2000 * (e.received_ns - start)) for e in example2
     ]
-    run = read(slow)
-    found = evaluate_run(run)
-    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
-    panel = next(a for a in drawn.axes if a.get_title("left").startswith("Real-time factor"))
+    panel = panel_of(read(slow), "Real-time factor")
     assert panel.lines[0].get_ydata() == pytest.approx(1 / 2000, rel=0.1)
     low, high = panel.get_ylim()
     assert low < 1 / 2000 and high > 1.0
@@ -412,24 +398,17 @@ def long_run(long_bag, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_long_run_is_integrated_compiled(long_run, monkeypatch):
+def test_a_long_run_is_reported_whole_and_integrated_compiled(long_run, monkeypatch):
     """The work that a report does for it, which is what its time and memory come from."""
-    calls = 0
-    follow = TickPropagator.follow
-
-    def counted(*given):
-        nonlocal calls
-        calls += 1
-        return follow(*given)
-
-    assert len(long_run.time_ns) == 10_001 and len(long_run.ticks.start_ns) == 20_000
-    monkeypatch.setattr(TickPropagator, "follow", counted)
-    integration, ideal = reference.integration(long_run), reference.ideal(long_run)
-    energy = timing.energy_residual(long_run, [])
-    assert calls == 3  # both references and the energy, in one call each
-    assert integration.compared == 10_001 and integration.error.gamma.max() < 1e-12
-    assert integration.own.gamma.max() < 1e-13 and ideal.error.gamma.max() < 1e-2
-    assert np.abs(energy).max() < 1e-11
+    follow, calls = TickPropagator.follow, []
+    monkeypatch.setattr(TickPropagator, "follow", lambda *given: calls.append(0) or follow(*given))
+    integration, ideal, summary = evaluate_run(long_run)[1:]
+    assert len(calls) == 3  # both references and the energy, in one call each
+    assert summary["samples_recorded"] == summary["samples_compared"] == 10_001
+    assert (summary["ticks_recorded"], summary["commands_followed"]) == (20_000, 10_000)
+    assert summary["command_latency_mean_us"] == pytest.approx(750.0)
+    assert integration.error.gamma.max() < 1e-12 and integration.own.gamma.max() < 1e-13
+    assert ideal.error.gamma.max() < 1e-2 and summary["energy_residual_max_J"] < 1e-11
 
 
 @pytest.mark.slow
@@ -445,12 +424,3 @@ def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
     assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201
     assert plain[0].error.gamma[:201] == pytest.approx(compiled[0].error.gamma[:201], abs=1e-15)
     assert plain[1][:201] == pytest.approx(compiled[1][:201], abs=1e-13)
-
-
-@pytest.mark.slow
-def test_a_minute_is_reported_whole(long_bag, tmp_path):
-    summary = write_run_report(long_bag.write(tmp_path / "bag", 60.0), tmp_path / "out")
-    assert summary["samples_recorded"] == summary["samples_compared"] == 30_001
-    assert summary["integration_error_gamma_rad"] < 1e-12
-    assert summary["commands_followed"] == 30_000
-    assert summary["command_latency_mean_us"] == pytest.approx(750.0)
