@@ -77,15 +77,11 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
 
 def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
     """Return one line for each parameter file that has no parameters for the node of the words."""
-    node, namespace = f"sst_{command}", ""
     given, _ = _ros_parser().parse_known_args(_split(words)[1])
-    for rule in given.remap:
-        if found := re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule):
-            if found[1] == "ns":
-                namespace = found[2].strip("/")
-            else:
-                node = found[2]
-    full = "/" + "/".join(filter(None, (namespace, node)))
+    rules = [re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule) for rule in given.remap]
+    renamed = {rule[1].replace("name", "node"): rule[2] for rule in rules if rule}
+    parts = renamed.get("ns", "").strip("/"), renamed.get("node", f"sst_{command}")
+    full = "/" + "/".join(filter(None, parts))
     lines = []
     for path in given.params_file:
         patterns = ["/" + pattern.strip("/") for pattern in _nodes_of(_document(path))]
@@ -114,9 +110,8 @@ def unknown_parameter(name: str, known: Sequence[str]) -> Problem:
 
 def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Sort words into plain options and ROS arguments, as rcl does."""
-    plain: list[str] = []
-    ros: list[str] = []
-    here = plain
+    here = plain = list[str]()
+    ros = list[str]()
     for word in words:
         if word == "--ros-args":
             here = ros
@@ -241,4 +236,5 @@ def _as_yaml(spec: Spec, word: str) -> str:
     elif spec.kind == "texts":
         value = [part.strip() for part in word.strip("[]").split(",")]
     text = json.dumps(accept(spec, value), ensure_ascii=False)
+    # rcl reads 1e-9 as text.
     return re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text

@@ -9,7 +9,7 @@ from array import array
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import CancelResponse, GoalResponse
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -17,12 +17,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.control.controller import Measurement
 from sst_ros.control.law import Command
-from sst_ros.control.tracking import tracking_table
+from sst_ros.control.tracking import TrackingMetrics, tracking_table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
-from sst_ros.nodes.topics import ActionGoal, TorqueCommands
+from sst_ros.nodes.topics import ActionGoal, TorqueCommands, serve_action
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -92,7 +92,7 @@ class InverseDynamicsController:
         if self._began and not self.done.is_set():
             self._commands.send(ZERO)
         self._report()
-        self._print()
+        _print(self.follower.tracking())
 
     def _hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does.
@@ -108,7 +108,7 @@ class InverseDynamicsController:
         if phase.data == "waiting" and self._began and news:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._goals.interrupt("the simulator was reset")
-            self._print()
+            _print(self.follower.tracking())
             self.follower.restart()
             self._began = False
 
@@ -163,9 +163,9 @@ class InverseDynamicsController:
     def _publish(self, state: JointState, command: Command) -> None:
         """Publish reference and tracking error under the stamp of the sample."""
         at = command.desired
-        for publisher, (position, velocity), effort in (
-            (self._reference, (at.gamma, at.gamma_dot), command.feedforward),
-            (self._error, (command.error, command.error_rate), command.feedback),
+        for publisher, position, velocity, effort in (
+            (self._reference, at.gamma, at.gamma_dot, command.feedforward),
+            (self._error, command.error, command.error_rate, command.feedback),
         ):
             message = JointState(name=list(ACTUATORS))
             message.header.stamp = state.header.stamp
@@ -180,16 +180,15 @@ class InverseDynamicsController:
 
     def take(self, trajectory: JointTrajectory) -> bool:
         """Follow a trajectory, or log why not; return whether it is followed."""
+        tracking = self.follower.tracking()
         try:
-            tracking = self.follower.tracking()
             self.follower.take(trajectory, self._seen)
         except SstError as error:
             self.refuse(error)
             return False
         finally:
             self._commands.restart_timeout()  # no message could be received during the check
-        if tracking is not None:
-            print(tracking_table(tracking), flush=True)
+        _print(tracking)
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
         return True
 
@@ -208,11 +207,10 @@ class InverseDynamicsController:
     def _report(self) -> None:
         """Publish the diagnostics."""
         follower = self.follower
-        rms, largest = follower.errors
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         counts = follower.samples, follower.irregular, follower.limited
         refusals = follower.refused, follower.last_refusal
-        row = (stage, self.parameters.mode, *counts, rms, largest, *refusals)
+        row = (stage, self.parameters.mode, *counts, *follower.errors, *refusals)
         values: dict[str, object] = dict(zip(KEYS, row, strict=True))
         doubts = [
             words
@@ -227,17 +225,11 @@ class InverseDynamicsController:
         text = "; ".join([stage, *doubts])
         self._diagnostics.publish(topics.diagnostics(self.node, "control", level, text, values))
 
-    def _print(self) -> None:
-        """Print the tracking errors of the last motion."""
-        if (tracking := self.follower.tracking()) is not None:
-            print(tracking_table(tracking), flush=True)
 
-
-class _ActiveGoal(ActionGoal):
-    def __init__(self, handle: Any, goal: TrajectoryGoal) -> None:
-        super().__init__(handle)
-        self.goal = goal
-        self.feedback: Any = None
+def _print(tracking: TrackingMetrics | None) -> None:
+    """Print the tracking errors of a motion."""
+    if tracking is not None:
+        print(tracking_table(tracking), flush=True)
 
 
 class FollowJointTrajectoryServer:
@@ -245,29 +237,24 @@ class FollowJointTrajectoryServer:
 
     def __init__(self, controller: InverseDynamicsController) -> None:
         self._controller, self._follower = controller, controller.follower
-        self._active: _ActiveGoal | None = None
+        self._active: ActionGoal | None = None
         self._accepted: TrajectoryGoal | None = None
+        self._goal: TrajectoryGoal | None = None
+        self._feedback: Any = None
         if FollowJointTrajectory is None:
             return
-        self._server: Any = ActionServer(
-            controller.node,
-            FollowJointTrajectory,
-            topics.CONTROLLER["follow_joint_trajectory"].name,
-            lambda _: FollowJointTrajectory.Result(),
-            goal_callback=self._check,
-            handle_accepted_callback=self._begin,
-            cancel_callback=self._cancel,
-        )
+        name = topics.CONTROLLER["follow_joint_trajectory"].name
+        callbacks = {"goal_callback": self._check, "cancel_callback": self._cancel}
+        serve_action(controller.node, FollowJointTrajectory, name, self._begin, **callbacks)
         every(controller.node, _FEEDBACK_PERIOD_S, self._report)
 
     def sample(self, state: JointState, measured: Measurement, command: Command) -> None:
         """Test the tolerances of the active goal at a sample of the run that was answered."""
-        active = self._active
-        if active is None or self._end_if_canceled(active):
+        if self._goal is None or not self._is_active():
             return
         time = self._follower.time
-        active.feedback = state.header.stamp, time, measured, command
-        outcome = active.goal.outcome(time, command.error, command.error_rate)
+        self._feedback = state.header.stamp, self._goal.index(time), time, measured, command
+        outcome = self._goal.outcome(time, command.error, command.error_rate)
         if outcome is None:
             return
         self._report()
@@ -277,7 +264,7 @@ class FollowJointTrajectoryServer:
 
     def interrupt(self, reason: str) -> None:
         """Abort the active goal; what is followed now is not its concern any more."""
-        if self._active is not None and not self._end_if_canceled(self._active):
+        if self._is_active():
             self._end(ErrorCode.INVALID_GOAL, reason)
 
     def close(self) -> None:
@@ -301,8 +288,7 @@ class FollowJointTrajectoryServer:
 
     def _begin(self, handle: Any) -> None:
         self.interrupt("preempted by a new goal")
-        assert self._accepted is not None
-        self._active = _ActiveGoal(handle, self._accepted)
+        self._active, self._goal, self._feedback = ActionGoal(handle), self._accepted, None
 
     def _cancel(self, handle: Any) -> CancelResponse:
         """Stop; the goal ends after this call, when its handle has changed to canceling."""
@@ -310,10 +296,11 @@ class FollowJointTrajectoryServer:
             self._follower.stop()
         return CancelResponse.ACCEPT
 
-    def _end_if_canceled(self, active: _ActiveGoal) -> bool:
-        if active.handle.is_cancel_requested:
+    def _is_active(self) -> bool:
+        """Whether there is a goal; one that was canceled ends."""
+        if self._active is not None and self._active.handle.is_cancel_requested:
             self._end(ErrorCode.SUCCESSFUL, "canceled")
-        return self._active is None
+        return self._active is not None
 
     def _end(self, code: ErrorCode, message: str) -> None:
         active, self._active = self._active, None
@@ -324,18 +311,17 @@ class FollowJointTrajectoryServer:
 
     def _report(self) -> None:
         """Publish feedback of the last sample, once."""
-        active = self._active
-        if active is None or self._end_if_canceled(active) or active.feedback is None:
+        if not self._is_active() or self._feedback is None or self._active is None:
             return
-        (stamp, time, measured, command), active.feedback = active.feedback, None
-        desired, total = command.desired, command.torque
+        (stamp, index, time, measured, command), self._feedback = self._feedback, None
+        desired = command.desired
         message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
-        message.header.stamp, message.index = stamp, active.goal.index(time)
+        message.header.stamp, message.index = stamp, index
         message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
         message.desired.accelerations = array("d", desired.gamma_ddot)
-        message.actual = _point(time, measured.gamma, measured.gamma_dot, total)
+        message.actual = _point(time, measured.gamma, measured.gamma_dot, command.torque)
         message.error = _point(time, command.error, command.error_rate, command.feedback)
-        active.handle.publish_feedback(message)
+        self._active.handle.publish_feedback(message)
 
 
 def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> JointTrajectoryPoint:

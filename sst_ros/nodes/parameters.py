@@ -9,12 +9,8 @@ from array import array
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import SetParametersResult as Result
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -99,31 +95,30 @@ def _watch(node: Node, start: P, changed: Callable[[P], None] | None) -> None:
     """Check values that are set at run time, and pass them on."""
     held = [start]
 
-    def check(given: list[Parameter[Any]]) -> SetParametersResult:
+    def check(given: list[Parameter[Any]]) -> Result:
         known = specs(type(start))
         values = {parameter.name: parameter.value for parameter in given}
         if "use_sim_time" in values:
             reason = "use_sim_time is read when the node starts, and cannot be changed"
-            return SetParametersResult(successful=False, reason=reason)
+            return Result(successful=False, reason=reason)
         mine = {name: value for name, value in values.items() if name in known}
         try:
             result = dataclasses.replace(held[0], **mine)
         except InputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return Result(successful=False, reason=str(error))
         if mine and changed is not None:
             held[0] = result
             changed(result)
-        return SetParametersResult(successful=True)
+        return Result(successful=True)
 
     node.add_on_set_parameters_callback(check)
 
 
 def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
-    unit = f" [{spec.unit}]" if spec.unit else ""
     descriptor = ParameterDescriptor(
         name=name,
         type=(Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value,
-        description=spec.doc + unit,
+        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
         additional_constraints=spec.describe(),
         read_only=read_only,
     )

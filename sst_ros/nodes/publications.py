@@ -31,10 +31,11 @@ from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATORS, HasState
+from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, State, Vector3
 
 LOG_NS = 50_000_000
@@ -227,38 +228,35 @@ class PublishedClock:
     """
 
     def __init__(self, node: Node) -> None:
-        self._node = node
-        origin, name = node.get_fully_qualified_name(), "publish_clock"
+        self._node, allowed = node, ""
         if follows_clock(node):
             allowed = "a node with use_sim_time follows /clock and cannot be its source"
-            raise InputError(origin, [Problem(name, True, allowed)])
-        deadline = time.monotonic() + _DISCOVERY_S
-        others: list[str] = []
-        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
-            others = topics.publishers(node, "/clock")
-            time.sleep(0.02)
-        if others:
+        elif others := self._find_others():
             allowed = f"/clock is published already, by {', '.join(others)}"
-            raise InputError(origin, [Problem(name, True, allowed)])
+        if allowed:
+            problem = Problem("publish_clock", True, allowed)
+            raise InputError(node.get_fully_qualified_name(), [problem])
         self._publisher = topics.SIMULATOR["clock"].publisher(node)
         self.now_ns = node.get_clock().now().nanoseconds
 
-    def publish(self, now_ns: int) -> None:
-        """Publish the time."""
-        self.now_ns = now_ns
-        self.repeat()
+    def _find_others(self) -> list[str]:
+        """Wait until discovery has had its time, or one is found by its name."""
+        deadline = time.monotonic() + _DISCOVERY_S
+        others: list[str] = []
+        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
+            others = topics.publishers(self._node, "/clock")
+            time.sleep(0.02)
+        return others
 
-    def repeat(self) -> None:
-        """Publish the time again, for late subscribers."""
+    def publish(self, now_ns: int | None = None) -> None:
+        """Publish the time; without one the last again, for late subscribers."""
+        self.now_ns = self.now_ns if now_ns is None else now_ns
         self._publisher.publish(clock_message(self.now_ns))
 
     def rivals(self) -> list[str]:
         """Names of other nodes that publish /clock."""
-        found = topics.publishers(self._node, "/clock")
         own = self._node.get_fully_qualified_name()
-        if own in found:
-            found.remove(own)
-        return found
+        return [name for name in topics.publishers(self._node, "/clock") if name != own]
 
 
 class SimulatorTopics:
@@ -320,7 +318,7 @@ class SimulatorTopics:
         """Log the torque [N m] and external moment [N m] of some ticks."""
         self._log.append(torque, moment, count)
 
-    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+    def sample(self, simulation: Simulation, stamp_ns: int) -> None:
         """Publish a sample of the run, and from time to time the torques logged up to it.
 
         Raises:
@@ -351,7 +349,7 @@ class SimulatorTopics:
         joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero.
         """
         if self._clock is not None:
-            self._clock.repeat()
+            self._clock.publish()
         self.flush()
         self._torques.publish(self._log.take(0))
         with contextlib.suppress(NotFinite):  # then the last valid one is shown

@@ -19,15 +19,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces
 
 from sst_ros.errors import SstError
 from sst_ros.nodes import parameters, topics
@@ -68,7 +60,7 @@ class RecordedTopic:
     """
 
     subscription: Subscription[Any]
-    connection: Connection
+    connection: interfaces.Connection
     counted: bool
     messages: int = 0
     lost: int = 0
@@ -167,16 +159,15 @@ class Recorder:
 
     def _subscribe(self, topic: str, type_name: str, own: Endpoint | None) -> None:
         if not self._bag.knows(type_name):  # a name that others chose must not get to the import
-            self.node.get_logger().error(
-                f"{topic} is not recorded: its type {type_name} is unknown"
-            )
+            text = f"{topic} is not recorded: its type {type_name} is unknown"
+            self.node.get_logger().error(text)
             self._unknown.add(topic)
             return
         offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
         if own is None and not offers:
             return
         # That of a topic of ours does not depend on the order of discovery.
-        qos = _qos(latched=own.latched, reliable=True) if own else _offered_qos(offers)
+        qos = _qos([own.qos()] if own else offers)
         subscription = self.node.create_subscription(
             topics.message_type(type_name),
             topic,
@@ -202,15 +193,10 @@ class Recorder:
             self.done.set()
 
 
-def _offered_qos(offers: list[QoSProfile]) -> QoSProfile:
+def _qos(offers: list[QoSProfile]) -> QoSProfile:
     """QoS that all publishers can serve."""
-    return _qos(
-        latched=all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers),
-        reliable=all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers),
-    )
-
-
-def _qos(*, latched: bool, reliable: bool) -> QoSProfile:
+    latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+    reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
     return QoSProfile(
         depth=_DEPTH,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
@@ -218,19 +204,19 @@ def _qos(*, latched: bool, reliable: bool) -> QoSProfile:
     )
 
 
-def _bag_qos(asked: QoSProfile) -> Qos:
+def _bag_qos(asked: QoSProfile) -> interfaces.Qos:
     """QoS that a player of the bag offers: that of the subscription."""
-    never = QosTime(2147483647, 4294967295)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        asked.depth,
-        QosReliability[asked.reliability.name],
-        QosDurability[asked.durability.name],
-        never,
-        never,
-        QosLiveliness.AUTOMATIC,
-        never,
-        False,
+    never = interfaces.QosTime(2147483647, 4294967295)
+    return interfaces.Qos(
+        history=interfaces.QosHistory.KEEP_LAST,
+        depth=asked.depth,
+        reliability=interfaces.QosReliability[asked.reliability.name],
+        durability=interfaces.QosDurability[asked.durability.name],
+        deadline=never,
+        lifespan=never,
+        liveliness=interfaces.QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
     )
 
 

@@ -14,12 +14,11 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.action.server import ActionServer, CancelResponse
 from rclpy.node import Node
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
@@ -28,7 +27,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
-from sst_ros.nodes.topics import ActionGoal
+from sst_ros.nodes.topics import ActionGoal, serve_action
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import BASE_FRAME, Quaternion, Vector3
 
@@ -42,7 +41,6 @@ UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
 INVALID_POSE = 101
 
-_UNKNOWN = f"there is no entity {{!r}}, only {NAME!r}"
 _UNIT = 1e-3
 """Largest deviation of a quaternion's length from 1; it is normalised."""
 _SAME = 1e-6
@@ -74,7 +72,7 @@ def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:
         kind = getattr(srv, name.title().replace("_", ""))
         qos = topics.SERVICE_QOS
         node.create_service(kind, f"~/{name}", getattr(answers, name), qos_profile=qos)
-    StepsAction(node, loop)
+    offer_steps(node, loop)
     return True
 
 
@@ -165,15 +163,15 @@ class SimulationInterfaces:
 
     def get_entity_state(self, request: Any, response: Any) -> Any:
         """Return pose and twist in base_link; the acceleration is left at zero."""
-        if request.entity != NAME:
-            return answer(response, NOT_FOUND, _UNKNOWN.format(request.entity))
+        if unknown := _refuse_other(request, response):
+            return unknown
         self._fill(response.state)
         return answer(response, OK)
 
     def set_entity_state(self, request: Any, response: Any) -> Any:
         """Set the state of a run that waits or is paused; the acceleration is ignored."""
-        if request.entity != NAME:
-            return answer(response, NOT_FOUND, _UNKNOWN.format(request.entity))
+        if unknown := _refuse_other(request, response):
+            return unknown
         frame, pose, twist = request.state.header.frame_id, request.state.pose, request.state.twist
         if frame not in ("", "world", BASE_FRAME):
             return answer(response, FAILED, f"frame_id {frame!r} must be {BASE_FRAME}")
@@ -194,10 +192,10 @@ class SimulationInterfaces:
             except ValueError as error:
                 return answer(response, FAILED, str(error))
         try:
-            gamma, gamma_dot = self._actuators(quaternion, rate)
+            joints = self._actuators(quaternion, rate)
         except (AssemblyError, ArithmeticError) as error:
             return answer(response, INVALID_POSE, str(error) or "the manipulator is singular there")
-        return self._ask(response, partial(self._loop.set_state, gamma, gamma_dot))
+        return self._ask(response, partial(self._loop.set_state, *joints))
 
     def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
@@ -219,8 +217,13 @@ class SimulationInterfaces:
     def _fill(self, message: Any) -> Any:
         state = self._loop.simulation.state
         message.header.frame_id = BASE_FRAME
-        _write(message.pose.orientation, "xyzw", state.quaternion)
-        _write(message.twist.angular, "xyz", _turn(state.quaternion, state.body_rate))
+        turning = _turn(state.quaternion, state.body_rate)
+        for part, names, values in (
+            (message.pose.orientation, "xyzw", state.quaternion),
+            (message.twist.angular, "xyz", turning),
+        ):
+            for name, value in zip(names, values, strict=True):
+                setattr(part, name, value)
         return message
 
     def _ask(self, response: Any, request: Callable[[], Reply]) -> Any:
@@ -232,39 +235,30 @@ class SimulationInterfaces:
         return PLAYING if self._loop.phase in (Phase.WAITING, Phase.RUNNING) else PAUSED
 
 
-class StepsAction:
-    """The action ~/simulate_steps: steps of a paused run, with feedback after each.
+def offer_steps(node: Node, loop: RunLoop) -> None:
+    """Offer the action ~/simulate_steps: steps of a paused run, with feedback after each.
 
     A thread asks for the steps, so that the node answers meanwhile.
     """
 
-    def __init__(self, node: Node, loop: RunLoop) -> None:
-        self._loop = loop
-        self._server: Any = ActionServer(
-            node,
-            action.SimulateSteps,
-            "~/simulate_steps",
-            lambda _: action.SimulateSteps.Result(),
-            handle_accepted_callback=self._begin,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )
-
-    def _begin(self, handle: Any) -> None:
-        threading.Thread(target=self._run, args=(ActionGoal(handle),), daemon=True).start()
-
-    def _run(self, goal: ActionGoal) -> None:
+    def run(goal: ActionGoal) -> None:
         handle = goal.handle
         steps, reply = int(handle.request.steps), Reply(True, "")
         feedback = action.SimulateSteps.Feedback()
         for done in range(1, steps + 1):
             if handle.is_cancel_requested:
                 break
-            reply = self._loop.ask(self._loop.step)
+            reply = loop.ask(loop.step)
             if not reply.success:
                 break
             feedback.completed_steps, feedback.remaining_steps = done, steps - done
             handle.publish_feedback(feedback)
         goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
+
+    def begin(handle: Any) -> None:
+        threading.Thread(target=run, args=(ActionGoal(handle),), daemon=True).start()
+
+    serve_action(node, action.SimulateSteps, "~/simulate_steps", begin)
 
 
 def answer(response: Any, code: int, text: str = "") -> Any:
@@ -276,6 +270,12 @@ def answer(response: Any, code: int, text: str = "") -> Any:
 def answer_with(response: Any, reply: Reply) -> Any:
     """Fill the result of a response from a reply of the run, and return the response."""
     return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
+
+
+def _refuse_other(request: Any, response: Any) -> Any:
+    """Return the filled response where another entity than the star is meant, else None."""
+    text = f"there is no entity {request.entity!r}, only {NAME!r}"
+    return None if request.entity == NAME else answer(response, NOT_FOUND, text)
 
 
 def _turn(quaternion: Quaternion, vector: Vector3) -> Vector3:
@@ -297,8 +297,3 @@ def _unit(quaternion: Quaternion) -> Quaternion:
         raise ValueError(f"orientation has length {length:.6g}, must be 1")
     x, y, z, w = (part / length for part in quaternion)
     return x, y, z, w
-
-
-def _write(message: Any, names: str, values: Sequence[float]) -> None:
-    for name, value in zip(names, values, strict=True):
-        setattr(message, name, value)

@@ -62,11 +62,13 @@ class Simulator:
         self._topics = SimulatorTopics(self.node, simulated, given)
         self._run = given.run
         self._input = TorqueInput(self._run, simulated.actuators, *self._readers(simulated))
-        self._pacer = self._create_pacer()
-        traced = given.equations == "quaternion"
-        self._code = (
-            CodeCompiler(self.node, simulated, given) if given.compiled and traced else None
+        follows = follows_clock(self.node)
+        source, longest_ns = (
+            (FollowedClock(self.node), FOLLOWED_STEP_NS) if follows else (SteadyTime(), 0)
         )
+        self._pacer = Pacer(self._run.period_ns, given.real_time_factor, source, longest_ns)
+        compiles = given.compiled and given.equations == "quaternion"
+        self._code = CodeCompiler(self.node, simulated, given) if compiles else None
         self._latency = scheduling.CpuDmaLatency()
         self._loop = RunLoop(
             simulated, self._build, self._run, self._input, self._pacer, self._topics
@@ -123,20 +125,13 @@ class Simulator:
 
     def _build(self, simulated: Scene) -> Simulation:
         given = self.parameters
-        compiled = self._code is not None and self._code.available
         return Simulation(
             simulated,
             given.integrator,
             tolerance=given.tolerance,
-            compiled=compiled,
+            compiled=self._code is not None and self._code.available,
             equations=given.equations,
         )
-
-    def _create_pacer(self) -> Pacer:
-        speed = self._run.period_ns, self.parameters.real_time_factor
-        if follows_clock(self.node):
-            return Pacer(*speed, FollowedClock(self.node), FOLLOWED_STEP_NS)
-        return Pacer(*speed, SteadyTime())
 
     def _readers(self, simulated: Scene) -> list[Reader]:
         names = ["commands", "commands_stamped"]

@@ -184,21 +184,20 @@ class Endpoint:
 
     def publisher(self, node: Node, depth: int = 0, *, simulator: str = "") -> Publisher[Any]:
         """Create its publisher."""
-        return node.create_publisher(self.kind, self.resolve(simulator), self._qos(depth))
+        return node.create_publisher(self.kind, self.resolve(simulator), self.qos(depth))
 
     def subscription(
         self, node: Node, callback: Callable[[Any], None], *, simulator: str = ""
     ) -> Subscription[Any]:
         """Create its subscription."""
-        return node.create_subscription(
-            self.kind, self.resolve(simulator), callback, self._qos(self.depth)
-        )
+        return node.create_subscription(self.kind, self.resolve(simulator), callback, self.qos())
 
     def resolve(self, simulator: str) -> str:
         """Return its name with that of the simulator's node."""
         return self.name.replace("{simulator}", simulator)
 
-    def _qos(self, depth: int) -> QoSProfile:
+    def qos(self, depth: int = 10) -> QoSProfile:
+        """Return its QoS; the depth is for a topic that has none of its own."""
         durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
@@ -216,8 +215,7 @@ def _read(table: str) -> dict[str, dict[str, Endpoint]]:
                 use, name, kind, *more = head.split()
                 depth, latched = int(more[0]) if more else 10, "latched" in more
                 last = name.rpartition("/")[2]
-                doc = " ".join(text)
-                nodes[node][last] = Endpoint(use, name, kind, depth, latched, when, doc)
+                nodes[node][last] = Endpoint(use, name, kind, depth, latched, when, " ".join(text))
     return nodes
 
 
@@ -384,6 +382,16 @@ class TorqueCommands:
         silent = time.monotonic() - self._received
         if silent > self._given.timeout:
             raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
+
+
+def serve_action(
+    node: Node, kind: Any, name: str, begin: Callable[[Any], None], **callbacks: Callable[..., Any]
+) -> None:
+    """Serve an action whose goals are `ActionGoal`s, made by `begin` from a handle of rclpy."""
+    from rclpy.action.server import ActionServer, CancelResponse  # most nodes have no action
+
+    given: dict[str, Any] = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **callbacks}
+    ActionServer(node, kind, name, lambda _: None, handle_accepted_callback=begin, **given)
 
 
 class ActionGoal:

@@ -96,8 +96,7 @@ class Viewer:
     def reset(self) -> tuple[bool, str]:
         """Return to the initial state."""
         reply = self._call("reset", Trigger.Request())
-        if reply[0]:
-            self._restart()
+        self._start_ns = 0 if reply[0] else self._start_ns  # time counts from the next sample
         return reply
 
     def apply(self, torque: Vector3) -> None:
@@ -125,12 +124,8 @@ class Viewer:
 
     def _take_phase(self, message: String) -> None:
         if message.data == "waiting" and self._phase:  # the first that is heard is no news
-            self._restart()
+            self._start_ns = 0
         self._phase = message.data
-
-    def _restart(self) -> None:
-        """Count time from the next sample."""
-        self._start_ns = 0
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         name = f"{self.node.resolve_topic_name(self._parameters.simulator)}: run"
@@ -142,14 +137,12 @@ class Viewer:
 
     def _look(self) -> None:
         """Look for another node that publishes commands, and leave the run to it."""
-        own, node = self.node.get_fully_qualified_name(), self._parameters.simulator
-        names = (
+        own, simulator = self.node.get_fully_qualified_name(), self._parameters.simulator
+        names = [
             name
             for topic in ("commands", "commands_stamped")
-            for name in topics.publishers(
-                self.node, self.node.resolve_topic_name(f"{node}/{topic}")
-            )
-        )
+            for name in topics.publishers(self.node, f"{simulator}/{topic}")
+        ]
         self._controller = next((name for name in names if name != own), "")
         if self._controller:
             self._driving = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 from sst_ros.dynamics.model import limits_of
 from sst_ros.host import scheduling
@@ -13,6 +13,7 @@ from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import Phase, RunLoop
 from sst_ros.runtime.tick_loop import HeldTorques
 from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
@@ -74,17 +75,6 @@ KEYS = {
 """Keys of /diagnostics, in order."""
 
 
-class TableRow(NamedTuple):
-    """State of the run at one time, for the table at the end."""
-
-    simulated_s: float
-    factor: float
-    missed: int
-    error: object
-    energy: object
-    closure: object
-
-
 class RunDiagnostics:
     """Collects the counters of the parts of the node."""
 
@@ -97,21 +87,18 @@ class RunDiagnostics:
         self._before = (0, 0.0)
         self._noted: tuple[int, ...] = (0, 0, 0, 0)
         self._warned: list[str] = []
-        self._rows: list[TableRow] = []
-        self._last: TableRow | None = None
+        self._rows: list[str] = []
+        self._last: tuple[float, str] | None = None
         self._count, self._stride = 0, 1
 
     def values(self, publishers: int) -> dict[str, Any]:
         """Return the value of each key that has one."""
         count, commands = self._loop.counters, self._input
-        ticks, wall, factor = count.ticks, count.wall_s, 0.0
+        ticks, wall, age = count.ticks, count.wall_s, commands.age
         mean, deviation, largest = count.lateness_us
-        passed = wall - self._before[1]
-        if passed > 0:
-            factor = (ticks - self._before[0]) * self._period_s / passed
+        new, passed = ticks - self._before[0], wall - self._before[1]
         self._before = (ticks, wall)
-        age = commands.age
-        values = {
+        values: dict[str, Any] = {
             "phase": self._loop.phase.value,
             "ticks": ticks,
             "ticks_missed": self._pacer.missed,
@@ -126,7 +113,7 @@ class RunDiagnostics:
             "late_std_us": deviation,
             "late_max_us": largest,
             "real_time_factor": ticks * self._period_s / wall if wall else 0.0,
-            "real_time_factor_now": factor,
+            "real_time_factor_now": new * self._period_s / passed if passed > 0 else 0.0,
             "wall_time_s": wall,
             "simulated_time_s": ticks * self._period_s,
             "commands_received": commands.received,
@@ -146,7 +133,7 @@ class RunDiagnostics:
             "fault": self._loop.fault,
         }
         if ticks:
-            self._keep_row(ticks * self._period_s, ticks * self._period_s / wall if wall else 0.0)
+            self._keep_row(values["simulated_time_s"], values["real_time_factor"])
         return values
 
     def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
@@ -194,26 +181,26 @@ class RunDiagnostics:
             f"{'real-time':>10} {'ticks':>8}"
         )
         yield f"{'[s]':>12} {'[rad]':>11} {'[J]':>11} {'[1]':>11} {'factor':>10} {'missed':>8}"
-        for row in [*self._rows, *filter(None, [self._last])]:
-            numbers = " ".join(
-                f"{value:11.2e}" if isinstance(value, float) else f"{'-':>11}"
-                for value in (row.error, row.energy, row.closure)
-            )
-            yield f"{row.simulated_s:12.3f} {numbers} {row.factor:10.3f} {row.missed:8d}"
+        yield from self._rows
+        if self._last is not None:
+            yield self._last[1]
 
     def _keep_row(self, simulated_s: float, factor: float) -> None:
         """Keep the newest row and at most 16 before it, evenly over the run."""
         keys = ("error_estimate", "energy_residual_J", "closure_residual")
-        error, energy, closure = (self.gauges.get(key) for key in keys)
-        row = TableRow(simulated_s, factor, self._pacer.missed, error, energy, closure)
-        if self._last is not None and self._last.simulated_s != row.simulated_s:
+        numbers = " ".join(
+            f"{value:11.2e}" if isinstance(value, float) else f"{'-':>11}"
+            for value in map(self.gauges.get, keys)
+        )
+        row = f"{simulated_s:12.3f} {numbers} {factor:10.3f} {self._pacer.missed:8d}"
+        if self._last is not None and self._last[0] != simulated_s:
             self._count += 1
             if self._count % self._stride == 0:
-                self._rows.append(self._last)
+                self._rows.append(self._last[1])
             if len(self._rows) >= _ROWS:
                 self._rows = self._rows[1::2]
                 self._stride *= 2
-        self._last = row
+        self._last = simulated_s, row
 
 
 def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
@@ -221,10 +208,9 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     state, hold = simulation.state, held.errors(simulation)
     conditioning = simulation.conditioning
     angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
-    margins: dict[bool, list[float]] = {True: [], False: []}
+    margins: dict[str, list[float]] = {"gamma": [], "mu": [], "beta": []}
     for limit in limits_of(simulation.scene, simulation.geometry):
-        if limit.joint < 3 or limit.joint >= 6:
-            margins[limit.joint < 3].append(limit.distance(angles))
+        margins[JOINTS[limit.joint].partition("_")[0]].append(limit.distance(angles))
     values: dict[str, object] = {
         "error_estimate": simulation.error_estimate,
         "rate_error_estimate": simulation.rate_error_estimate,
@@ -234,15 +220,15 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
         "closure_residual": simulation.closure_residual,
         "singularity_serial": conditioning["sin_mu"],
         "singularity_parallel": conditioning["det_j2"],
-        "stroke_margin_rad": min(margins[True], default=None),
-        "workspace_margin_rad": min(margins[False], default=None),
+        "stroke_margin_rad": min(margins["gamma"], default=None),
+        "workspace_margin_rad": min(margins["beta"], default=None),
         "integrator": simulation.method,
         "integrator_changes": len(simulation.changes),
         "step_evaluations": simulation.evaluations / max(simulation.accepted_steps, 1),
         "step_budget": simulation.step_budget,
     }
-    return {key: value for key, value in values.items() if _is_known(value)}
-
-
-def _is_known(value: object) -> bool:
-    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+    return {
+        key: value
+        for key, value in values.items()
+        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
+    }

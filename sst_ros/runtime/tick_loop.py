@@ -12,7 +12,7 @@ from typing import Protocol
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import Pacer, RunSettings
-from sst_ros.runtime.torque_input import HasState, TorqueInput
+from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import State, Vector3
@@ -45,7 +45,7 @@ class RunOutput(Protocol):
     def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
         """Log the torque [N m] and external moment [N m] of some ticks."""
 
-    def sample(self, simulation: HasState, stamp_ns: int) -> None:
+    def sample(self, simulation: Simulation, stamp_ns: int) -> None:
         """Publish a sample of the run, and from time to time the torques logged up to it."""
 
     def flush(self) -> None:
@@ -162,11 +162,9 @@ class HeldTorques:
     def _sum(self) -> None:
         """Add what the last torque has done."""
         if self._last is not None:
-            self._seconds += self._held
-            self._impulse = [
-                p + torque * self._held for p, torque in zip(self._impulse, self._last, strict=True)
-            ]
-            self._held = 0.0
+            held, self._held = self._held, 0.0
+            self._seconds += held
+            self._impulse = [p + a * held for p, a in zip(self._impulse, self._last, strict=True)]
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
@@ -175,8 +173,7 @@ class HeldTorques:
         """
         self._sum()
         first, second, last = self._first, self._second, self._last
-        lags = len(simulation.dynamics.state) > 7
-        if first is None or second is None or last is None or lags:
+        if not (first and second and last) or len(simulation.dynamics.state) > 7:
             return None
         period = self._seconds / self._changes
         count = self._seconds / period

@@ -12,7 +12,8 @@ from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators
-from sst_ros.state import NANOSECONDS, State, Vector3, clamp, finite_vector, nanoseconds
+from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import NANOSECONDS, Vector3, clamp, finite_vector, nanoseconds
 
 ACTUATORS = JOINTS[:3]
 
@@ -30,18 +31,6 @@ class Arrivals(Protocol):
 
     def read(self, until_ns: float) -> Sequence[Any]:
         """Return the next messages that arrived until this monotonic time [ns], within bounds."""
-
-
-class HasState(Protocol):
-    """A simulation, as far as its state is read."""
-
-    @property
-    def state(self) -> State:
-        """Present state; built when it is read."""
-
-    @property
-    def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
-        """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
 
 
 class MessageRefused(Exception):
@@ -127,7 +116,7 @@ class TorqueInput:
             self._take(time.monotonic_ns())
         return self.begun
 
-    def torque(self, simulation: HasState, now_ns: int) -> Vector3:
+    def torque(self, simulation: Simulation, now_ns: int) -> Vector3:
         """Return the torques of the tick that begins at this monotonic time [ns], in N m."""
         self._take(now_ns)
         if not self._has_expired(now_ns):
@@ -167,8 +156,7 @@ class TorqueInput:
         if found := self._stamped.read(now_ns):
             for message in self._complete(found):
                 self._use(torque_by_name, message, now_ns)
-        if self._moments is not None:
-            self._take_moments(now_ns)
+        self._take_moments(now_ns)
 
     def _complete(self, found: Sequence[Any]) -> Sequence[Any]:
         """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""

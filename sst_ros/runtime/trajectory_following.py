@@ -12,7 +12,7 @@ import dataclasses
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
@@ -62,14 +62,19 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
     if problems := [*_trajectory_faults(message, begin)]:
         raise InputError("joint_trajectory", problems)
     places = [list(message.joint_names).index(name) for name in ACTUATORS]
-    points = message.points
+
+    def by_leg(quantity: str) -> list[list[float]]:
+        """Sort by leg what is whole; what is not is refused as it is."""
+        rows = [list(map(float, getattr(point, quantity))) for point in message.points]
+        return [[row[k] for k in places] if len(row) == len(places) else row for row in rows]
+
     return through_points(
         geometry,
         begin.quaternion,
-        [nanoseconds(point.time_from_start) / NANOSECONDS for point in points],
-        [_by_leg(point.positions, places) for point in points],
-        [_by_leg(point.velocities, places) for point in points],
-        [_by_leg(point.accelerations, places) for point in points],
+        [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points],
+        by_leg("positions"),
+        by_leg("velocities"),
+        by_leg("accelerations"),
         begin=(begin.gamma_dot, begin.gamma_ddot),
     )
 
@@ -88,11 +93,6 @@ def _trajectory_faults(message: Any, begin: Reference) -> Iterator[Problem]:
     if first is not None and not nanoseconds(first.time_from_start):
         allowed = "must be > 0 s while the reference is moving"
         yield Problem("points[0].time_from_start", 0.0, allowed)
-
-
-def _by_leg(values: Sequence[float], places: Sequence[int]) -> list[float]:
-    """Sort by leg what is whole; what is not is refused as it is."""
-    return [float(values[k]) for k in places] if len(values) == len(places) else list(values)
 
 
 class ErrorCode(IntEnum):
@@ -135,18 +135,23 @@ class TrajectoryGoal:
     """
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
-        problems = [*_multi_dof(message)]
-        own = {"position": defaults.path_tolerance, "velocity": 0.0}
+        given = message.multi_dof_trajectory
+        problems = [
+            Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
+            for name, rows in (
+                ("multi_dof_trajectory.joint_names", given.joint_names),
+                ("multi_dof_trajectory.points", given.points),
+                ("component_path_tolerance", message.component_path_tolerance),
+                ("component_goal_tolerance", message.component_goal_tolerance),
+            )
+            if len(rows)
+        ]
+        own = defaults.path_tolerance, 0.0
         self.path = _tolerances("path_tolerance", message.path_tolerance, own, problems)
-        own = {
-            "position": defaults.goal_tolerance,
-            "velocity": defaults.stopped_velocity_tolerance,
-        }
+        own = defaults.goal_tolerance, defaults.stopped_velocity_tolerance
         self.goal = _tolerances("goal_tolerance", message.goal_tolerance, own, problems)
-        time = nanoseconds(message.goal_time_tolerance) / NANOSECONDS
-        self.goal_time = _resolve(
-            "goal_time_tolerance", time, defaults.goal_time_tolerance, problems
-        )
+        time, usual = nanoseconds(message.goal_time_tolerance), defaults.goal_time_tolerance
+        self.goal_time = _resolve("goal_time_tolerance", time / NANOSECONDS, usual, problems)
         if problems:
             raise InputError("follow_joint_trajectory", problems)
         points = message.trajectory.points
@@ -188,20 +193,24 @@ def _violations(kind: str, tolerances: Tolerances, errors: dict[str, Vector3]) -
 
 
 def _tolerances(
-    name: str, given: Iterable[Any], defaults: dict[str, float], problems: list[Problem]
+    name: str, given: Iterable[Any], defaults: tuple[float, float], problems: list[Problem]
 ) -> Tolerances:
     """Resolve a sequence of JointTolerance messages; what is wrong joins the problems."""
-    found = {joint: dict(defaults) for joint in ACTUATORS}
+    usual = {
+        quantity: default for (quantity, _), default in zip(_QUANTITIES, defaults, strict=True)
+    }
+    found = {joint: dict(usual) for joint in ACTUATORS}
     for index, tolerance in enumerate(given):
         place = f"{name}[{index}]"
         if tolerance.name not in found:
             allowed = f"must be one of {', '.join(ACTUATORS)}"
             problems.append(Problem(f"{place}.name", tolerance.name, allowed))
             continue
-        for quantity, default in defaults.items():
+        for quantity, default in usual.items():
             value = getattr(tolerance, quantity)
-            resolved = _resolve(f"{place}.{quantity}", value, default, problems)
-            found[tolerance.name][quantity] = resolved
+            found[tolerance.name][quantity] = _resolve(
+                f"{place}.{quantity}", value, default, problems
+            )
     return found
 
 
@@ -212,18 +221,6 @@ def _resolve(name: str, value: float, default: float, problems: list[Problem]) -
         allowed = "must be > 0, 0 for the default or -1 for none"
         problems.append(Problem(name, value, allowed))
     return value or default
-
-
-def _multi_dof(message: Any) -> Iterator[Problem]:
-    given = message.multi_dof_trajectory
-    for name, rows in (
-        ("multi_dof_trajectory.joint_names", given.joint_names),
-        ("multi_dof_trajectory.points", given.points),
-        ("component_path_tolerance", message.component_path_tolerance),
-        ("component_goal_tolerance", message.component_goal_tolerance),
-    ):
-        if len(rows):
-            yield Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
 
 
 class Stage(Enum):
@@ -413,10 +410,9 @@ class TrajectoryFollower:
         meant = None if named is None else rotation_matrix(named)
         assembly = kinematics.admissible(self._geometry, seen.gamma, meant)
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
+        space = ActuatorSpaceMap(self._geometry)
         try:
-            return ActuatorSpaceMap(self._geometry).of_actuators(
-                (x, y, z, w), seen.gamma, ZERO, ZERO
-            )
+            return space.of_actuators((x, y, z, w), seen.gamma, ZERO, ZERO)
         except ArithmeticError:
             raise SingularConfiguration("the manipulator is singular, det J2", 0.0) from None
 
