@@ -22,6 +22,7 @@ from test.models import seeded_samples
 
 PERIOD = 0.002
 ZERO = (0.0, 0.0, 0.0)
+HEAVY = scene.load("example2_heavy")
 
 
 class Standing:
@@ -36,7 +37,7 @@ class Standing:
         return self.desired
 
 
-def turned(model, vector, duration=0.4):
+def turned(model, vector=(0.1, 0.0, 0.0), duration=0.4):
     """From the initial orientation by a rotation vector in {E}."""
     geometry = Geometry.of(model)
     start = kinematics.admissible(geometry, model.initial.gamma).rotation
@@ -44,26 +45,24 @@ def turned(model, vector, duration=0.4):
     return geodesic_motion(geometry, tuple(quaternion_of(start)), tuple(end), duration)
 
 
-def desired_near(sample, seed):
-    """Another pose of the same assembly, in motion."""
+def answer(sample, desired, gamma_dot=None, **given):
+    """The command for the state of a sample."""
+    gamma_dot = sample.gamma_dot if gamma_dot is None else gamma_dot
+    acting = Controller(sample.scene, Standing(desired), ControllerSettings(**given), PERIOD)
+    return acting.command(0.0, Measurement(tuple(sample.gamma.tolist()), tuple(gamma_dot.tolist())))
+
+
+@pytest.fixture(params=enumerate(seeded_samples(1, 5)), ids=range(5))
+def near(request):
+    """A sample, another pose of its assembly in motion, and the errors of angles and rates."""
+    seed, sample = request.param
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(0.1 * rng.standard_normal(3))
     q = tuple((Rotation.from_matrix(sample.rotation) * turn).as_quat().tolist())
     rate, acceleration = (tuple(rng.standard_normal(3).tolist()) for _ in range(2))
-    return ActuatorSpaceMap(sample.geometry).of_star(q, rate, acceleration)
-
-
-def errors(sample, desired):
-    gamma, gamma_dot = desired.gamma, desired.gamma_dot
-    return np.subtract(gamma, sample.gamma), np.subtract(gamma_dot, sample.gamma_dot)
-
-
-def seen(sample):
-    return Measurement(tuple(sample.gamma.tolist()), tuple(sample.gamma_dot.tolist()))
-
-
-def controller(sample, desired, **given):
-    return Controller(sample.scene, Standing(desired), ControllerSettings(**given), PERIOD)
+    desired = ActuatorSpaceMap(sample.geometry).of_star(q, rate, acceleration)
+    errors = desired.gamma - sample.gamma, desired.gamma_dot - sample.gamma_dot
+    return sample, desired, *errors
 
 
 def papers_posture(sample, desired):
@@ -71,74 +70,61 @@ def papers_posture(sample, desired):
     return virtual_work.posture(sample.geometry, np.array(desired.gamma), rotation)
 
 
-def test_feedforward_is_the_papers_inverse_dynamics():
-    for seed, sample in enumerate(seeded_samples(1, 5)):
-        desired = desired_near(sample, seed)
-        told = controller(sample, desired).command(0.0, seen(sample))
-        assert told.torque == told.feedforward and told.feedback == ZERO
-        expected = virtual_work.inverse_dynamics(
-            sample.mechanism, papers_posture(sample, desired), desired.gamma_dot, desired.gamma_ddot
-        )
-        assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
+def test_feedforward_is_the_papers_inverse_dynamics(near):
+    sample, desired, *_ = near
+    told = answer(sample, desired)
+    assert told.torque == told.feedforward and told.feedback == ZERO
+    expected = virtual_work.inverse_dynamics(
+        sample.mechanism, papers_posture(sample, desired), desired.gamma_dot, desired.gamma_ddot
+    )
+    assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes():
-    for seed, sample in enumerate(seeded_samples(2, 5)):
-        desired = desired_near(sample, seed)
-        at = papers_posture(sample, desired)
-        m = -np.diag(virtual_work.equation_of_motion(sample.mechanism, at, np.zeros(3))[0])
-        error, error_rate = errors(sample, desired)
-        expected = m * (20.0**2 * error + 2.0 * 0.7 * 20.0 * error_rate)
-        given = {"bandwidth": 20.0, "damping_ratio": 0.7}
-        for mode in ("pd", "gravity_pd", "feedforward_pd"):
-            told = controller(sample, desired, mode=mode, **given).command(0.0, seen(sample))
-            assert np.allclose(told.feedback, expected, rtol=1e-9, atol=1e-9)
-            assert np.allclose(told.torque, np.add(told.feedforward, told.feedback), rtol=1e-15)
-        direct = {"stiffness": m * 400.0, "damping": m * 28.0}
-        told = controller(sample, desired, mode="pd", **direct).command(0.0, seen(sample))
-        assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
+def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes(near):
+    sample, desired, error, error_rate = near
+    at = papers_posture(sample, desired)
+    m = -np.diag(virtual_work.equation_of_motion(sample.mechanism, at, np.zeros(3))[0])
+    expected = m * (20.0**2 * error + 2.0 * 0.7 * 20.0 * error_rate)
+    for mode in ("pd", "gravity_pd", "feedforward_pd"):
+        told = answer(sample, desired, mode=mode, bandwidth=20.0, damping_ratio=0.7)
+        assert np.allclose(told.feedback, expected, rtol=1e-9, atol=1e-9)
+        assert np.allclose(told.torque, np.add(told.feedforward, told.feedback), rtol=1e-15)
+    told = answer(sample, desired, mode="pd", stiffness=m * 400.0, damping=m * 28.0)
+    assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics():
-    for seed, sample in enumerate(seeded_samples(3, 5)):
-        desired = desired_near(sample, seed)
-        told = controller(
-            sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6
-        ).command(0.0, seen(sample))
-        found = virtual_work.direct_dynamics(
-            sample.mechanism, sample.posture, sample.gamma_dot, told.torque
-        )
-        error, error_rate = errors(sample, desired)
-        wanted = desired.gamma_ddot + 225.0 * error + 18.0 * error_rate
-        assert np.allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(near):
+    sample, desired, error, error_rate = near
+    told = answer(sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6)
+    found = virtual_work.direct_dynamics(
+        sample.mechanism, sample.posture, sample.gamma_dot, told.torque
+    )
+    expected = desired.gamma_ddot + 225.0 * error + 18.0 * error_rate
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
-def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says():
+@pytest.mark.parametrize("sample", seeded_samples(4, 5), ids=range(5))
+def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says(sample):
     """R = R_d exp(-phi n) with phi'' = -2 w phi' - w^2 phi; R_d turns about the same axis."""
-    w, phi0, t = 12.0, 0.3, 0.05
+    w, phi0, t, axis = 12.0, 0.3, 0.05, np.array([0.48, 0.6, 0.64])
     phi, dot, ddot = (
         phi0 * np.exp(-w * t) * factor
         for factor in (1.0 + w * t, -w * w * t, w * w * (w * t - 1.0))
     )
-    for sample in seeded_samples(4, 5):
-        axis = np.array([0.48, 0.6, 0.64])
-        here = sample.rotation
-        there = here @ Rotation.from_rotvec(phi * axis).as_matrix()
-        rate, acceleration = 0.7, -1.3
-        desired = ActuatorSpaceMap(sample.geometry).of_star(
-            tuple(quaternion_of(there).tolist()), tuple(rate * axis), tuple(acceleration * axis)
-        )
-        body_rate = (rate - dot) * axis
-        motion = rates.of_star(sample.geometry, here, here @ body_rate)
-        told = controller(
-            sample, desired, mode="computed_torque", space="so3", bandwidth=w
-        ).command(0.0, Measurement(tuple(sample.gamma), tuple(motion.gamma_dot)))
-        gamma_ddot = virtual_work.direct_dynamics(
-            sample.mechanism, sample.posture, motion.gamma_dot, told.torque
-        )
-        found = rates.of_actuators(sample.posture, motion.gamma_dot, gamma_ddot).omega_dot
-        expected = here @ ((acceleration - ddot) * axis)
-        assert np.allclose(found, expected, rtol=1e-9, atol=1e-9)
+    here, rate, acceleration = sample.rotation, 0.7, -1.3
+    there = quaternion_of(here @ Rotation.from_rotvec(phi * axis).as_matrix())
+    desired = ActuatorSpaceMap(sample.geometry).of_star(
+        tuple(there.tolist()), tuple(rate * axis), tuple(acceleration * axis)
+    )
+    motion = rates.of_star(sample.geometry, here, here @ ((rate - dot) * axis))
+    settings = {"mode": "computed_torque", "space": "so3", "bandwidth": w}
+    told = answer(sample, desired, motion.gamma_dot, **settings)
+    gamma_ddot = virtual_work.direct_dynamics(
+        sample.mechanism, sample.posture, motion.gamma_dot, told.torque
+    )
+    found = rates.of_actuators(sample.posture, motion.gamma_dot, gamma_ddot).omega_dot
+    expected = here @ ((acceleration - ddot) * axis)
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_gravity_pd_holds_the_weight_where_the_manipulator_is():
@@ -146,12 +132,9 @@ def test_gravity_pd_holds_the_weight_where_the_manipulator_is():
     # At rest and without a lag of the actuators, which the torque would have to grow through.
     still = Initial(gamma=model.initial.gamma)
     model = dataclasses.replace(model, initial=still, actuators=None)
-    simulation = Simulation(model)
+    simulation, motion = Simulation(model), turned(model)
     gamma = simulation.state.joints.gamma
-    coordinates = ActuatorSpaceMap(Geometry.of(model))
-    begin = coordinates.of_actuators(simulation.state.quaternion, gamma, ZERO, ZERO)
-    settings = ControllerSettings(mode="gravity_pd")
-    holding = Controller(model, Standing(begin), settings, PERIOD)
+    holding = Controller(model, motion, ControllerSettings(mode="gravity_pd"), PERIOD)
     told = holding.command(0.0, Measurement(gamma, ZERO))
     assert told.feedback == ZERO
     for _ in range(20):
@@ -173,23 +156,21 @@ def loop(model, plant, motion, settings, seconds):
 
 @pytest.mark.parametrize("space", ["gamma", "so3"])
 def test_computed_torque_brings_the_manipulator_to_the_motion(space):
-    model = scene.load("example2_heavy")
     off = dataclasses.replace(
-        model, initial=Initial(gamma=tuple(np.add(model.initial.gamma, (0.2, -0.15, 0.1))))
+        HEAVY, initial=Initial(gamma=tuple(np.add(HEAVY.initial.gamma, (0.2, -0.15, 0.1))))
     )
     settings = ControllerSettings(mode="computed_torque", space=space, feedforward_at="middle")
-    largest, last = loop(model, off, turned(model, (0.1, 0.1, -0.2)), settings, 0.6)
+    largest, last = loop(HEAVY, off, turned(HEAVY, (0.1, 0.1, -0.2)), settings, 0.6)
     assert largest == pytest.approx(0.2, abs=0.02)  # no overshoot: critically damped
     assert last < 1e-5
 
 
 def test_the_integral_takes_out_what_the_model_does_not_know():
-    model = scene.load("example2_heavy")
-    pushed = dataclasses.replace(model, moment=Moment(value=(0.5, -0.4, 0.3)))
-    motion = turned(model, (0.1, 0.1, -0.2), duration=0.2)
+    pushed = dataclasses.replace(HEAVY, moment=Moment(value=(0.5, -0.4, 0.3)))
+    motion = turned(HEAVY, (0.1, 0.1, -0.2), duration=0.2)
     for mode in ("feedforward_pd", "computed_torque"):
         without, with_it = (
-            loop(model, pushed, motion, ControllerSettings(mode=mode, integral_rate=r), 1.2)[1]
+            loop(HEAVY, pushed, motion, ControllerSettings(mode=mode, integral_rate=r), 1.2)[1]
             for r in (0.0, 12.0)
         )
         assert without > 1e-4
@@ -199,31 +180,29 @@ def test_the_integral_takes_out_what_the_model_does_not_know():
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_an_integral_that_would_be_unstable_is_refused(mode):
     """The bound is where a root of s^3 + kd s^2 + kp s + kp r crosses the imaginary axis."""
-    model = scene.load("example2_heavy")
-    motion, w, zeta = turned(model, (0.1, 0.0, 0.0)), 30.0, 0.8
+    motion, w, zeta = turned(HEAVY), 30.0, 0.8
     for share, sound in ((0.999, True), (1.001, False)):
         r = share * 2.0 * zeta * w
         roots = np.roots([1.0, 2.0 * zeta * w, w * w, w * w * r])
         assert (roots.real.max() < 0.0) == sound
         settings = ControllerSettings(mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r)
         if sound:
-            Controller(model, motion, settings, PERIOD)
+            Controller(HEAVY, motion, settings, PERIOD)
         else:
             with pytest.raises(InputError, match="integral_rate"):
-                Controller(model, motion, settings, PERIOD)
+                Controller(HEAVY, motion, settings, PERIOD)
 
 
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
     """A second of an error that saturates leaves nothing behind; without a limit it winds up."""
-    model = scene.load("example2_heavy")
-    motion = turned(model, (0.1, 0.0, 0.0))
+    motion = turned(HEAVY)
     begin = motion.at(0.0)
     away = tuple(angle - 0.1 for angle in begin.gamma)
     left = []
     for limit in (1.0, 0.0):
         settings = ControllerSettings(mode=mode, integral_rate=10.0, torque_limit=limit)
-        acting = Controller(model, Standing(begin), settings, PERIOD)
+        acting = Controller(HEAVY, Standing(begin), settings, PERIOD)
         for _ in range(500):
             told = acting.command(0.0, Measurement(away, ZERO))
         assert told.saturated == (limit > 0.0)
@@ -234,8 +213,8 @@ def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
 
 
 def test_the_limit_of_the_models_actuators_holds_too():
-    model = dataclasses.replace(scene.load("example2_heavy"), actuators=Actuators(torque_limit=0.5))
-    motion = turned(model, (0.1, 0.0, 0.0))
+    model = dataclasses.replace(HEAVY, actuators=Actuators(torque_limit=0.5))
+    motion = turned(model)
     away = Measurement(tuple(angle - 0.2 for angle in model.initial.gamma), ZERO)
     for limit, expected in ((0.0, 0.5), (0.2, 0.2), (0.9, 0.5)):
         settings = ControllerSettings(mode="pd", torque_limit=limit)
@@ -246,11 +225,8 @@ def test_the_limit_of_the_models_actuators_holds_too():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_what_is_not_finite_is_refused_until_a_reset(mode):
-    model = scene.load("example2_heavy")
-    acting = Controller(
-        model, turned(model, (0.1, 0.0, 0.0)), ControllerSettings(mode=mode), PERIOD
-    )
-    gamma = model.initial.gamma
+    acting = Controller(HEAVY, turned(HEAVY), ControllerSettings(mode=mode), PERIOD)
+    gamma = HEAVY.initial.gamma
     good = Measurement(gamma, ZERO)
     for bad in (Measurement((np.nan, *gamma[1:]), ZERO), Measurement(gamma, (0.0, np.inf, 0.0))):
         acting.command(0.0, good)
@@ -265,12 +241,12 @@ def test_what_is_not_finite_is_refused_until_a_reset(mode):
 @pytest.mark.parametrize("mode", ["computed_torque", "gravity_pd"])
 def test_angles_that_no_assembly_has_end_the_control(mode):
     rng, ended = np.random.default_rng(5), 0
-    for seed, sample in enumerate(seeded_samples(6, 40)):
+    for sample in seeded_samples(6, 40):
         nowhere = tuple(rng.uniform(-1.5, 1.5, 3) + sample.gamma)
         if kinematics.direct(sample.geometry, nowhere):
             continue
-        acting = controller(sample, desired_near(sample, seed), mode=mode)
-        acting.command(0.0, seen(sample))
+        begin = ActuatorSpaceMap(sample.geometry).of_star(sample.quaternion, ZERO, ZERO)
+        acting = Controller(sample.scene, Standing(begin), ControllerSettings(mode=mode), PERIOD)
         with pytest.raises(ControlStopped, match="parallel singularity"):
             acting.command(PERIOD, Measurement(nowhere, ZERO))
         ended += 1

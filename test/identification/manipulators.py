@@ -5,7 +5,14 @@ import dataclasses
 
 import numpy as np
 
-from sst_ros import Controller, ControllerSettings, load_scene, reference_motion, simulate
+from sst_ros import (
+    Controller,
+    ControllerSettings,
+    InverseDynamics,
+    load_scene,
+    reference_motion,
+    simulate,
+)
 from sst_ros.scene.loads import DesiredMotion, Sweep
 
 PERIOD = 5e-4
@@ -52,8 +59,6 @@ def payload():
 def run(plant, model=None, period=PERIOD, mode="feedforward_pd"):
     """The trajectory of a plant that follows its motion by a controller with a model of it."""
     settings = ControllerSettings(mode=mode, feedforward_at="middle", bandwidth=60.0)
-    if mode == "feedforward":
-        settings = ControllerSettings(mode=mode, feedforward_at="middle")
     controller = Controller(model or plant, reference_motion(plant), settings, period)
     count = round(plant.duration / period)
     return simulate(
@@ -62,15 +67,28 @@ def run(plant, model=None, period=PERIOD, mode="feedforward_pd"):
     )  # fmt: skip
 
 
+def states(motion, times):
+    """Quaternion, W and W_dot of a motion, each shape (n, ...)."""
+    references = [motion.at(t) for t in np.asarray(times).tolist()]
+    names = ("quaternion", "body_rate", "body_acceleration")
+    return tuple(np.array([getattr(one, name) for one in references]) for name in names)
+
+
+def torques(scene, quaternion, rate, acceleration):
+    """Torques of the inverse dynamics, shape (n, 3)."""
+    inverse = InverseDynamics(scene)
+    rows = zip(quaternion, rate, acceleration, strict=True)
+    return np.array([inverse.torque(*row) for row in rows])
+
+
 def wrong(scene, seed=0, share=0.2):
     """The scene with every link's inertia wrong by up to `share`, masses alike."""
     rng = np.random.default_rng(seed)
     factors = iter(1.0 + share * rng.choice([-1.0, 1.0], 20) * rng.uniform(0.5, 1.0, 20))
 
     def scaled(body, factor):
-        inertia = body.inertia and dataclasses.replace(
-            body.inertia,
-            **{k: factor * v for k, v in dataclasses.asdict(body.inertia).items()},
+        inertia = body.inertia and type(body.inertia)(
+            **{k: factor * v for k, v in dataclasses.asdict(body.inertia).items()}
         )
         return dataclasses.replace(body, inertia=inertia, mass=factor * body.mass)
 

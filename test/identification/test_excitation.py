@@ -24,13 +24,9 @@ LIMITS = {
 def condition(scene):
     """Of the regressor of the base parameters over the scene's motion, columns of length one."""
     motion = reference_motion(scene)
-    references = [motion.at(t) for t in np.linspace(0.0, motion.duration, 200).tolist()]
     regressor = Regressor(scene, parameters.select_names(scene, None))
-    _, columns = regressor(
-        np.array([one.quaternion for one in references]),
-        np.array([one.body_rate for one in references]),
-        np.array([one.body_acceleration for one in references]),
-    )
+    times = np.linspace(0.0, motion.duration, 200)
+    _, columns = regressor(*manipulators.states(motion, times))
     base = find_independent(columns, regressor.names)
     matrix = base.of_columns(columns).reshape(-1, len(base.chosen))
     return np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)), base

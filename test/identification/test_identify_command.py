@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 from bags import simulated
-from identification import manipulators
 
 from sst_ros import load_scene
 from sst_ros.cli.main import run
@@ -72,10 +71,3 @@ def test_a_scene_becomes_a_motion(tmp_path, capsys):
 def test_what_does_not_fit_is_refused(words, message, capsys):
     assert run(["identify", *words]) == 1
     assert message in capsys.readouterr().err
-
-
-def test_a_recording_of_another_manipulator_is_refused(written, example2, tmp_path, capsys):
-    other = tmp_path / "other.yaml"
-    other.write_text(dump(manipulators.general()), encoding="utf-8")
-    assert run(["identify", str(written(example2)), "--scene", str(other)]) == 1
-    assert "must be angles of this manipulator" in capsys.readouterr().err

@@ -11,9 +11,8 @@ from symmetric_motion import drift_free_rate, inertia
 
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics import model as dynamics_model
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.model import damping_of, joint_angle
+from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
@@ -40,18 +39,6 @@ def rubbing():
     )
 
 
-CASES = {
-    "bodies": (
-        lambda: load_scene("example2_heavy"),
-        ("star.inertia.zz", "actuated_links.inertia.zz", "intermediate_links[1].inertia.yy"),
-    ),
-    "loads": (
-        rubbing,
-        ("friction.gamma.smoothing", "friction.gamma.coulomb", "actuators.time_constant"),
-    ),
-}
-
-
 def extrapolated(function, y, begin, end):
     """Gragg, Bulirsch and Stoer in mpmath: modified midpoint rule, extrapolated in 1/n^2."""
     rows = []
@@ -73,33 +60,31 @@ def extrapolated(function, y, begin, end):
     return rows[-1][-1]
 
 
-def derivative(scene, opened):
-    """The model in 50 digits, and its derivative over time under the scene's sines."""
-    model = kernel.model_of(opened, Geometry.of(scene))
-    wave = scene.torque
+def opened(scene, name, value):
+    """The model with one number of mpmath, its derivative under the scene's sines, the start."""
+    geometry, wave = Geometry.of(scene), scene.torque
+    model = kernel.model_of(parameters.with_symbols(scene, {name: value}), geometry)
     rows = list(zip(wave.amplitude, wave.frequency, wave.phase, strict=True))
 
     def function(t, y):
         torque = [mp.mpf(a) * mp.sin(mp.mpf(f) * t + mp.mpf(p)) for a, f, p in rows]
         return kernel.derivative(model, tuple(y), torque)
 
-    return model, function
+    lags = 3 if model.time_constant is not None else 0
+    return model, function, [mp.mpf(x) for x in (*initial_state(scene, geometry), *[0] * lags)]
 
 
-def initial(scene, model):
-    """The state that the scene begins with."""
-    y = [mp.mpf(x) for x in initial_state(scene, Geometry.of(scene))]
-    return y + [mp.mpf(0)] * (3 if model.time_constant is not None else 0)
-
-
-def final_state(scene, name, value):
-    """The state at END in 50 digits, with one parameter as an mpmath number."""
-    model, function = derivative(scene, parameters.with_symbols(scene, {name: value}))
-    y = initial(scene, model)
-    for step in range(STEPS):
-        begin, end = (mp.mpf(END) * k / STEPS for k in (step, step + 1))
-        y = extrapolated(function, y, begin, end)
+def integrated(function, y, begin, duration, steps):
+    """The state after some steps of equal length."""
+    for k in range(steps):
+        y = extrapolated(function, y, *(begin + duration * i / steps for i in (k, k + 1)))
     return y
+
+
+def at_the_end(scene, name, value, _):
+    """The state at END in 50 digits."""
+    _, function, y = opened(scene, name, value)
+    return integrated(function, y, mp.mpf(0), mp.mpf(END), STEPS)
 
 
 BOUNCE_END = 0.05
@@ -118,29 +103,27 @@ def bouncing():
     )
 
 
-def state_after_the_bounce(scene, name, value, monkeypatch):
-    """The state at BOUNCE_END in 50 digits: integrated from event to event, which are located."""
-    opened = parameters.with_symbols(scene, {name: value})
-    model, function = derivative(scene, opened)
-    begin, y = mp.mpf(0), initial(scene, model)
+def after_the_bounce(scene, name, value, monkeypatch):
+    """The state at BOUNCE_END in 50 digits: integrated from event to event, which are located.
+
+    There is no jump at the events: the torque of a stop begins and ends at zero.
+    """
+    model, function, y = opened(scene, name, value)
+    begin = mp.mpf(0)
 
     def gamma(state):
-        leg = model.legs[0]
-        at = kernel.leg_motion(leg, rotation_rows(tuple(state[:4])), ZERO)
-        return joint_angle(at, 0)
+        rows = rotation_rows(tuple(state[:4]))
+        return kernel.joint_angle(kernel.leg_motion(model.legs[0], rows, ZERO), 0)
 
     for contact, guess, steps in PHASES:
         # The branch of the phase, also where a stage of the method lies beyond its end.
         least = -0.5 if contact else 0.5
         monkeypatch.setattr(
-            dynamics_model, "positive", lambda x, least=least: x if x > least else mp.mpf(0)
+            kernel, "positive", lambda x, least=least: x if x > least else mp.mpf(0)
         )
 
         def state_at(duration, begin=begin, y=y, steps=steps):
-            for k in range(steps):
-                first, last = (begin + duration * i / steps for i in (k, k + 1))
-                y = extrapolated(function, y, first, last)
-            return y
+            return integrated(function, y, begin, duration, steps)
 
         duration = BOUNCE_END - begin
         if guess is not None:
@@ -150,34 +133,35 @@ def state_after_the_bounce(scene, name, value, monkeypatch):
     return y
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["star.inertia.zz", "stroke.stiffness", "stroke.damping"])
-def test_sensitivities_across_a_bounce_are_those_of_50_digit_differences(name, monkeypatch):
-    """No jump at the events: the torque of a stop begins and ends at zero."""
-    scene = bouncing()
-    motion = Sensitivities(scene, (name,), SineProfile(scene.torque))
-    value = value_of(scene, name)
-    _, slopes = motion.run(np.array([value]), np.array([BOUNCE_END]))
-    with mp.workdps(50):
-        high, low = (
-            state_after_the_bounce(scene, name, mp.mpf(value) + sign * TINY, monkeypatch)
-            for sign in (1, -1)
-        )
-        expected = [float((a - b) / (2 * TINY)) for a, b in zip(high, low, strict=True)]
-    assert np.abs(slopes[0, :, 0] - expected).max() < 1e-10 * max(map(abs, expected))
+BODIES = ("star.inertia.zz", "actuated_links.inertia.zz", "intermediate_links[1].inertia.yy")
+LOADS = ("friction.gamma.smoothing", "friction.gamma.coulomb", "actuators.time_constant")
+STOPS = ("star.inertia.zz", "stroke.stiffness", "stroke.damping")
 
 
-@pytest.mark.parametrize("case", ["bodies", pytest.param("loads", marks=pytest.mark.slow)])
-def test_sensitivities_are_those_of_50_digit_differences(case):
-    build, names = CASES[case]
+@pytest.mark.parametrize(
+    ("build", "names", "end", "final_state"),
+    [
+        (lambda: load_scene("example2_heavy"), BODIES, END, at_the_end),
+        pytest.param(rubbing, LOADS, END, at_the_end, marks=pytest.mark.slow),
+        *(
+            pytest.param(bouncing, (name,), BOUNCE_END, after_the_bounce, marks=pytest.mark.slow)
+            for name in STOPS
+        ),
+    ],
+)
+def test_sensitivities_are_those_of_50_digit_differences(
+    build, names, end, final_state, monkeypatch
+):
     scene = build()
     motion = Sensitivities(scene, names, SineProfile(scene.torque))
     values = np.array([value_of(scene, name) for name in names])
-    _, slopes = motion.run(values, np.array([END]))
+    _, slopes = motion.run(values, np.array([end]))
     with mp.workdps(50):
         for i, name in enumerate(names):
             centre = mp.mpf(float(values[i]))
-            high, low = (final_state(scene, name, centre + sign * TINY) for sign in (1, -1))
+            high, low = (
+                final_state(scene, name, centre + sign * TINY, monkeypatch) for sign in (1, -1)
+            )
             expected = [float((a - b) / (2 * TINY)) for a, b in zip(high, low, strict=True)]
             size = max(map(abs, expected))
             assert np.abs(slopes[0, :, i] - expected).max() < 1e-10 * size
