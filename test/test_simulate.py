@@ -1,9 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""simulate(): what it takes, what it returns, and that it is the run of Simulation."""
+"""simulate() and prepare(): what they take and return, and that it is the run of Simulation."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
+from scipy.integrate import solve_ivp
 
+from sst_ros import TorqueTable, prepare
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.propagator import Propagator
@@ -16,9 +24,16 @@ from sst_ros.simulation.simulation import Simulation
 EXAMPLE2 = load("example2_heavy")
 
 
-def test_a_name_a_path_a_dict_and_a_scene_are_the_same(tmp_path):
-    import yaml
+def jerk(t):
+    return t, t, t
 
+
+def spring(t, state):
+    rows = zip(state.joints.gamma, state.joints.gamma_dot, strict=True)
+    return [-4.0 * (angle - 0.8) - 0.1 * rate - t for angle, rate in rows]
+
+
+def test_a_name_a_path_a_dict_and_a_scene_are_the_same(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(dump(EXAMPLE2))
     document = yaml.safe_load(dump(EXAMPLE2))
@@ -32,11 +47,8 @@ def test_a_name_a_path_a_dict_and_a_scene_are_the_same(tmp_path):
 
 
 def test_the_run_of_simulate_with_a_control_period_is_that_of_simulation():
-    def angles(state):
-        return state.joints.gamma, state.joints.gamma_dot
-
     def controller(t, state):
-        return [2.0 - 3.0 * g - 0.5 * r for g, r in zip(*angles(state), strict=True)]
+        return spring(0.0, state)
 
     found = simulate(EXAMPLE2, controller, 0.1, control_period=0.001, tolerance=1e-10)
     simulation = Simulation(EXAMPLE2, tolerance=1e-10)
@@ -83,12 +95,45 @@ def test_collocation_is_chosen_for_a_smooth_motion_under_a_profile_and_is_as_acc
     np.testing.assert_allclose(sampled.gamma, found.at(times).gamma, rtol=0, atol=1e-14)
 
 
-def test_the_same_call_again_gives_the_same_bits_and_its_own_arrays():
-    first, second = simulate(EXAMPLE2), simulate(EXAMPLE2)
-    assert first.quaternion.tobytes() == second.quaternion.tobytes()
-    assert not np.shares_memory(first.quaternion, second.quaternion)
-    other = simulate(EXAMPLE2, duration=0.5)
-    assert other.t[-1] == 0.5
+ARRAYS = ("t", "quaternion", "body_rate", "torque", "gamma")
+RUNS = {
+    "collocation": {"scene": "example2_heavy"},
+    "constant": {"scene": "general", "torque": (0.1, 0.2, 0.0), "duration": 0.3},
+    "steps": {"scene": "swing", "duration": 0.2},
+    "function": {"scene": "example2", "torque": lambda t: (t, -t, t), "duration": 0.2},
+    "table": {
+        "scene": "example2",
+        "torque": TorqueTable([0.0, 0.1], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        "duration": 0.2,
+    },
+}
+
+
+@pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
+def test_a_prepared_run_is_simulate_each_time(arguments):
+    run, expected = prepare(**arguments), simulate(**arguments)
+    for _ in range(3):
+        found = run.run()
+        for name in ARRAYS:
+            assert getattr(found, name).tobytes() == getattr(expected, name).tobytes()
+            assert not np.shares_memory(getattr(found, name), getattr(expected, name))
+        assert found.error_estimate == expected.error_estimate
+
+
+@pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
+def test_threads_get_their_own_motions(arguments):
+    run = prepare(**arguments)
+    one = run.run()
+    times = [np.sort(np.random.default_rng(k).uniform(0.0, one.t[-1], 20)) for k in range(8)]
+    expected = [one.at(t).quaternion for t in times]
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(3):
+            at = list(pool.map(lambda t: one.at(t).quaternion, times))
+            again = list(pool.map(lambda _: run.run().quaternion, times))
+            for found, wanted in zip(at, expected, strict=True):
+                assert found.tobytes() == wanted.tobytes()
+            for found in again:
+                assert found.tobytes() == one.quaternion.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -96,7 +141,7 @@ def test_the_same_call_again_gives_the_same_bits_and_its_own_arrays():
     [
         ("elastic_stops", None, "at_end: elastic"),
         ("friction", None, "steps of collocation"),
-        ("example2_heavy", lambda t: (t, t, t), "constant torques and sines"),
+        ("example2_heavy", jerk, "constant torques and sines"),
     ],
 )
 def test_auto_says_why_collocation_is_not_chosen_and_gauss_refuses(scene, torque, said):
@@ -144,40 +189,30 @@ def test_another_start():
         ({"method": "euler"}, "must be one of auto, rk4, dopri5, dop853, rodas4, gauss"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),
-        ({"method": "gauss", "torque": lambda t: (t, t, t)}, "constant torques and sines"),
+        ({"method": "gauss", "torque": jerk}, "constant torques and sines"),
         ({"initial": {"gama": 1}}, "must have the key gamma"),
-        ({"initial": {"gamma": [3.0, 1.0, 1.0]}}, "must lie in the stroke"),
+        ({"torque": lambda t, state: None, "duration": 0.1}, r"torque\(0\) = None: must be three"),
+        ({"duration": None}, r"duration(.|\n)*must be given"),
+        (
+            {"torque": jerk, "control_period": 1e-9},
+            "period = 1e-09: must be at least .* s",
+        ),
+        ({"breaks": [0.2, 0.1]}, "breaks(.|\n)*ascending"),
+        ({"breaks": "x"}, "breaks(.|\n)*ascending"),
+        ({"max_step": 0.0}, "max_step(.|\n)*> 0"),
+        ({"max_step": float("nan")}, "max_step(.|\n)*> 0"),
+        ({"max_step": "1"}, "max_step(.|\n)*> 0"),
+        ({"method": "gauss", "max_step": 0.001}, "no max_step"),
     ],
 )
 def test_bad_input_is_refused(arguments, said):
     with pytest.raises(InputError, match=said):
-        simulate(**{"scene": EXAMPLE2, "duration": 0.01, **arguments})
-
-
-def test_a_scene_without_a_duration_asks_for_one():
-    from dataclasses import replace
-
-    with pytest.raises(InputError, match=r"duration(.|\n)*must be given"):
-        simulate(replace(EXAMPLE2, duration=None))
-
-
-def spring(t, state):
-    return [
-        -4.0 * (angle - 0.8) - 0.1 * rate - t for angle, rate in zip(*angles_of(state), strict=True)
-    ]
-
-
-def angles_of(state):
-    return state.joints.gamma, state.joints.gamma_dot
+        simulate(**{"scene": replace(EXAMPLE2, duration=None), "duration": 0.01, **arguments})
 
 
 @pytest.mark.parametrize("method", ["auto", "dopri5", "dop853", "rodas4"])
 def test_a_state_feedback_is_part_of_the_differential_equation(method):
     """The reference is SciPy's DOP853 at 1e-13 on the derivative of the scene."""
-    from scipy.integrate import solve_ivp
-
-    from sst_ros.dynamics.traced_dynamics import Dynamics
-
     dynamics = Dynamics.of(EXAMPLE2)
     start = Simulation(EXAMPLE2).state
 
@@ -196,20 +231,13 @@ def test_a_state_feedback_is_part_of_the_differential_equation(method):
     assert abs(found.energy_residual) < 1e-9
     assert found.evaluations > 10
     for k in range(2):
-        assert found.torque[k].tolist() == spring(found.t[k], Rebuilt(found, k))
+        seen = SimpleNamespace(gamma=found.gamma[k], gamma_dot=found.gamma_dot[k])
+        assert found.torque[k].tolist() == spring(found.t[k], SimpleNamespace(joints=seen))
     np.testing.assert_allclose(
         found.at(0.15).gamma[0],
         simulate(EXAMPLE2, spring, 0.15, tolerance=1e-11).gamma[-1],
         atol=1e-10,
     )
-
-
-class Rebuilt:
-    """What `spring` reads of a state, from a sample of a trajectory."""
-
-    def __init__(self, motion, k):
-        self.joints = self
-        self.gamma, self.gamma_dot = motion.gamma[k], motion.gamma_dot[k]
 
 
 def test_a_held_feedback_tends_to_the_continuous_one_in_proportion_to_the_period():
@@ -234,11 +262,6 @@ def test_a_feedback_has_the_limit_and_the_lag_of_the_actuators():
     assert max(torque[0] for torque in seen) > 0.9
 
 
-def test_a_feedback_that_returns_no_torques_is_refused():
-    with pytest.raises(InputError, match=r"torque\(0\) = None: must be three finite"):
-        simulate(EXAMPLE2, lambda t, state: None, 0.1)
-
-
 def test_the_error_estimate_at_the_end_is_within_the_tolerance():
     """A tolerance of the local errors alone leaves 3.3e-9 rad after 10 s, three times as much."""
 
@@ -250,16 +273,6 @@ def test_the_error_estimate_at_the_end_is_within_the_tolerance():
     assert found.error_estimate <= 1e-9
     finer = simulate("swing", still, 10.0, tolerance=1e-12, method="dop853", t_eval=[10.0])
     assert np.abs(found.quaternion - finer.quaternion).max() <= 1e-9
-
-
-def test_rodas4_runs_under_a_sine_profile():
-    """It needs the derivative of the torques: a sine is traced, and not a Python function."""
-    motions = {
-        method: simulate("example2_heavy", method=method, tolerance=1e-8, t_eval=[0.0, 1.0])
-        for method in ("dopri5", "rodas4")
-    }
-    assert motions["rodas4"].evaluations != motions["dopri5"].evaluations
-    np.testing.assert_allclose(motions["rodas4"].gamma, motions["dopri5"].gamma, atol=1e-7)
 
 
 @pytest.mark.skipif(numba_version() is None, reason="needs numba")

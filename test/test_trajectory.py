@@ -187,6 +187,46 @@ def test_samples_under_held_torques_need_nothing_else():
     assert bare.at(0.034567).torque[0].tolist() == list(wanted.torque)
 
 
+@pytest.mark.parametrize("name", ["t", "quaternion", "body_rate", "torque"])
+def test_arrays_are_read_only(run, name):
+    for found in (run, simulate("example2_heavy"), run.at([0.1, 0.2])):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(found, name)[0] *= 1000.0
+
+
+def at_rest(times):
+    n = len(times)
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    return Trajectory(EXAMPLE2, times, quaternion, np.zeros((n, 3)), np.zeros((n, 3))), quaternion
+
+
+def test_what_is_given_to_a_trajectory_can_change_without_it():
+    t = np.array([0.0, 1.0])
+    found, quaternion = at_rest(t)
+    t *= 5.0
+    quaternion[:] = 7.0
+    assert found.t.tolist() == [0.0, 1.0]
+    assert found.quaternion.max() == 1.0
+
+
+@pytest.mark.parametrize("times", [[0.0, 1.0, 0.5], [0.0, 0.0], [1.0, 0.0]])
+def test_times_that_do_not_ascend_are_refused(times):
+    with pytest.raises(InputError, match=r"t = (.|\n)*ascending"):
+        at_rest(times)
+
+
+@pytest.mark.parametrize("torque", [lambda t: (t, 0.0, 0.1), lambda t, state: (t, 0.0, 0.1)])
+def test_a_loaded_run_under_a_function_has_no_motion_between_its_samples(torque, tmp_path):
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    run = simulate("example2", torque, 0.2, t_eval=[0.0, 0.1, 0.2])
+    run.save(tmp_path / "run.parquet")
+    again = Trajectory.load(tmp_path / "run.parquet")
+    assert again.at([0.1]).quaternion.tobytes() == run.quaternion[1:2].tobytes()
+    with pytest.raises(InputError, match=r"not in the file"):
+        again.at(0.05)
+    assert "<table>" in again._repr_html_()
+
+
 def test_misfits_are_refused():
     with pytest.raises(InputError, match=r"quaternion(.|\n)*must have the shape"):
         Trajectory(EXAMPLE2, [0.0, 1.0], np.zeros((1, 4)), np.zeros((2, 3)), np.zeros((2, 3)))
