@@ -52,20 +52,6 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     assert pairs.get("dopri5", 0) + pairs.get("dop853", 0) < 60
 
 
-def test_auto_returns_to_an_explicit_method_when_accuracy_asks_for_short_steps():
-    """A torque that starts anew every 200 microseconds makes steps shorter than the decay."""
-    simulation = Simulation(viscous(30.0, 5.0), tolerance=1e-9)
-    for _ in range(10):
-        simulation.step(REST, 100 * MILLISECOND)
-    assert simulation.method == "rodas4"
-    for _ in range(80):
-        simulation.step((20.0, -20.0, 5.0), 200_000)
-    last = simulation.changes[-1]
-    assert last.method == "dopri5"
-    assert last.reason.startswith("no longer stiff: step times rate is ")
-    assert 1.0 < last.time < 1.02
-
-
 def test_a_reset_run_repeats_bit_by_bit_after_changes_of_method():
     simulation = Simulation(load("stiff"), tolerance=1e-9)
     ends = []

@@ -12,7 +12,6 @@ import pytest
 from loaded_scenes import IGNORE, loaded, start_of, viscous
 from models import seeded_samples
 
-from sst_ros.dynamics.expression import trace, with_jacobian
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration import codegen
@@ -44,34 +43,6 @@ def both(scene, method):
 
 
 needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
-
-
-class Top(ODE):
-    """A free rigid body: as small as a system with a quaternion can be."""
-
-    @property
-    def program(self):
-        return trace(self._turn, self._inputs)
-
-    @property
-    def jacobian(self):
-        return with_jacobian(self._turn, self._inputs, ("t", *self.state))
-
-    def _turn(self, t, x, y, z, w, a, b, c, *drive):
-        q = ((w * a + y * c - z * b), (w * b + z * a - x * c), (w * c + x * b - y * a))
-        body = (0.3 * b * c + drive[0], -0.5 * c * a + drive[1], 0.2 * a * b + drive[2])
-        return (*(0.5 * part for part in q), -0.5 * (x * a + y * b + z * c), *body)
-
-
-@needs_numba
-def test_numba_gives_the_bits_of_plain_python_with_an_implicit_method():
-    y = [0.0, 0.6, 0.0, 0.8, 1.0, -2.0, 30.0]
-    ends = []
-    for by_numba in (False, True):
-        machine = CompiledMethod(Top(Dynamics.of(EXAMPLE2)), RODAS4, compiled=by_numba)
-        ends.append(machine.step_pair(0.0, 0.01, y, y, DRIVE))
-    assert ends[0] == ends[1]
-    assert math.dist(ends[0][0], y) > 0.1
 
 
 @needs_numba

@@ -13,11 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loaded_scenes import REST, apart
+from loaded_scenes import IGNORE, REST, apart
 from models import inertia_of
 
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
+from sst_ros.integration.events import first_crossing
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
@@ -31,9 +32,8 @@ FREE_STAR = replace(
     star=replace(EXAMPLE2.star, inertia=inertia_of(0.3 * np.eye(3))),
     actuated_links=(NOTHING,) * 3,
     intermediate_links=(NOTHING,) * 3,
-    stroke=Stroke(at_end="ignore"),
-    workspace=Workspace(at_edge="ignore"),
     torque=None,
+    **IGNORE,
 )
 GAMMA = (0.7, 0.8, 0.75)
 RATE = 3.0
@@ -138,3 +138,33 @@ def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
     first, back, again = (change.time for change in told)
     assert 0.0 < first < 0.6 < back < 0.65 < 1.0 < again < 1.6
     assert apart(simulation, truth)[0] < 1e-6
+
+
+FOUND = {
+    "a crossing, to the rounding of its time": (math.cos, lambda t: -math.sin(t), 2.0, math.pi / 2),
+    "a dip inside": (lambda t: (t - 0.4) * (t - 0.6), lambda t: 2.0 * t - 1.0, 1.0, 0.4),
+    "leaving an end and back": (lambda t: t * (0.5 - t), lambda t: 0.5 - 2.0 * t, 1.0, 0.5),
+    "through an end at once": (lambda t: -t, lambda t: -1.0, 1.0, 0.0),
+    "from beyond it by rounding": (lambda t: -1e-15 - t, lambda t: -1.0, 1.0, 0.0),
+    "pushed from rest through an end": (lambda t: -t * t, lambda t: -2.0 * t, 1.0, 0.0),
+}
+NONE = {
+    "a minimum above zero": (lambda t: (t - 0.5) ** 2 + 1e-9, lambda t: 2.0 * (t - 0.5), 1.0),
+    "leaving an end": (lambda t: t, lambda t: 1.0, 1.0),
+    "inside, away": (lambda t: 1.0 + t, lambda t: 1.0, 1.0),
+    "inside, towards an end": (lambda t: 2.0 - t, lambda t: -1.0, 1.0),
+    "rest at an end": (lambda t: -1e-16, lambda t: 0.0, 1.0),
+    # What has just left an end at almost no rate is off it by less than an angle's rounding.
+    "rounding on the way inwards": (lambda t: 1e-14 * t - 1e-16, lambda t: 1e-14, 1e-3),
+}
+
+
+@pytest.mark.parametrize(("margin", "slope", "h", "at"), FOUND.values(), ids=FOUND)
+def test_a_crossing_is_found(margin, slope, h, at):
+    found = first_crossing(margin, slope, h)
+    assert found == (pytest.approx(at, abs=4e-16) if at else 0.0)
+
+
+@pytest.mark.parametrize(("margin", "slope", "h"), NONE.values(), ids=NONE)
+def test_what_stays_inside_is_no_crossing(margin, slope, h):
+    assert first_crossing(margin, slope, h) is None

@@ -14,7 +14,9 @@ from scipy.integrate import solve_ivp
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
+from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation, tables
+from sst_ros.integration.methods import DOP853
 from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
 
@@ -132,9 +134,6 @@ def test_the_flat_sine_is_the_sine(scale):
 
 def test_every_term_lag_and_a_drive_are_carried_along():
     """Against many steps of a method that is tested by itself."""
-    from sst_ros.integration.compiled_method import CompiledMethod
-    from sst_ros.integration.methods import DOP853
-
     scene = loaded()
     system = ODE(Dynamics.of(scene), work=True)
     y = start_of(scene, len(system.state))

@@ -9,10 +9,9 @@ Wanner II, section IV.7), here they are turned back into alpha and gamma.
 
 from __future__ import annotations
 
-import builtins
+import inspect
 import math
 from itertools import combinations_with_replacement
-from types import FunctionType
 
 import mpmath
 import numpy as np
@@ -236,26 +235,8 @@ def test_it_is_a_stable_and_its_stability_function_vanishes_at_infinity():
         assert abs(stability(mpmath.mpc(-1e12, 1e12))) < 1e-10
 
 
-def test_the_stability_function_is_the_exponential_up_to_order_four():
-    with mpmath.workdps(50):
-        for z in (mpmath.mpf("1e-3"), mpmath.mpc(0, "1e-3")):
-            miss = abs(stability(z) - mpmath.exp(z))
-            assert 1e-3 * 1e-15 < miss < 1e-15
-
-
 def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
     """Take steps of a scalar equation through the very text that a simulation runs."""
-    names = {
-        "SIZE": 1,
-        "RODAS_A": [(*row, *(0.0,) * 5) for row in RODAS4.a],
-        "RODAS_C": [(*row, *(0.0,) * 5) for row in RODAS4.c],
-        "RODAS_ALPHA": RODAS4.alpha,
-        "RODAS_D": RODAS4.d,
-        "vector": lambda n: [0.0] * n,
-        "square": lambda n: [[0.0] * n for _ in range(n)],
-        "rows": lambda m, n: [[0.0] * n for _ in range(m)],
-        "__builtins__": builtins,
-    }
 
     def linearise(t, y, d, p, slope, by_t, matrix):
         slope[0], by_t[0], matrix[0][0] = slope_of(t, y[0]), by_time(t), matrix_of(y[0])
@@ -263,22 +244,29 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
     def evaluate(t, y, d, p, slope):
         slope[0] = slope_of(t, y[0])
 
-    names |= {"linearise": linearise, "evaluate": evaluate}
-    for part in ("factorise", "substitute", "attempt_linearly_implicit"):
-        names[part] = FunctionType(getattr(step_loops, part).__code__, names)
-    attempt = names["attempt_linearly_implicit"]
+    parts = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
+    a, c = ([(*row, *(0.0,) * 5) for row in table] for table in (RODAS4.a, RODAS4.c))
+    known = {
+        "SIZE": 1,
+        "RODAS_A": a,
+        "RODAS_C": c,
+        "RODAS_ALPHA": RODAS4.alpha,
+        "RODAS_D": RODAS4.d,
+    }
+    module = codegen.load([inspect.getsource(part) for part in parts], known, numba=False)
+    vars(module).update(linearise=linearise, evaluate=evaluate)
     y, new, error = [y0], [0.0], [0.0]
     for k in range(count):
-        attempt(k * h, h, y, y, (), (), new, error)
+        module.attempt_linearly_implicit(k * h, h, y, y, (), (), new, error)
         y[0] = new[0]
-    return y[0], error[0]
+    return y[0]
 
 
 @pytest.mark.parametrize("rate", [1.0, 1e3, 1e6, 1e9])
 def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_function(rate):
     with mpmath.workdps(30):
         wanted = float(stability(mpmath.mpf(-0.5 * rate)).real)
-    got, _ = steps_of(1.0, 0.5, 1, lambda y: -rate, lambda t, y: -rate * y)
+    got = steps_of(1.0, 0.5, 1, lambda y: -rate, lambda t, y: -rate * y)
     assert got == pytest.approx(wanted, abs=1e-13)
     assert abs(got) < 1.0
 
@@ -286,7 +274,7 @@ def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_funct
 def test_a_stiff_equation_follows_its_slow_solution_in_large_steps():
     """Prothero & Robinson: y' = -1e6 (y - cos t) - sin t from y(0) = 1; y = cos t."""
     rate = 1e6
-    got, _ = steps_of(
+    got = steps_of(
         1.0,
         0.05,
         20,
