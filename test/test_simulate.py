@@ -262,19 +262,6 @@ def test_a_feedback_has_the_limit_and_the_lag_of_the_actuators():
     assert max(torque[0] for torque in seen) > 0.9
 
 
-def test_the_error_estimate_at_the_end_is_within_the_tolerance():
-    """A tolerance of the local errors alone leaves 3.3e-9 rad after 10 s, three times as much."""
-
-    def still(_):
-        return 0.0, 0.0, 0.0
-
-    found = simulate("swing", still, 10.0, tolerance=1e-9, method="dopri5", t_eval=[10.0])
-    assert found.success
-    assert found.error_estimate <= 1e-9
-    finer = simulate("swing", still, 10.0, tolerance=1e-12, method="dop853", t_eval=[10.0])
-    assert np.abs(found.quaternion - finer.quaternion).max() <= 1e-9
-
-
 @pytest.mark.skipif(numba_version() is None, reason="needs numba")
 @pytest.mark.parametrize(
     ("scene", "method", "torque"),

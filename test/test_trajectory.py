@@ -12,7 +12,6 @@ from sst_ros.errors import InputError
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulation import Simulation
 from sst_ros.simulation.torque_profile import PolynomialTorque, TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 
@@ -168,23 +167,14 @@ def test_between_samples_the_actuators_clamp_as_at_them():
 
 def test_samples_under_held_torques_need_nothing_else():
     """As those of a recording: each torque is that of the interval that ends there."""
-    simulation, states = Simulation(EXAMPLE2, tolerance=1e-12), []
-    for k in range(11):
-        states.append(simulation.state)
-        simulation.step((0.1 * k, 0.5, -0.3), 10_000_000)
-    bare = Trajectory(
-        EXAMPLE2,
-        [state.time_ns / 1e9 for state in states],
-        [state.quaternion for state in states],
-        [state.body_rate for state in states],
-        [state.torque for state in states],
+    times, torques = np.arange(11) / 100, [(0.1 * k, 0.5, -0.3) for k in range(10)]
+    run, wanted = (
+        simulate(EXAMPLE2, TorqueTable(times[:10], torques), 0.1, t_eval=t, tolerance=1e-12)
+        for t in (times, [0.034567])
     )
-    simulation.reset()
-    for k in range(4):
-        simulation.step((0.1 * k, 0.5, -0.3), 10_000_000)
-    wanted = simulation.within(34_567_000)
-    np.testing.assert_allclose(bare.at(0.034567).quaternion[0], wanted.quaternion, atol=1e-12)
-    assert bare.at(0.034567).torque[0].tolist() == list(wanted.torque)
+    found = Trajectory(EXAMPLE2, run.t, run.quaternion, run.body_rate, run.torque).at(0.034567)
+    np.testing.assert_allclose(found.quaternion, wanted.quaternion, atol=1e-12)
+    assert found.torque[0].tolist() == list(torques[3])
 
 
 @pytest.mark.parametrize("name", ["t", "quaternion", "body_rate", "torque"])
