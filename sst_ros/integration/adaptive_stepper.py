@@ -43,14 +43,10 @@ def step_factor(error: float, error_order: int) -> float:
 def better_method(
     method: Method, tolerance: float, steps: Array, *, only_stiff: bool
 ) -> tuple[Method, str]:
-    """Choose the method that would take longer steps, and state why.
+    """Choose the method that would take longer steps, the one in use if none is, and state why.
 
-    Args:
-        method: the one in use, which is the choice where none is better.
-        tolerance: largest local error estimate of a step.
-        steps: length of a step times the eigenvalues of the Jacobian.
-        only_stiff: look for stiffness alone.
-
+    `steps` is the length of a step times the eigenvalues of the Jacobian; `only_stiff` looks for
+    stiffness alone.
     """
     radius, decay = abs(steps).max(), -steps.real.min()
     implicit = isinstance(method, Rosenbrock)

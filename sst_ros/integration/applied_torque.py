@@ -63,11 +63,8 @@ class AppliedTorque:
     Args:
         ode: equations whose torques are part of the drive.
         limit: largest torque of an actuator [N m], or None.
-        rhs: derivative of the state in place of that of `ode`, with its inputs.
-
-    Attributes:
-        limit: as given.
-        is_traced: whether the derivative is that of `ode`.
+        rhs: derivative of the state in place of that of `ode`, with its inputs; `is_traced` says
+            that there is none.
 
     """
 
@@ -139,11 +136,7 @@ class AppliedTorque:
         Bisection keeps the half with the larger change: that of a jump stays, any other shrinks
         (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them for the same purpose).
 
-        Args:
-            begin: time of the derivative from which it is looked for [s].
-            end: time up to which it is [s].
-            y: state, the same at all times.
-
+        Between two times of the derivative [s], at the same state y.
         """
         torque = self._torque
         assert torque is not None

@@ -80,12 +80,14 @@ class Batch:
         if codegen.numba_version() is None:
             require("numba")
             raise InputError(scene.name, [Problem("SST_ROS_NUMBA", "0", "must not be set to 0")])
-        problems = []
+        unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
+        problems = [
+            Problem(key, "given", unused[section])
+            for key in parameters or ()
+            if (section := key.partition(".")[0]) in unused
+        ]
         if profile and scene.torque is None:
             problems.append(Problem("torque", None, "must be given in the scene for its profile"))
-        unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
-        unused_keys = [(key, unused.get(key.partition(".")[0])) for key in parameters or ()]
-        problems += [Problem(key, "given", reason) for key, reason in unused_keys if reason]
         if problems:
             raise InputError(scene.name, problems)
         self.scene, self._method = scene, method

@@ -125,14 +125,8 @@ def limit_distances(
 ) -> tuple[Scalar, ...]:
     """Return a number for each limit, positive inside, then the rate of each.
 
-    They hold for angles less than pi away from the limit.
-
-    Args:
-        limits: which joints, and on which side.
-        ends: cosine and sine of the end of each.
-        model: constants.
-        state: quaternion and body rate.
-
+    They hold for angles less than pi away from the limit. `ends` has cosine and sine of the end of
+    each limit; the state is quaternion and body rate.
     """
     x, y, z, w, *rate = state
     rows = rotation_rows((x, y, z, w))

@@ -138,15 +138,9 @@ class Collocation:
         self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
         *, iterations: int = 5,
     ) -> PreparedMotion:  # fmt: skip
-        """Prepare `count` steps of h from t.
+        """Prepare `count` steps of h [s] from t [s] and state y under a constant drive d.
 
-        Args:
-            t: time [s].
-            h: length of a step [s].
-            count: number of steps.
-            y: state.
-            d: drive, constant.
-            iterations: evaluations of all nodes a step.
+        A step has `iterations` evaluations of all nodes.
 
         Raises:
             InputError: count or iterations is less than 1.

@@ -205,14 +205,7 @@ class ParameterColumns(NamedTuple):
 class ParametricModel:
     """The programs of a scene, with the numbers that differ between scenarios as inputs.
 
-    Args:
-        scenarios: what differs between them becomes an input.
-        profile: whether the scene's own torques act.
-
-    Attributes:
-        scene: the document.
-        ode: what is integrated, for the names of its state and drive.
-
+    With `profile` the scene's own torques act. `ode` has the names of the state and the drive.
     """
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:

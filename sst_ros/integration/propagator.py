@@ -91,12 +91,9 @@ class Propagator:
         scene: what is simulated.
         integrator: a method of `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step.
-        compiled: by numba.
-        budget: evaluations that a period may take.
-        derivative: derivative of the state in plain Python, in place of the traced one and with
-            its inputs; for explicit methods, and for torques that are numbers or functions.
+        derivative: of the state in plain Python, in place of the traced one and with its inputs;
+            for explicit methods, and for torques that are numbers or functions.
         limits: whether the limits of the scene end the motion.
-        max_step: longest step [s].
         observe: called after each accepted step, for motions whose steps are their own: RK4 has
             error control, too, and periods are not done by one call of compiled code.
 
@@ -363,14 +360,8 @@ class TickSequence(NamedTuple):
 class TickPropagator(Propagator):
     """Propagates a scene by DOP853 through ticks, all of one call in compiled code.
 
-    Limits of the scene do not end the motion.
-
-    Args:
-        scene: what moves.
-        torque: torques over time, within the limit of the actuators; without them they are those
-            of each tick.
-        compiled: by numba, where it is installed.
-
+    Limits of the scene do not end the motion. Torques over time are within the limit of the
+    actuators; without them they are those of each tick.
     """
 
     def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
@@ -402,18 +393,14 @@ class TickPropagator(Propagator):
         begin += length * (np.arange(len(length)) - np.repeat(first, parts))
         begins = np.full((len(length), len(self.ode.state)), np.nan)
         begins[first] = np.hstack([starts, 0.0 * starts[:, :1]])
-        reached = self._reached(begin, length, self._drives(begin, ticks, parts), begins)
+        if self._sine is not None:  # phases of sines, or torques within the limit
+            drives = np.fmod(np.outer(begin, self._sine.frequency) + self._sine.phase, 2.0 * np.pi)
+        else:
+            drives = np.repeat(ticks.drives, parts, axis=0)
+            limit = np.inf if self.torque.limit is None else self.torque.limit
+            drives[:, :3] = np.clip(drives[:, :3], -limit, limit)
+        reached = self._reached(begin, length, drives, begins)
         return np.asarray(reached[first + parts - 1])
-
-    def _drives(self, begin: Array, ticks: TickSequence, parts: NDArray[np.int64]) -> Array:
-        """Return the drives of the parts of ticks: torques within the limit, or phases of sines."""
-        if self._sine is not None:
-            phases = np.multiply.outer(begin, self._sine.frequency) + self._sine.phase
-            return np.asarray(np.fmod(phases, 2.0 * np.pi))
-        drives = np.repeat(ticks.drives, parts, axis=0)
-        if self.torque.limit is not None:
-            drives[:, :3] = np.clip(drives[:, :3], -self.torque.limit, self.torque.limit)
-        return drives
 
     def _reached(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:
         reached: Any = np.full((len(length), 2, len(self.ode.state)), np.nan)

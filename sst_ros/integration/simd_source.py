@@ -16,13 +16,7 @@ from sst_ros.dynamics.expression import Operand, Program, Slots
 
 
 class Layout:
-    """Where in an array `block` the rows of some groups are.
-
-    Attributes:
-        lanes: length of a row.
-        numbers: length of the array.
-
-    """
+    """Where in an array `block` of `numbers` the rows of some groups are, each of `lanes`."""
 
     def __init__(self, lanes: int, **rows: int) -> None:
         ends = list(accumulate(rows.values()))
@@ -49,11 +43,9 @@ def split(
 ) -> tuple[list[str], list[str], list[str]]:
     """Lines of a program that need early inputs only, the other lines, and the results.
 
-    Args:
-        program: its inputs are called u0, u1, ...; results of its lines v0, v1, ...
-        early: for each input whether it is known earlier than others.
-        slots: of numbers that are not in the text.
-
+    Inputs of the program are called u0, u1, ... here, and results of its lines v0, v1, ...; `early`
+    says of each input whether it is known earlier than others. `slots` are of numbers that are not
+    in the text.
     """
     count = len(program.inputs)
     lines, results = replace(program, inputs=tuple(f"u{i}" for i in range(count))).body(slots)

@@ -52,7 +52,7 @@ class GaussMotion:
         scene: what moves, without contacts.
         torque: the sine that acts, or three constant torques within the actuators' limit [N m].
         y: state at t = 0.
-        duration: length of the motion [s].
+        duration: [s].
         tolerance: largest error estimate of the orientation at the end [rad].
         compiled: by numba; None where its machine code is there already.
         finest: most steps that are tried.

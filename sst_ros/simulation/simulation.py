@@ -239,18 +239,7 @@ class Simulation:
         return self._propagator.torque.acting(torque)
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
-        """Do what `steps` does, for arguments that have been checked.
-
-        Args:
-            torque: one of `acting`.
-            dt_ns: length of a step [ns], > 0.
-            count: number of steps.
-            moment: three finite numbers.
-
-        Raises:
-            as `steps`, without InputError.
-
-        """
+        """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
         propagator, h = self._propagator, dt_ns / NANOSECONDS
         held = tuple(moment) if self.dynamics.has_moment_topic else ()
         while count > 0:

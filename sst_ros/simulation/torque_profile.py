@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import inspect
 import math
@@ -358,12 +359,12 @@ def _arguments(function: Callable[..., Any]) -> int:
 
     """
     try:
-        parameters = list(inspect.signature(function).parameters.values())
+        signature = inspect.signature(function)
     except (TypeError, ValueError):
         return 1
-    places = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    needed = [p for p in places if p.default is p.empty]
-    if len(needed) > 2 or not (places or any(p.kind == p.VAR_POSITIONAL for p in parameters)):
-        allowed = "must be a function f(t) or f(t, state)"
-        raise InputError("simulate", [Problem("torque", function, allowed)])
-    return 2 if len(needed) == 2 else 1
+    for count in (1, 2):
+        with contextlib.suppress(TypeError):
+            signature.bind(*range(count))
+            return count
+    allowed = "must be a function f(t) or f(t, state)"
+    raise InputError("simulate", [Problem("torque", function, allowed)])

@@ -283,11 +283,9 @@ class Trajectory:
         try:
             columns, texts = load_table(Path(path), list(UNITS), [_KEY])
             about = json.loads(texts[_KEY])
-        except KeyError:
-            raise InputError("load", [Problem("path", str(path), allowed)]) from None
-        except ValueError as error:
-            problem = Problem("path", str(path), f"{allowed} ({error})")
-            raise InputError("load", [problem]) from None
+        except (KeyError, ValueError) as error:
+            reason = f" ({error})" if isinstance(error, ValueError) else ""
+            raise InputError("load", [Problem("path", str(path), allowed + reason)]) from None
         if about["format"] != _FORMAT:
             raise InputError("load", [Problem("format", about["format"], f"must be {_FORMAT}")])
         arrays = {
