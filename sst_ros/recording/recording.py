@@ -276,6 +276,8 @@ class Recording:
         reports: diagnostics of the simulator's run: when received [ns], text by key.
         missing: keys of the topics that are not in the recording.
         signals: those given.
+        table: `Signals.table`, a table as pandas by its name: samples (the default), ticks,
+            commands, commands_stamped or external_moment.
 
     Raises:
         InputError: the signals are not those of a whole run; the error names the fault.
@@ -283,7 +285,7 @@ class Recording:
     """
 
     def __init__(self, found: Signals) -> None:
-        self.signals, self.path = found, found.path
+        self.signals, self.path, self.table = found, found.path, found.table
         if absent := [found.absent[key] for key in ESSENTIAL if key in found.absent]:
             raise InputError(str(self.path), absent)
         if found.scene is None:
@@ -378,16 +380,6 @@ class Recording:
             error_estimate=error_estimate,
             law=None if ticks.gaps else TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque),
         )
-
-    def table(self, name: str = "samples") -> pd.DataFrame:
-        """Return a table as pandas: samples, ticks, commands, commands_stamped, external_moment.
-
-        Raises:
-            InputError: the recording has no such table.
-            MissingDependency: pandas is not installed.
-
-        """
-        return self.signals.table(name)
 
 
 def read(path: str | Path, *, damaged: bool = False) -> Recording:

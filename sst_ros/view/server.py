@@ -164,25 +164,18 @@ def _free_port(host: str, port: int) -> int:
     if not _PORTS[0] <= port <= _PORTS[1]:
         allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
         raise InputError("view", [Problem("port", port, allowed)])
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
-        _bind(addresses, 0)
-    except (OSError, UnicodeError) as error:
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, TypeError, ValueError) as error:  # bytes that are no name are a TypeError
         allowed = f"must be an address of this machine ({error})"
         raise InputError("view", [Problem("host", host, allowed)]) from None
     last = min(port + _TRIED - 1, _PORTS[1])
     for tried in range(port, last + 1):
         with contextlib.suppress(OSError):
-            _bind(addresses, tried)
+            socket.create_server((host, tried), family=family).close()
             return tried
     raise InputError("view", [Problem("port", port, f"no port up to {last} is free")])
-
-
-def _bind(addresses: list[Any], port: int) -> None:
-    for family, kind, _, _, address in addresses:
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((address[0], port, *address[2:]))
 
 
 def _name(host: str) -> str:

@@ -239,12 +239,6 @@ def test_ends_limits_and_friction_are_in_it():
     assert float(effort) == 4.0
 
 
-def test_command_line(capsys):
-    assert main(["describe", "--scene", "general"]) == 0
-    assert capsys.readouterr().out == urdf(load("general"))
-    assert main(["describe", "--scene", "none"]) == 1
-
-
 def test_an_arc_begins_ends_and_stays_on_its_sphere():
     begin, axis = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
     points = Arc(begin, axis, 1.234, 0.35, 0.01, (1.0, 0.0, 0.0)).points()
@@ -304,7 +298,9 @@ def test_the_states_before_the_first_message_are_the_initial_ones():
     assert given == [number for state in states for number in state]
 
 
-def test_the_rest_is_the_urdf_of_the_scene(capsys):
+def test_the_command_writes_both_and_the_rest_of_the_second_is_the_first(capsys):
+    assert main(["describe", "--scene", "swing"]) == 0
+    assert capsys.readouterr().out == urdf(load("swing"))
     assert main(["describe", "--scene", "swing", "--ros2-control"]) == 0
     root = ET.fromstring(capsys.readouterr().out)
     root.remove(root.find("ros2_control"))
