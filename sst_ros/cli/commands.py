@@ -357,21 +357,11 @@ def function(name: str) -> Any:
 
 
 def free_out(options: argparse.Namespace, default: str | Path) -> Path:
-    """Return the path of `--out`, or the default, if nothing there would be overwritten.
-
-    Raises:
-        InputError: there are earlier results, and `--force` is not given.
-
-    """
+    """Return the path of `--out`, or the default; refuse to overwrite without `--force`."""
     out = options.out or Path(default)
     return require_free(out, options.command, force=getattr(options, "force", False))
 
 
 def refuse(options: argparse.Namespace, option: str, value: object, allowed: str) -> NoReturn:
-    """Refuse the value of an option.
-
-    Raises:
-        InputError: always.
-
-    """
+    """Raise the error that refuses the value of an option."""
     raise InputError(options.command, [Problem(option, value, allowed)])

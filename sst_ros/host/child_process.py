@@ -28,14 +28,7 @@ _next = itertools.count(os.getpid())  # what comes later leaves the last ones to
 
 
 def start(command: str, given: dict[str, object], **more: Any) -> Popen[str]:
-    """Start a node that ends when this process does, however that comes.
-
-    Args:
-        command: which.
-        given: its parameters.
-        more: for Popen.
-
-    """
+    """Start a node with parameters; it ends when this process does, however that comes."""
     keep_domain()
     return Popen(
         [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)],
@@ -61,12 +54,7 @@ def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[
 
 
 def keep_domain() -> None:
-    """Use the ROS domain that the environment names, or else one that this process then keeps.
-
-    Raises:
-        SstError: all domains from 1 to 100 are in use.
-
-    """
+    """Use the ROS domain that the environment names, or else one that this process then keeps."""
     if "ROS_DOMAIN_ID" not in os.environ:
         os.environ["ROS_DOMAIN_ID"] = str(_lock_domain()[0])
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -74,12 +62,7 @@ def keep_domain() -> None:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Have nodes use a ROS domain that nothing else on this machine has, without the network.
-
-    Raises:
-        SstError: all domains from 1 to 100 are in use.
-
-    """
+    """Have nodes use a ROS domain that nothing else on this machine has, without the network."""
     number, lock = _lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     before = {name: os.environ.get(name) for name in ours}
@@ -95,7 +78,12 @@ def own_domain() -> Iterator[int]:
 
 
 def _lock_domain() -> tuple[int, int]:
-    """Return the number of a domain, and the descriptor that keeps it until it is closed."""
+    """Return the number of a domain, and the descriptor that keeps it until it is closed.
+
+    Raises:
+        SstError: all domains from 1 to 100 are in use.
+
+    """
     for _ in range(_DOMAINS):
         number = 1 + next(_next) % _DOMAINS
         path = Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}"

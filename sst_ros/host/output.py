@@ -33,11 +33,7 @@ def results_folder(bag: Path, kind: str) -> Path:
 def require_free(out: Path, origin: str, *, force: bool = False, option: str = "--out") -> Path:
     """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
 
-    Args:
-        out: path of a file, or of a folder.
-        origin: command that writes, for the message.
-        force: allow files of the same names to be replaced.
-        option: option that gave `out`, for the message.
+    `origin` is the command that writes, `option` that which gave `out`: the message names both.
 
     Raises:
         InputError: `out` is a file, or a folder that is not empty, and `force` is not set; or it
@@ -89,13 +85,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 class Bar:
-    """A bar that shows on a terminal how much is done.
-
-    Args:
-        label: what is done.
-        shown: whether it is drawn, if stderr is a terminal.
-
-    """
+    """A bar that shows how much of something is done, where `shown` and stderr is a terminal."""
 
     def __init__(self, label: str, shown: bool) -> None:
         self._label, self._percent = label, -1

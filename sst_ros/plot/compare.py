@@ -164,12 +164,12 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
 
 def labels(runs: Sequence[Signals]) -> list[str]:
     """Name each run by the shortest end of its path that no other has."""
-    parts = [run.path.resolve().parts for run in runs]
+    parts = [run.bag.path.resolve().parts for run in runs]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-depth:]) for part in parts]
         if len(set(names)) == len(names):
             return names
-    return [f"{index}: {run.path}" for index, run in enumerate(runs, 1)]
+    return [f"{index}: {run.bag.path}" for index, run in enumerate(runs, 1)]
 
 
 def difference_text(runs: Sequence[Signals]) -> str:

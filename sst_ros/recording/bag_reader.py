@@ -86,6 +86,7 @@ class Bag:
         damaged: read what is intact of a damaged recording instead of refusing it.
 
     Attributes:
+        path: as given.
         topics: full names of the topics found, by key; complete when `messages` is exhausted.
         damage: what is damaged or lost, a line for each part.
         unverified: number of chunks without a checksum.
@@ -133,11 +134,15 @@ class Bag:
         if not count:
             raise refusal(self.path, "messages", 0, "the recording is empty")
 
-    def absence(self, topic: Topic) -> Problem:
-        """Describe that a topic is missing."""
-        others = [f"{name} ({kind})" for name, kind in self._channels if topic.matches(name)]
-        allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
-        return Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
+    @property
+    def absent(self) -> dict[str, Problem]:
+        """Why a requested topic is missing, by its key."""
+        found = {}
+        for topic in (one for one in self._requested if one.key not in self.topics):
+            others = [f"{name} ({kind})" for name, kind in self._channels if topic.matches(name)]
+            allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
+            found[topic.key] = Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
+        return found
 
     def _mcap_files(self) -> list[Path]:
         """Files that are read as they are; none where rosbags reads them."""

@@ -71,29 +71,21 @@ class Signals:
     """All that a recording holds of a run, as tables.
 
     Attributes:
-        path: of the recording.
+        bag: the recording: its path, topics, damage.
         scene: what was simulated; None where it was not recorded.
         start_ns: stamp of the start of the run [ns].
         topic_series: rows of each topic that was recorded, by its key.
         idle_states: number of joint states that are no samples of the run.
         statuses: diagnostics, in order of reception.
-        topics: full names of the topics found, by key.
-        absent: why a topic is missing, by key.
-        damage: what is damaged or lost, a line for each part; empty unless it was asked for.
-        unverified: number of chunks without a checksum.
 
     """
 
-    path: Path
+    bag: Bag
     scene: Scene | None
     start_ns: int
     topic_series: dict[str, Series]
     idle_states: int
     statuses: tuple[Status, ...]
-    topics: dict[str, str]
-    absent: dict[str, Problem]
-    damage: tuple[str, ...] = ()
-    unverified: int = 0
 
     @cached_property
     def tables(self) -> dict[str, Series]:
@@ -144,7 +136,7 @@ class Signals:
         """
         if table not in self.tables:
             allowed = "must be one of those in the bag: " + ", ".join(self.tables)
-            raise refusal(self.path, "table", table, allowed)
+            raise refusal(self.bag.path, "table", table, allowed)
         series = self.tables[table]
         times = (self.time_ns(table), series.stamp_ns, series.received_ns)
         numbers = zip(series.columns, series.values.T, strict=True)
@@ -173,14 +165,14 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
 
     Args:
         path: a rosbag2 recording, MCAP or sqlite3.
-        damaged: read what is intact of a damaged recording; `Signals.damage` names the rest.
+        damaged: read what is intact of a damaged recording; `Signals.bag.damage` names the rest.
 
     Raises:
         InputError: there is no recording, it is damaged, or it has nothing of a run.
 
     """
-    path, requested = Path(path), [*TOPIC_TABLES, SCENE, DIAGNOSTICS]
-    bag = Bag(path, requested, damaged=damaged)
+    path = Path(path)
+    bag = Bag(path, [*TOPIC_TABLES, SCENE, DIAGNOSTICS], damaged=damaged)
     collected = {table.key: CollectedRows(table) for table in TOPIC_TABLES}
     scenes: set[str] = set()
     statuses: list[Status] = []
@@ -209,16 +201,12 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
     starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
     origin = f"{path}: {bag.topics.get(SCENE.key)}"
     return Signals(
-        path=path,
+        bag=bag,
         scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
         start_ns=min(starts or [int(one.received_ns[0]) for one in found.values()]),
         topic_series=found,
         idle_states=idle,
         statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
-        topics=bag.topics,
-        absent={one.key: bag.absence(one) for one in requested if one.key not in bag.topics},
-        damage=bag.damage,
-        unverified=bag.unverified,
     )
 
 
@@ -285,13 +273,14 @@ class Recording:
     """
 
     def __init__(self, found: Signals) -> None:
-        self.signals, self.path, self.table = found, found.path, found.table
-        if absent := [found.absent[key] for key in ESSENTIAL if key in found.absent]:
-            raise InputError(str(self.path), absent)
+        self.signals, self.path, self.table = found, found.bag.path, found.table
+        absent = found.bag.absent
+        if problems := [absent[key] for key in ESSENTIAL if key in absent]:
+            raise InputError(str(self.path), problems)
         if found.scene is None:
             raise refusal(self.path, SCENE.key, 0, "the recording must hold one scene")
         self.scene, self.idle_states = found.scene, found.idle_states
-        self.missing = tuple(key for key in OPTIONAL if key in found.absent)
+        self.missing = tuple(key for key in OPTIONAL if key in absent)
         self.reports = tuple(
             (one.received_ns, one.values)
             for one in found.statuses
@@ -387,7 +376,7 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
 
     Args:
         path: folder of the recording, or its file.
-        damaged: read what is intact of a damaged recording; `signals.damage` names the rest.
+        damaged: read what is intact of a damaged recording; `signals.bag.damage` names the rest.
 
     Raises:
         InputError: it is no recording of a run, or a damaged one; the error names the fault.
@@ -448,7 +437,7 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
     bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refusal(found.path, table.key, row, f"is not finite at stamp {stamp} ns")
+        raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
     return series
 
 

@@ -196,7 +196,7 @@ def summarise(
         "effort_difference_largest_at_s": when if off else None,
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
-        "damage": list(run.signals.damage),
+        "damage": list(run.signals.bag.damage),
         "notes": list(_notes(run, integration, ideal)),
         "report": made_on(),
     }
@@ -298,7 +298,7 @@ def _notes(run: Recording, integration: Comparison, ideal: Comparison | None) ->
         yield "the scene has no torques: no ideal to compare with"
     if run.scene.lags:
         yield "the actuators lag: efforts differ from the torques that are asked for"
-    if unverified := run.signals.unverified:
+    if unverified := run.signals.bag.unverified:
         yield f"{unverified} chunks have no checksum: damage would not be noticed"
     if "euler_zyz" in run.missing:
         yield "euler_zyz is not recorded: its pictures show the orientation's angles"

@@ -87,7 +87,8 @@ def read_tracking(path: Path) -> TrackedRun:
 
     """
     run = recording.read(path)
-    if absent := [run.signals.absent[key] for key in KEYS if key in run.signals.absent]:
+    missing = run.signals.bag.absent
+    if absent := [missing[key] for key in KEYS if key in missing]:
         raise InputError(str(path), absent)
     found = of(run)
     if found is None:

@@ -95,6 +95,11 @@ class RunControl(Protocol):
 class Replay:
     """Plays a bag; has `scene`, `states` and `status` as a run; used from two threads of the page.
 
+    Attributes:
+        scene: that was recorded.
+        length: of the run [s].
+        playing: whether it is.
+
     Raises:
         InputError: the bag is no whole recording of a run.
 
@@ -104,26 +109,12 @@ class Replay:
         from sst_ros.recording.recording import read  # needs rosbags, which a live view does not
 
         self._run = read(bag)
+        self.scene, self._seconds = self._run.scene, self._run.seconds
+        self.length = float(self._seconds[-1])
         self._lock = threading.Lock()
-        self._seconds = self._run.seconds
         self._now, self._since, self._factor = 0.0, time.monotonic(), 1.0
-        self._playing, self._shown = False, -1
+        self.playing, self._shown = False, -1
         self.play(True)
-
-    @property
-    def scene(self) -> Scene:
-        """The recorded scene."""
-        return self._run.scene
-
-    @property
-    def length(self) -> float:
-        """Length of the run [s]."""
-        return float(self._seconds[-1])
-
-    @property
-    def playing(self) -> bool:
-        """Whether it is playing."""
-        return self._playing
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""
@@ -131,7 +122,7 @@ class Replay:
             self._advance()
             if playing and self._now >= self.length:
                 self._now = 0.0
-            self._playing = playing
+            self.playing = playing
 
     def seek(self, time: float) -> None:
         """Go to a time [s]."""
@@ -162,15 +153,15 @@ class Replay:
         """Return the last diagnostics of the recording."""
         values = self._run.diagnostics
         fault = values.get("fault", "")
-        phase = "recording" if self._playing else "recording, paused"
+        phase = "recording" if self.playing else "recording, paused"
         return RunStatus(phase, 2 if fault else 0, fault, values)
 
     def _advance(self) -> None:
         now = time.monotonic()
-        if self._playing:
+        if self.playing:
             self._now += (now - self._since) * self._factor
             if self._now >= self.length:
-                self._now, self._playing = self.length, False
+                self._now, self.playing = self.length, False
         self._since = now
 
 

@@ -70,7 +70,7 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
 
 
 def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
-    words = ["plot", "--compare", *(str(run.path) for run in pair), "--out", str(tmp_path)]
+    words = ["plot", "--compare", *(str(run.bag.path) for run in pair), "--out", str(tmp_path)]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "at samples that both have at the same time since the start of each run" in said

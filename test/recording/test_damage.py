@@ -122,7 +122,7 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
         recording.read(bag)
     run = recording.read(bag, damaged=True)
     assert 30 < len(run.time_ns) < 51
-    assert any("40 messages are lost" in line for line in run.signals.damage)
+    assert any("40 messages are lost" in line for line in run.signals.bag.damage)
     found = recover(bag, tmp_path / "recovered")
     whole_messages, kept = messages_of(whole), messages_of(found.bag)
     assert set(kept) < set(whole_messages) and len(kept) == len(whole_messages) - CHUNK
@@ -136,7 +136,7 @@ def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, en
 
 
 def test_recordings_without_checksums_are_read_and_counted(written, example2):
-    assert recording.read(written(example2)).signals.unverified > 0
+    assert recording.read(written(example2)).signals.bag.unverified > 0
 
 
 def test_a_late_flush_makes_no_large_chunk_and_the_index_of_messages_is_not_kept(

@@ -38,7 +38,7 @@ def test_a_run_comes_back_as_it_was_written(reread, bags, example2):
     assert np.array_equal(run.received_ns - run.start_ns, run.time_ns + 50_000)
     assert (run.idle_states, len(run.commands.torque), run.missing) == (3, 1, ())
     assert run.diagnostics["phase"] == "finished"
-    assert run.signals.topics["orientation"] == "/sst_simulator/orientation"
+    assert run.signals.bag.topics["orientation"] == "/sst_simulator/orientation"
     last = next(e.content for e in example2 if (e.topic, e.sample) == (bags.JOINTS, 150))
     sections = [run.gamma, run.mu, run.beta], [run.gamma_dot, run.mu_dot, run.beta_dot]
     assert np.array_equal(np.concatenate([part[150] for part in sections[0]]), last.position)
@@ -164,7 +164,7 @@ def test_bags_of_every_kind_hold_the_same_run(reread, tmp_path, bags, example2):
     for kind in (*kinds, *({"mode": mode} for mode in modes)):
         run = reread(example2, namespace="/cell_7", **kind)
         bags.same(run, expected)
-        assert run.signals.topics["joint_states"] == "/cell_7/joint_states"
+        assert run.signals.bag.topics["joint_states"] == "/cell_7/joint_states"
 
 
 def test_idle_states_are_no_samples(reread, bags, example2):
