@@ -52,7 +52,7 @@ EXTRAS |= {
         "sphinx-gallery>=0.16",
     ],
     "engines": ["mujoco>=4", "pin>=4"],
-    "peers": ["drake", "exudyn", "mpmath", "mujoco>=4", "pin>=4"],
+    "peers": ["mpmath", "mujoco>=4", "pin>=4"],
     "test": [
         "argcomplete",
         "build",

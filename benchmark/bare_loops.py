@@ -12,14 +12,11 @@ Each is measured as the machine is, and where it is asked to let no core sleep (
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,6 +25,7 @@ from typing import Any
 
 import rclpy
 
+from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import scheduling
 from sst_ros.mechanism.generic_math import ZERO
@@ -159,10 +157,8 @@ def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> d
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
         stack.callback(Process("recorder", output=folder / "bag").end)
         if name != NODE:
-            command = [sys.executable, "-m", "benchmark.bare_loops", "--loop", name]
-            command += ["--seconds", str(seconds), "--cpu-dma-latency", str(latency_us)]
-            found = subprocess.run(command, check=True, capture_output=True, text=True)
-            return dict(json.loads(found.stdout))
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+                return process.submit(run_loop, name, seconds, latency_us).result()
         full = "/sst_simulator"
         watch.values.clear()
         simulator = start_simulator(scene="swing", compiled=True, cpu_dma_latency=latency_us)
@@ -177,16 +173,11 @@ def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> d
             watch.spin(1.5)  # until its last diagnostics have come
 
 
-def explain_refusal(latency_us: int) -> str | None:
-    """Return why this exit latency cannot be asked for here, None where it can."""
-    said = scheduling.CpuDmaLatency().request(latency_us)
-    return said if scheduling.NO_LIMIT in said else None
-
-
 def compare(watch: Client, seconds: float, rounds: int) -> str:
     """Measure all in turn; Markdown, a row for each, a table for each cpu_dma_latency."""
     settings = {-1: "no limit of the exit latency, the default"}
-    if (said := explain_refusal(0)) is None:
+    said = scheduling.CpuDmaLatency().request(0)
+    if scheduling.NO_LIMIT not in said:
         settings[0] = "`cpu_dma_latency` 0"
     found: dict[tuple[int, str], list[dict[str, float]]] = {
         (latency_us, name): [] for name in (NODE, *LOOPS) for latency_us in settings
@@ -211,23 +202,13 @@ def compare(watch: Client, seconds: float, rounds: int) -> str:
             }
             rows.append(row)
         tables.append(markdown(data_frame(rows)))
-    if said is not None:
+    if 0 not in settings:
         tables.append(f"With `cpu_dma_latency` 0: {said}.")
     return "\n\n".join(tables)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each run")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--cpu-dma-latency", type=int, default=-1, help="of --loop [us]")
-    parser.add_argument("--loop", choices=LOOPS, help="run this loop alone, in this process")
-    options = parser.parse_args()
-    if options.loop:
-        print(json.dumps(run_loop(options.loop, options.seconds, options.cpu_dma_latency)))
-        return
+    options = read_options("bare_loops", __doc__, seconds=20.0, rounds=3)
     with Client.start() as watch:
         print(compare(watch, options.seconds, options.rounds))
 

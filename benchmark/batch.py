@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a step of many scenarios costs: numba, the same text in C with SIMD, and NumPy columns.
 
-python -m benchmark.batch [--scene example2_heavy] [--scenarios 10000] [--rounds 9] [--json FILE]
+python -m benchmark.batch [--scene example2_heavy] [--scenarios 10000] [--rounds 9]
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -19,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import Costs, describe_machine, join_line, time_in_turn, write_json
+from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.methods import DOP853, RK4, Tableau
@@ -38,7 +37,7 @@ FLAGS = {
     "C SIMD, -ffast-math": (*SIMD, "-ffast-math"),
 }
 ONE, ALL, FLOOR, PLAIN = "numba, 1 thread", "numba, all cores", "C SIMD", "C SIMD, no fma"
-COLUMNS, TRACED = "NumPy columns", "NumPy columns, traced program"
+COLUMNS = "NumPy columns"
 AT_MOST_C, AT_LEAST_COLUMNS = 1.5, 20
 STEP, STEPS = 1e-3, 20
 SPREAD = 0.05
@@ -54,12 +53,9 @@ State = tuple[Any, ...]
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.batch", description=__doc__)
-    parser.add_argument("--scene", default="example2_heavy")
-    parser.add_argument("--scenarios", type=int, default=10_000)
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
+    options = read_options(
+        "batch", __doc__, arguments, scene="example2_heavy", scenarios=10_000, rounds=9
+    )
     scene = scenes.load(options.scene)
     with_c = c_floor.has_gcc()
     with tempfile.TemporaryDirectory() as folder:
@@ -69,10 +65,9 @@ def main(arguments: list[str] | None = None) -> int:
     if with_c:
         host["gcc"] = c_floor.read_version()
     counts = {
-        (name, who): (1 if who in (COLUMNS, TRACED) else STEPS) * options.scenarios
-        * len(METHODS[name].b)
+        (name, who): (1 if who == COLUMNS else STEPS) * options.scenarios * len(METHODS[name].b)
         for name, who in seconds
-    }  # fmt: skip
+    }
     costs = Costs(seconds, counts, FLOOR)
     print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {SIMD_WIDTH} lanes.")
     print("Time per evaluation and scenario: a step with limits and error, over its stages.")
@@ -85,11 +80,8 @@ def main(arguments: list[str] | None = None) -> int:
         for who in (STAR, BODIES):
             print(f"{name}: {who} over fixed {costs.ratio(name, who, ONE):.2f}")
         for ours in (ALL, ONE):
-            for who in (COLUMNS, TRACED):
-                costs.judge(name, who, ours, AT_LEAST_COLUMNS, least=True)
+            costs.judge(name, COLUMNS, ours, AT_LEAST_COLUMNS, least=True)
     print("\n" + join_line(host))
-    found = {"scene": options.scene, "rows": costs.rows(), "notes": work.notes}
-    write_json(options.json, {"machine": host, **found})
     return 0
 
 
@@ -133,10 +125,8 @@ class _Work:
         if folder is not None:
             self._add_c(name, method, batch, start, run(1)[0], folder)
         dynamics, columns = Dynamics.of(self._scene), tuple(y.copy())
-        system = ODE(dynamics, self._scene.torque)
-        slopes = {COLUMNS: _columns(dynamics, self._scene), TRACED: _traced(system)}
-        for who, slope in slopes.items():
-            self.calls[name, who] = partial(_step, method, slope, 0.0, columns)
+        slope = _columns(dynamics, self._scene)
+        self.calls[name, COLUMNS] = partial(_step, method, slope, 0.0, columns)
 
     def _add_c(
         self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any],
@@ -200,14 +190,6 @@ def _columns(dynamics: Dynamics, scene: Scene) -> Callable[..., State]:
         return kernel.derivative(dynamics.model, y, tau)
 
     return slope
-
-
-def _traced(system: ODE) -> Callable[..., State]:
-    names: dict[str, Any] = {}
-    head = "from numpy import arctan2 as atan2, cos, exp, sin, sqrt, tanh\n"
-    exec(head + system.program.source("rhs"), names)
-    drive = (0.0,) * len(system.drive)
-    return lambda t, *y: names["rhs"](t, *y, *drive)
 
 
 def _step(method: Tableau, slope: Callable[..., State], t: float, y: State) -> State:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What one evaluation and one step cost: numba, plain Python, and C from the same traced program.
 
-python -m benchmark.kernel [--scene example2_heavy] [--rounds 15] [--json FILE]
+python -m benchmark.kernel [--scene example2_heavy] [--rounds 15]
 """
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ import numba
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import Costs, describe_machine, join_line, time_in_turn, write_json
+from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
 from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -45,21 +45,17 @@ def slopes(count, y):
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.kernel", description=__doc__)
-    parser.add_argument("--scene", default="example2_heavy")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
+    options = read_options("kernel", __doc__, arguments, scene="example2_heavy", rounds=15)
     scene = scenes.load(options.scene)
     system = ODE(Dynamics.of(scene), scene.torque)
     start = Simulation(scene).state
     y = [*start.quaternion, *start.body_rate]
     if len(system.state) != 7 or system.drive:
-        parser.error("needs a scene with a torque, without lag or moment from a topic")
+        sys.exit("needs a scene with a torque, without lag or moment from a topic")
     with_c = c_floor.has_gcc()
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
-        seconds = time_in_turn(calls, options.rounds, shortest=5e-3)
+        seconds = time_in_turn(calls, options.rounds, shortest=5e-3, clock=time.process_time)
     host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
@@ -70,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
     costs = Costs(seconds, counts, "C -O3")
     size = sum(system.program.operations.values())
     print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
-    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
+    print(f"Processor time: medians of {options.rounds} interleaved rounds, and of quotients.\n")
     costs.print()
     for work in dict.fromkeys(work for work, _ in seconds):
         costs.judge(work, NUMBA, "C -O3", AT_MOST_C)
@@ -78,7 +74,6 @@ def main(arguments: list[str] | None = None) -> int:
     met = "met" if plain <= AT_MOST_PLAIN else "MISSED"
     print(f"plain rk4 step {1e6 * plain:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
     print("\n" + join_line(host))
-    write_json(options.json, {"machine": host, "scene": options.scene, "rows": costs.rows()})
     return 0
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of a long run: time and memory of `report run` for ten minutes at 500 Hz.
 
-python -m benchmark.long_bag [--seconds 600] [--bag FOLDER] [--json FILE]
+python -m benchmark.long_bag [--seconds 600] [--bag FOLDER]   # is kept there, used if it exists
 
 The bag is a true run: Example 2 with springs and friction in its actuators, so that it stays inside
 for ever, solved by single steps at 1 kHz. Its messages are made by the code of the nodes.
@@ -9,7 +9,6 @@ for ever, solved by single steps at 1 kHz. Its messages are made by the code of 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import math
@@ -24,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.measure import describe_machine, join_line, write_json
+from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.host.output import slices
 from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array
@@ -53,6 +52,11 @@ TOPICS = {
 CDR = b"\x00\x01\x00\x00"
 """Begin of every message: little-endian CDR."""
 _CHUNK = 5000
+SHOWN = (
+    *("samples_recorded", "ticks_recorded", "samples_compared"),
+    *("integration_error_gamma_rad", "integration_reference_error_gamma_rad"),
+)
+"""Of the report's summary."""
 
 
 def endless() -> Scene:
@@ -124,11 +128,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the bag, report it, print what that took and the verdict; the exit status is 0."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.long_bag", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--bag", type=Path, help="write it there and keep it; used if it exists")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
+    options = read_options("long_bag", __doc__, arguments, seconds=600.0, bag=Path)
     with tempfile.TemporaryDirectory() as folder:
         bag = options.bag or Path(folder) / "bag"
         if not bag.exists():
@@ -140,24 +140,13 @@ def main(arguments: list[str] | None = None) -> int:
         wall, used = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
         busy, memory = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
         summary = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
-    found = {
-        "samples": summary["samples_recorded"],
-        "ticks": summary["ticks_recorded"],
-        "samples_compared": summary["samples_compared"],
-        "bag_GB": size,
-        "wall_s": wall,
-        "processor_s": busy,
-        "peak_GB": memory,
-        "integration_error_gamma_rad": summary["integration_error_gamma_rad"],
-        "integration_reference_error_gamma_rad": summary["integration_reference_error_gamma_rad"],
-    }
+    found = {"bag_GB": size, "wall_s": wall, "processor_s": busy, "peak_GB": memory}
+    found |= {name: summary[name] for name in SHOWN}
     for name, value in found.items():
         print(f"{name:40} {value:.4g}" if isinstance(value, float) else f"{name:40} {value}")
     good = wall < AT_MOST_S and memory < AT_MOST_GB
     print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
-    host = describe_machine("numpy", "numba", "rosbags", "matplotlib")
-    print(join_line(host))
-    write_json(options.json, {"found": found, "machine": host})
+    print(join_line(describe_machine("numpy", "numba", "rosbags", "matplotlib")))
     return 0
 
 

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import gc
-import json
 import os
 import platform
 import time
@@ -20,6 +20,29 @@ from sst_ros.report.results import data_frame, markdown, processor
 
 Key = TypeVar("Key", bound=Hashable)
 DOCS = Path(__file__).parents[1] / "docs"
+
+
+def read_options(
+    name: str, doc: str | None, arguments: list[str] | None = None, **defaults: Any
+) -> argparse.Namespace:
+    """Read the options of a benchmark: flags where the default is False, else values of its type.
+
+    A default that is a type stands for an option that may be left out.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmark.{name}",
+        description=doc,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    for key, default in defaults.items():
+        option = f"--{key.replace('_', '-')}"
+        if default is False:
+            parser.add_argument(option, action="store_true")
+        elif isinstance(default, type):
+            parser.add_argument(option, type=default)
+        else:
+            parser.add_argument(option, type=type(default), default=default, help="%(default)s")
+    return parser.parse_args(arguments)
 
 
 def time_in_turn(
@@ -130,15 +153,6 @@ class Costs:
             return None
         return divide(self._ns, (work, who), (work, other))
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Work, who, the median cost [ns], and the ratio to the floor where that is known."""
-        found = []
-        for work, who in self._ns:
-            row = {"work": work, "who": who, "ns": median(self._ns[work, who])}
-            over = self.ratio(work, who, self.floor)
-            found.append(row if over is None else {**row, "over_c": over})
-        return found
-
     def judge(self, work: str, who: str, other: str, target: float, *, least: bool = False) -> None:
         """Print whether a ratio of at most `target` is met, or of `least` that."""
         value = self.ratio(work, who, other)
@@ -149,11 +163,12 @@ class Costs:
             print(f"{work}: {who} over {other} {said}, target {target}: {verdict}")
 
     def print(self) -> None:
-        """Print all rows."""
+        """Print the medians, and the ratios to the floor where they are known."""
         print(f"{'work':18}{'who':38}{'ns':>10}{'over ' + self.floor:>16}")
-        for row in self.rows():
-            over = f"{row['over_c']:.2f}" if "over_c" in row else ""
-            print(f"{row['work']:18}{row['who']:38}{row['ns']:10.1f}{over:>16}")
+        for work, who in self._ns:
+            over = self.ratio(work, who, self.floor)
+            said = "" if over is None else f"{over:.2f}"
+            print(f"{work:18}{who:38}{median(self._ns[work, who]):10.1f}{said:>16}")
         print()
 
 
@@ -173,10 +188,3 @@ def fill_page(page: Path, parts: dict[str, str], out: Path | None = None) -> Non
     """Write a page, by default in its place, with new parts; its other text stays."""
     text = fill(page.read_text(encoding="utf-8"), parts)
     (out or page).write_text(text, encoding="utf-8")
-
-
-def write_json(path: Path | None, document: Any) -> None:
-    """Write what was measured, where a file was asked for."""
-    if path is not None:
-        text = json.dumps(document, indent=1, ensure_ascii=False)
-        path.write_text(text + "\n", encoding="utf-8")

@@ -9,6 +9,10 @@ and as long with neither; in the same minutes a loop that only sleeps to the sam
 process of its own at the same priority, measures what the machine itself misses. Then the simulator
 runs as fast as possible, without and with a subscriber to joint_states, then a fleet. Commands of
 zero torque come at 100 Hz.
+
+--minutes is that of each run at 1 kHz (0: none), --usual that of the two others; --rounds and
+--seconds those beside the bare loops (0 rounds: none); --fleet measures only so many at once, at
+--rate [Hz]; --plain runs no machine code.
 """
 
 from __future__ import annotations
@@ -38,6 +42,7 @@ from benchmark.measure import (
     fill_page,
     format_columns,
     join_line,
+    read_options,
 )
 from benchmark.nodes import Account, Client, Process, start_simulator
 from sst_ros.nodes.topics import NeverSpun
@@ -217,22 +222,9 @@ def _count_recorded(bag: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--minutes", type=float, default=1.0, help="of each run at 1 kHz; 0: none")
-    parser.add_argument("--usual", type=float, help="minutes of the other two runs; half as many")
-    parser.add_argument("--scene", default="example2_heavy")
-    parser.add_argument("--plain", action="store_true", help="plain Python, no machine code")
-    parser.add_argument("--priority", type=int, default=20, help="of SCHED_FIFO")
-    parser.add_argument("--fleet", type=int, default=0, help="only so many simulators at once")
-    parser.add_argument("--rate", type=int, default=200, help="of the fleet [Hz]")
-    parser.add_argument("--rounds", type=int, default=3, help="beside the bare loops; 0: none")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each run of those")
-    parser.add_argument(
-        "--write", nargs="?", type=Path, const=PAGE, help="write the page, docs/realtime.md"
-    )
-    options = parser.parse_args()
+    of_runs: dict[str, Any] = {"minutes": 1.0, "usual": float, "rounds": 3, "seconds": 20.0}
+    of_nodes = {"scene": "example2_heavy", "plain": False, "priority": 20, "fleet": 0, "rate": 200}
+    options = read_options("realtime", __doc__, None, **of_runs, **of_nodes, write=False)
     given = {"scene": options.scene, "compiled": str(not options.plain).lower()}
     given["realtime_priority"] = options.priority
     if not options.plain:
@@ -242,7 +234,7 @@ def main() -> None:
         parts = dict(_measure(watch, options, given))
     if options.write:
         none = dict.fromkeys(TITLES, "not measured")
-        fill_page(PAGE, none | parts, options.write)
+        fill_page(PAGE, none | parts)
 
 
 def _measure(

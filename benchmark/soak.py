@@ -11,7 +11,6 @@ status is 1.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import re
 import signal
@@ -24,7 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmark.measure import describe_machine, format_columns, join_line
+from benchmark.measure import describe_machine, format_columns, join_line, read_options
 from benchmark.nodes import Process, own_domain, start_simulator, wait_for
 from sst_ros.recording import recording
 
@@ -139,11 +138,7 @@ def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]
 
 def main() -> int:
     """Soak, print the table and what is wrong."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--minutes", type=float, default=10.0)
-    options = parser.parse_args()
+    options = read_options("soak", __doc__, minutes=10.0)
     subprocess.run([sys.executable, "-m", "sst_ros", "compile", SCENE], check=True)
     with own_domain(), tempfile.TemporaryDirectory() as folder:
         columns, wrong = soak(Path(folder), 60.0 * options.minutes)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study of a million runs against its own kernel, MuJoCo, and two workers against one.
+"""A study of a million runs against its own kernel, and MuJoCo.
 
-python -m benchmark.sweep [--rows 1000000] [--mujoco] [--cluster] [--json FILE]
+python -m benchmark.sweep [--rows 1000000] [--mujoco]
 
 Example 2, one second, DOP853 by the steps that reach 1e-9 rad, the inertia of every body varied by
 a factor of its own, final states to Parquet.
@@ -9,25 +9,21 @@ a factor of its own, final states to Parquet.
 
 from __future__ import annotations
 
-import argparse
-import hashlib
 import os
 import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 
-from benchmark.measure import describe_machine, divide, join_line, time_in_turn, write_json
+from benchmark.measure import describe_machine, join_line, read_options, time_in_turn
 from sst_ros import load_scene, sweep
-from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_chunk, run_local
+from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_local
 from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
@@ -39,10 +35,6 @@ VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
 MUJOCO_STEPS = 2780
 """Steps, with the softness below, by which rollout reaches 1e-6 rad soonest (docs/peers.csv)."""
 
-HASHES = 4_000_000
-"""Repetitions of SHA-256, some seconds."""
-
-RUNS = 1e9
 ROUNDS, CHUNKS = 3, 16
 """What is compared takes turns, so many times, each with so many chunks."""
 
@@ -53,12 +45,7 @@ def study_of(rows: int) -> SweepStudy:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.sweep", description=__doc__)
-    parser.add_argument("--rows", type=int, default=1_000_000)
-    parser.add_argument("--mujoco", action="store_true", help="time MuJoCo's rollout, too")
-    parser.add_argument("--cluster", action="store_true", help="time Dask workers, too")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
+    options = read_options("sweep", __doc__, arguments, rows=1_000_000, mujoco=False)
     found: dict[str, Any] = {"machine": describe_machine("numpy", "numba", "dask", "pyarrow")}
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
@@ -70,13 +57,10 @@ def main(arguments: list[str] | None = None) -> int:
     found |= _ratios(found["steps"])
     if options.mujoco:
         found |= _mujoco(found["us a run"])
-    if options.cluster:
-        found |= _cluster(found["steps"])
     for name, value in found.items():
         if name != "machine":
             print(f"{name:>44}: {value:.6g}")
     print(join_line(found["machine"]))
-    write_json(options.json, found)
     return 0
 
 
@@ -171,75 +155,6 @@ def _mujoco(ours_us: float) -> dict[str, float]:
         "error of MuJoCo [rad]": error,
         "MuJoCo rollout over the study": 1e6 * best / ours_us,
     }
-
-
-def _cluster(steps: int) -> dict[str, float]:
-    """Two workers of one thread against one; cost of a chunk and of the scheduler."""
-    import distributed
-
-    from sst_ros.sweeps.cluster_engine import run_on_cluster, send_code
-
-    dask: Any = distributed
-    study = study_of(CHUNKS * CHUNK)
-    ready = prepare(study, steps)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        dask.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
-        dask.Client(cluster) as client,
-    ):
-        task = ChunkTask(study, steps, Path(folder), list_versions())
-        client.wait_for_workers(2, timeout=60)
-        send_code(client, ready.module)
-        both = list(client.scheduler_info(n_workers=-1)["workers"])
-
-        def run_on_one() -> None:
-            one = {"workers": both[:1], "pure": False}
-            client.gather([client.submit(_on_worker, task, i, **one) for i in range(CHUNKS)])
-
-        def run_on_both() -> None:
-            run_on_cluster(client, task, range(CHUNKS), lambda _: None)
-
-        def run_empty() -> None:
-            client.gather([client.submit(_nothing, i, pure=False) for i in range(1000)])
-
-        for index, worker in enumerate(both):  # each prepares the study once
-            client.submit(_on_worker, task, index, workers=[worker], pure=False).result()
-        calls: dict[str, Callable[[], object]] = {
-            "1": run_on_one,
-            "2": run_on_both,
-            "a chunk": partial(run_chunk, task, 0),
-            "1 in C": partial(_hash, 1),
-            "2 in C": partial(_hash, 2),
-            "empty": run_empty,
-        }
-        times = time_in_turn(calls, ROUNDS)
-    chunk, empty = median(times["a chunk"]), median(times["empty"]) / 1000
-    return {
-        "seconds of a chunk": chunk,
-        "seconds of an empty task, scheduler and client": empty,
-        f"seconds of {CHUNKS} chunks, 1 workers": min(times["1"]),
-        f"seconds of {CHUNKS} chunks, 2 workers": min(times["2"]),
-        "two workers against one": divide(times, "1", "2"),
-        # What this machine gives to any program.
-        "two loops in C against one, in turn with them": 2.0 * divide(times, "1 in C", "2 in C"),
-        # The scheduler serves one task at a time: more threads than this wait for it.
-        "largest useful number of threads": chunk / empty,
-        "hours of 1e9 runs on them": RUNS / CHUNK * empty / 3600,
-    }
-
-
-def _hash(threads: int) -> None:
-    """Occupy threads with bare C, each with the same work."""
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda _: hashlib.pbkdf2_hmac("sha256", b"", b"", HASHES), range(threads)))
-
-
-def _on_worker(task: ChunkTask, index: int) -> str:
-    return run_chunk(task, index).fault
-
-
-def _nothing(index: int) -> int:
-    return index
 
 
 if __name__ == "__main__":

@@ -11,9 +11,6 @@ ALLOWED = (
     "of a ROS installation",
     "no C++ compiler",
     "no chromium with chromedriver on the PATH",
-    # Engines of the extra `peers`, a gigabyte: `python -m benchmark.peers` runs them.
-    "No module named 'pydrake'",
-    "No module named 'exudyn'",
     "with the rclpy of Jazzy",
 )
 

@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes: hostile messages and parameters, floods, services at once, kills, starts and stops."""
+"""Nodes: hostile messages and parameters, steps that do not end, kills, starts and stops."""
 
 from __future__ import annotations
 
 import math
 import os
-import random
 import signal
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from benchmark.campaign.ledger import Ledger
 from benchmark.campaign.scenes import needle
 from benchmark.nodes import Client, Process, own_domain
+from sst_ros.errors import SstError
+from sst_ros.recording import bag_writer
+from sst_ros.recording.recording import read
 
+SAMPLE_NS = 2_000_000
 FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
 """Within this time a step that does not end is a fault, a node answers a service, and it ends."""
 
@@ -131,77 +134,6 @@ def messages(ledger: Ledger) -> None:
         stop(ledger, process)
 
 
-def floods(ledger: Ledger) -> None:
-    """Publish as fast as three threads can, for seconds: the node keeps answering."""
-    from std_msgs.msg import Float64MultiArray
-
-    sent = [0, 0, 0]
-    with running() as (process, client):
-        enough = threading.Event()
-        publishers = [
-            client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
-            for _ in range(3)
-        ]
-        client.until(lambda: publishers[0].get_subscription_count())
-
-        def flood(index: int) -> None:
-            message = Float64MultiArray(data=[0.1, 0.0, -0.1])
-            while not enough.is_set():
-                publishers[index].publish(message)
-                sent[index] += 1
-
-        with ThreadPoolExecutor(3) as pool:
-            done = pool.map(flood, range(3))
-            end = time.monotonic() + max(1.0, 20.0 * ledger.share)
-            try:
-                while time.monotonic() < end:
-                    if not is_alive(ledger, process, client, f"{sum(sent)} messages"):
-                        break
-            finally:
-                enough.set()
-            list(done)  # an error in a thread is an error of the part
-        ledger.tried = sum(sent)
-        stop(ledger, process, signal.SIGTERM)
-
-
-def services(ledger: Ledger) -> None:
-    """Call services from four clients at once, in any order: every call is answered."""
-    from std_srvs.srv import SetBool, Trigger
-
-    lock = threading.Lock()
-    with running() as (process, client):
-        is_alive(ledger, process, client, "the start")
-        number = int(os.environ["ROS_DOMAIN_ID"])
-
-        def work(index: int) -> None:
-            rng, caller = random.Random(ledger.seed + index), Client(number)
-            kinds: list[tuple[Any, str, dict[str, bool]]]
-            kinds = [(SetBool, "pause", {"data": data}) for data in (True, False)]
-            kinds += [(Trigger, "step", {}), (Trigger, "reset", {})]
-            clients: dict[str, Any] = {}
-            for kind, name, _ in kinds:
-                service = f"{NODE}/{name}"
-                clients[name] = caller.node.create_client(kind, service, qos_profile=caller.qos)
-            for one in clients.values():
-                caller.until(one.service_is_ready)
-            for _ in ledger.numbers(1000, least=15):
-                kind, name, fields = rng.choice(kinds)
-                began = time.monotonic()
-                future = clients[name].call_async(kind.Request(**fields))
-                done = caller.until(future.done, 10.0)
-                took = time.monotonic() - began
-                with lock:
-                    ledger.tried += 1
-                    ledger.time(took, REPLY_S, name)
-                    if not done:
-                        ledger.found("lost", f"no reply of {name} within 10 s")
-            caller.close()
-
-        with ThreadPoolExecutor(4) as pool:
-            list(pool.map(work, range(4)))
-        stop(ledger, process)
-
-
 def parameters(ledger: Ledger) -> None:
     """Set parameters of a running simulator to hostile values: refused, or taken; never a fall."""
     from rcl_interfaces.srv import ListParameters, SetParameters
@@ -249,6 +181,37 @@ def node_kills(ledger: Ledger) -> None:
             stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
 
 
+def recorder_kills(ledger: Ledger) -> None:
+    """Kill the recorder at random moments: all but the last chunk comes back."""
+    for number in ledger.cases(34):
+        with TemporaryDirectory() as name, own_domain(compiled=False):
+            bag = Path(name) / "bag"
+            recorder = start("recorder", output=bag)
+            simulator = start("simulator", scene="swing", duration=0.0)
+            try:
+                deadline = time.monotonic() + 30
+                while time.monotonic() < deadline and _size(bag) < 50_000:
+                    time.sleep(0.01)
+                # The wait is the experiment: the moment of the kill is random.
+                time.sleep(ledger.rng.uniform(1.5, 4.0))
+                size = _size(bag)
+                recorder.kill()
+                recorder.wait()
+                steps = np.diff(read(bag_writer.recover(bag).bag).time_ns)
+                if not np.all(steps == SAMPLE_NS):
+                    note = f"kill {number}: gaps inside what was recovered, {size} bytes"
+                    ledger.found("lost", note)
+            except SstError as error:
+                ledger.found("lost", f"kill {number}: {error}")
+            finally:
+                for process in (simulator, recorder):
+                    process.end(signal.SIGKILL, 20.0)
+
+
+def _size(bag: Path) -> int:
+    return sum(path.stat().st_size for path in bag.glob("*.mcap"))
+
+
 def stuck(ledger: Ledger) -> None:
     """Run a step that does not end, or only by its budget: a fault, and the node still answers."""
     rng = ledger.rng
@@ -281,24 +244,6 @@ def _time_fault(ledger: Ledger, client: Client) -> None:
     ledger.time(time.monotonic() - began, FAULT_S, "the fault")
     ledger.time(client.call(SetBool, f"{NODE}/pause", data=True)[1], REPLY_S, "pause")
     ledger.time(client.call(Trigger, f"{NODE}/reset")[1], REPLY_S, "reset")
-
-
-def clock(ledger: Ledger) -> None:
-    """Give a clock that jumps, stops and runs back: the node goes on or waits, and ends."""
-    from rosgraph_msgs.msg import Clock
-
-    rng = ledger.rng
-    with running(use_sim_time=True) as (process, client):
-        publisher = client.node.create_publisher(Clock, "/clock", 1)
-        now = 1.0
-        for _ in ledger.cases(300, least=30):
-            now = max(0.0, now + rng.choice((0.001, 0.01, 0.01, 0.1, 5.0, -2.0, 0.0, 1e6, -1e6)))
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = int(min(now, 2**31 - 1)), int(now % 1 * 1e9)
-            publisher.publish(message)
-            client.executor.spin_once(timeout_sec=0.005)
-        is_alive(ledger, process, client, "the jumps")
-        stop(ledger, process)
 
 
 def starts(ledger: Ledger) -> None:

@@ -24,8 +24,6 @@ MODULES = {
     "ours": "numba",
     "mujoco_peer": "mujoco",
     "pinocchio_peer": "pinocchio",
-    "drake_peer": "pydrake",
-    "exudyn_peer": "exudyn",
     "scipy_peer": "scipy",
 }
 """Who brings series, and the module without which it has none."""

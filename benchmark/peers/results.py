@@ -19,23 +19,15 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchmark.measure import DOCS, describe_machine, fill, fill_page, join_line, write_json
+from benchmark.measure import DOCS, describe_machine, fill, fill_page, join_line
 from benchmark.peers.floor import Floor
 from benchmark.peers.ours import ENGINE as OURS
 from benchmark.peers.ours import PUBLIC
 from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
-from sst_ros.plot.style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, save_figure, styled
+from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, save_figure, styled
 from sst_ros.report.results import markdown
 
-PACKAGES = ("numpy", "numba", "mujoco", "pin", "drake", "exudyn", "scipy", "mpmath")
-
-CLAIMS = (
-    ("MuJoCo", "", "MuJoCo's best setting", {1e-6: 1000, 1e-9: 2000}),
-    ("Pinocchio", "RK4", "Pinocchio in a loop of RK4 in Python", {1e-6: 300, 1e-9: 800}),
-    ("Pinocchio", "", "Pinocchio under our DOP853 in Python", {1e-6: 300, 1e-9: 800}),
-    ("SciPy on the paper's form", "", "SciPy on the NumPy form", {1e-6: 10000, 1e-9: 10000}),
-)
-"""Engine, begin of the method's name, what it is called, and the target ratio by error."""
+PACKAGES = ("numpy", "numba", "mujoco", "pin", "scipy", "mpmath")
 
 README = DOCS.parent / "README.md"
 README_ROWS = {
@@ -48,8 +40,6 @@ STYLES = {
     "sst_ros": (BLUE, "o"),
     "MuJoCo": (VERMILION, "s"),
     "Pinocchio": (GREEN, "D"),
-    "Drake": (PURPLE, "^"),
-    "Exudyn": (ORANGE, "v"),
     "SciPy on the paper's form": (INK, "P"),
 }
 """Colour and marker of each engine, in the order of the legend."""
@@ -75,12 +65,12 @@ class Results:
         """Names of the engines that passed, ours first."""
         return list(dict.fromkeys(c.series.engine for c in self.curves if c.passed))
 
-    def best(self, engine: str, target: float, method: str = "") -> Point | None:
-        """Return the setting by which an engine reaches an error soonest, by a method or by any.
+    def best(self, engine: str, target: float) -> Point | None:
+        """Return the setting by which an engine reaches an error soonest.
 
         Ours is the public call alone, overhead included.
         """
-        method = method or (PUBLIC if engine == OURS else "")
+        method = PUBLIC if engine == OURS else ""
         curves = [c for c in self.curves if c.series.engine == engine]
         return reach([c for c in curves if c.series.name.startswith(method)], target)
 
@@ -132,19 +122,6 @@ class Results:
             rows.append({"": f"{engine} over that", **cells})
         return rows
 
-    def verdicts(self) -> list[str]:
-        """One sentence for each claim on an engine that is here."""
-        found = []
-        for engine, method, name, targets in CLAIMS:
-            for target, asked in targets.items() if engine in self.engines else ():
-                ratio = self.ratio(self.best(engine, target, method), target)
-                verdict = f"{name}: not reached by any setting (target {asked:,})"
-                if ratio is not None:
-                    met = "met" if ratio >= asked else "NOT met"
-                    verdict = f"{_round(ratio)} times faster than {name} (target {asked:,}: {met})"
-                found.append(f"{_head(target)}: {verdict}")
-        return found
-
     def settings(self) -> list[str]:
         """The settings behind the best times of each engine."""
         lines = []
@@ -172,7 +149,6 @@ class Results:
         missing = [f"{engine}: {why}.\n" for engine, why in self.missing.items()]
         lines = ["The settings behind the best times:\n", *(f"- {x}." for x in self.settings())]
         return {part: markdown(rows) for part, rows in self.tables().items()} | {
-            "verdicts": "\n".join(f"- {line}." for line in self.verdicts()),
             "settings": "\n".join([*missing, *lines]),
             "run": self.run(),
         }
@@ -202,7 +178,8 @@ def write(results: Results, folder: Path) -> None:
             "ns_of_one_in_c": results.floor.seconds and 1e9 * results.floor.seconds,
         },
     }
-    write_json(folder / "peers.json", document)
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    (folder / "peers.json").write_text(text + "\n", encoding="utf-8")
     fill_page(DOCS / "peers.md", results.parts(), folder / "peers.md")
     draw(folder)
 
@@ -237,18 +214,16 @@ def _format(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else ""
 
 
+@styled
 def draw(folder: Path) -> None:
-    """Write peers.png beside peers.csv and peers.json."""
+    """Write peers.png beside peers.csv and peers.json.
+
+    One thin curve a method, and the best of all; of sst_ros that of the public call.
+    """
     rows = pd.read_csv(folder / "peers.csv")
     rows = rows[rows.median_ms.notna() & rows.failed.isna()]
     machine = json.loads((folder / "peers.json").read_text(encoding="utf-8"))["machine"]
     note = f"Thin: single methods. {machine['processor']}, one core, {machine['date']}."
-    save_figure(draw_engines(rows, note), folder / "peers.png")
-
-
-@styled
-def draw_engines(rows: pd.DataFrame, note: str) -> Figure:
-    """Draw one thin curve a method, and the best of all; of sst_ros that of the public call."""
     figure = Figure(figsize=(10.5, 5.4), layout="constrained")
     axes = figure.subplots()
     for engine, (colour, marker) in STYLES.items():
@@ -267,7 +242,7 @@ def draw_engines(rows: pd.DataFrame, note: str) -> Figure:
     axes.set_title("Work-precision diagram: Example 2 of the paper", loc="left")
     figure.legend(loc="outside right upper", fontsize=9.5, title="best of all settings")
     figure.supxlabel(note, fontsize=8.5, color="#444444")
-    return figure
+    save_figure(figure, folder / "peers.png")
 
 
 def find_front(rows: pd.DataFrame) -> tuple[list[float], list[float]]:

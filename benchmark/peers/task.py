@@ -122,19 +122,6 @@ class Task:
         answer: Array = np.array([at.g for at in legs]) @ rate + at_rest
         return answer
 
-    def at_once(self, at: Moving, mean: Array, begin: float, end: float) -> Array:
-        """Acceleration at a moving state from its mean over begin .. end after it.
-
-        For engines that only make steps: what the true mean differs from the true acceleration
-        is taken off.
-        """
-        machine = CompiledMethod(self.system, DOP853, compiled=False)
-        rates = []
-        for time in (begin, end):
-            y = machine.step_fixed(at.time, time, 1, at.y, []) if time else at.y
-            rates.append(np.array(self.dynamics.joints(*y)[9:12]))
-        return np.asarray(mean - (rates[1] - rates[0]) / (end - begin) + at.answer)
-
     @cached_property
     def moving(self) -> list[Moving]:
         """States of the motion itself, well after its start."""
@@ -182,7 +169,6 @@ class Body(NamedTuple):
     Attributes:
         name, parent, joint: names.
         axis: of the hinge in {B}, through O.
-        about_o: inertia about O in {B} [kg m^2].
         mass: [kg].
         centre: of mass in {B} [m].
         about_centre: inertia about the centre of mass in {B} [kg m^2].
@@ -193,7 +179,6 @@ class Body(NamedTuple):
     parent: str
     joint: str
     axis: Array
-    about_o: Array
     mass: float
     centre: Array
     about_centre: Array
@@ -227,4 +212,4 @@ def _body(task: Task, name: str, parent: str, joint: str, axis: Array) -> Body:
     mass = 1.0
     centre = axes[:, 2] * np.sqrt(max(0.0, 0.2 * (least + middle - most)) / mass)
     central = tensor - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return Body(name, parent, joint, axis, tensor, mass, centre, central)
+    return Body(name, parent, joint, axis, mass, centre, central)
