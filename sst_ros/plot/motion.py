@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import CubicHermiteSpline
@@ -127,25 +126,21 @@ def _over_time(
             np.round(first.seconds, 9), np.round(solution.seconds, 9), return_indices=True
         )
         apart = np.abs(columns[there] - values[0][here]).max(axis=1)
-        known = np.isfinite(apart).any()
-        largest = f"{np.nanmax(apart):.1e} {unit}" if known else "no common times"
+        common = np.isfinite(apart).any()
+        largest = f"{np.nanmax(apart):.1e} {unit}" if common else "no common times"
         below.plot(at, positive(apart), label=f"{solution.name}: {largest}", **style)
     widen(above, values[0], least_span)
-    _name_columns(above, first.seconds, values[0], letters)
+    beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
+    for letter, column in zip(letters, values[0].T, strict=True):
+        known = np.flatnonzero(np.isfinite(column))
+        if len(letters) > 1 and len(known):  # beside the last value, where there are several
+            place = first.seconds[known[-1]], column[known[-1]]
+            above.annotate(letter, place, (4, 0), **beside)
     legend(above)
     below.set_yscale("log")
     below.legend(fontsize=8, loc="best", title="largest difference", title_fontsize=8)
     span([above, below], first.seconds)
     return figure
-
-
-def _name_columns(axes: Axes, seconds: Array, columns: Array, letters: str) -> None:
-    """Write the letter of each column beside its last value, where there are several."""
-    beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
-    for letter, column in zip(letters, columns.T, strict=True):
-        known = np.flatnonzero(np.isfinite(column))
-        if len(letters) > 1 and len(known):
-            axes.annotate(letter, (seconds[known[-1]], column[known[-1]]), (4, 0), **beside)
 
 
 def path(scene: Scene, solutions: Sequence[Solution]) -> Figure:

@@ -70,8 +70,6 @@ STYLE: Any = {
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
 
-SUBSCRIPTS = "₁₂₃"
-
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
@@ -108,20 +106,16 @@ def free_figure(width: float, height: float) -> Figure:
         return Figure(figsize=(width, height))
 
 
-def leg_names(letter: str) -> tuple[str, str, str]:
+def leg_names(letter: str) -> list[str]:
     """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
-    first, second, third = (f"{letter}{subscript}" for subscript in SUBSCRIPTS)
-    return first, second, third
+    return [f"{letter}{subscript}" for subscript in "₁₂₃"]
 
 
-def sides(geometry: Geometry, points: int) -> list[Array]:
-    """Points on the three sides of the base triangle on the unit sphere, shape (points, 3) each."""
-    share = np.linspace(0.0, 1.0, points)[:, None]
+def sides(geometry: Geometry, points: int) -> Array:
+    """Points on the three sides of the base triangle on the unit sphere, shape (3, points, 3)."""
+    angle = np.multiply.outer(geometry.arc, np.linspace(0.0, 1.0, points))[:, :, None]
     across = np.cross(geometry.w, geometry.v)
-    return [
-        np.cos(arc * share) * v + np.sin(arc * share) * u
-        for arc, v, u in zip(geometry.arc, geometry.v, across, strict=True)
-    ]
+    return np.asarray(np.cos(angle) * geometry.v[:, None] + np.sin(angle) * across[:, None])
 
 
 def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:

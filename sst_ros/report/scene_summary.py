@@ -194,19 +194,15 @@ class Cost(NamedTuple):
 def costs(scene: Scene) -> list[Cost]:
     """Count the operations of every term that a scene has: traced with it and without it."""
     total = operations(scene)
-    found = []
-    for term in TERMS:
-        if has(scene, term):
-            bare = operations(without(scene, term))
-            found.append(Cost(term, total - bare, bare))
-    return found
+    bare = {term: operations(without(scene, term)) for term in TERMS if has(scene, term)}
+    return [Cost(term, total - count, count) for term, count in bare.items()]
 
 
-def evaluation_ns(scenes: Sequence[Scene], *, compiled: bool = True) -> list[float]:
-    """Return times of an evaluation of the right-hand sides of scenes in steps of RK4 [ns]."""
-    runs = []
-    for scene in scenes:
-        ode, start = ODE(Dynamics.of(scene)), [*initial_state(scene, Geometry.of(scene))]
+def cost_table(scene: Scene, *, compiled: bool = True) -> list[dict[str, Any]]:
+    """Return operations and times [ns] of an evaluation: the whole, then each term present."""
+    found, runs = costs(scene), []
+    for one in (scene, *(without(scene, cost.name) for cost in found)):
+        ode, start = ODE(Dynamics.of(one)), [*initial_state(one, Geometry.of(one))]
         start += [0.0] * (len(ode.state) - len(start))
         method = CompiledMethod(ode, RK4, compiled=compiled)
         method.step_fixed(0.0, 1e-7, 1, start, (0.0,) * len(ode.drive))  # compiles
@@ -218,17 +214,12 @@ def evaluation_ns(scenes: Sequence[Scene], *, compiled: bool = True) -> list[flo
             began = time.perf_counter()
             method.step_fixed(0.0, 1e-7, count, start, drive)
             times[k] = min(times[k], time.perf_counter() - began)
-    return [1e9 * took / (len(RK4.b) * count) for took in times]
-
-
-def cost_table(scene: Scene, *, compiled: bool = True) -> list[dict[str, Any]]:
-    """Return operations and times [ns] of an evaluation: the whole, then each term present."""
-    found = costs(scene)
-    scenes = [scene, *(without(scene, cost.name) for cost in found)]
-    whole_ns, *bare_ns = evaluation_ns(scenes, compiled=compiled)
-    rows = [("all", operations(scene), whole_ns)]
-    for cost, ns in zip(found, bare_ns, strict=True):
+    whole, *bare = (1e9 * took / (len(RK4.b) * count) for took in times)
+    rows = [("all", operations(scene), whole)]
+    for cost, ns in zip(found, bare, strict=True):
         # A term that folds into constants leaves the same number of operations, and its time.
-        rows.append((cost.name, cost.adds, whole_ns - ns if cost.adds else 0.0))
-    names = ("term", "operations", "ns")
-    return [{"scene": scene.name, **dict(zip(names, row, strict=True))} for row in rows]
+        rows.append((cost.name, cost.adds, whole - ns if cost.adds else 0.0))
+    return [
+        {"scene": scene.name, "term": term, "operations": added, "ns": ns}
+        for term, added, ns in rows
+    ]

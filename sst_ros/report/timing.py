@@ -98,7 +98,13 @@ def measure(recording: Recording) -> Timing:
     ]
     ticks = recording.ticks
     gaps = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
-    pace_s, pace = _pace(recording)
+    # Simulated time per received time, over pieces of the run.
+    pieces = min(60, len(recording.time_ns) - 1)
+    rows = np.unique(np.linspace(0, len(recording.time_ns) - 1, pieces + 1).round().astype(int))
+    piece = recording.time_ns[rows]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pace = np.diff(piece) / np.diff(recording.received_ns[rows])
+    good = np.isfinite(pace) & (pace > 0.0)
     late = recording.received_ns - recording.time_ns
     if not recording.diagnostics:
         missing.append("no diagnostics: missed ticks and samples published are not known")
@@ -107,8 +113,8 @@ def measure(recording: Recording) -> Timing:
         nominal_us=period / 1e3,
         lost_s=np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
         gaps_s=gaps / NANOSECONDS,
-        pace_s=pace_s,
-        pace=pace,
+        pace_s=(0.5 * (piece[1:] + piece[:-1]) / NANOSECONDS)[good],
+        pace=pace[good],
         late_us=(late - late.min()) / 1e3,
         reported=_read_reports(recording),
         latency=pair_commands(recording, missing),
@@ -137,17 +143,6 @@ def numbers(timing: Timing) -> dict[str, Any]:
         "energy_residual_max_J": float(np.nanmax(energy)) if np.isfinite(energy).any() else None,
         "unknown": list(timing.missing),
     }
-
-
-def _pace(recording: Recording) -> tuple[Array, Array]:
-    """Return times, and simulated time per received time over pieces of the run."""
-    pieces = min(60, len(recording.time_ns) - 1)
-    rows = np.unique(np.linspace(0, len(recording.time_ns) - 1, pieces + 1).round().astype(int))
-    time, received = recording.time_ns[rows], recording.received_ns[rows]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pace = np.diff(time) / np.diff(received)
-    good = np.isfinite(pace) & (pace > 0.0)
-    return (0.5 * (time[1:] + time[:-1]) / NANOSECONDS)[good], pace[good]
 
 
 def _read_reports(recording: Recording) -> Array:

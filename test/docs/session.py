@@ -103,12 +103,9 @@ class Session:
             self._done(["bash", "-euo", "pipefail", "-c", line], block)
 
     def _done(self, argv, block):
-        done = subprocess.run(
-            argv, capture_output=True, text=True, cwd=self.folder, env=self.environment,
-            timeout=LIMIT_S,
-        )  # fmt: skip
+        given = {"cwd": self.folder, "env": self.environment, "timeout": LIMIT_S}
+        done = subprocess.run(argv, capture_output=True, text=True, **given)
         assert done.returncode == 0, f"{block}: {argv[-1]}\n{done.stdout}{done.stderr}"
-        return done.stdout
 
     def _start(self, line, words):
         assert self._domain is not None, "nodes need a ROS domain"
@@ -124,19 +121,25 @@ class Session:
 
     def _wait_ready(self, words, process, log):
         """Wait until a node listens to Ctrl-C, and a recorder to its simulator."""
+
+        def has_said(text):
+            said = log.read_text()
+            return (said and text in said) or process.poll() is not None
+
         if words[1] == "-m":
-            _until(lambda: log.read_text() or process.poll() is not None, words, log)
+            _until(lambda: has_said(""), words, log)
         if "recorder" in words and any("simulator" in other for other, *_ in self._terminals):
-            _until(lambda: "ready" in log.read_text() or process.poll() is not None, words, log)
+            _until(lambda: has_said("ready"), words, log)
 
     def _wait_recorded(self, words, process, log):
         if "recorder" in words:
-            name = _value(words, "output")
+            files = (self.folder / _value(words, "output")).glob
 
-            def size():
-                return sum(path.stat().st_size for path in (self.folder / name).glob("*.mcap"))
+            def is_large():
+                size = sum(path.stat().st_size for path in files("*.mcap"))
+                return size > RECORDED_BYTES or process.poll() is not None
 
-            _until(lambda: size() > RECORDED_BYTES or process.poll() is not None, words, log)
+            _until(is_large, words, log)
 
     def _ended(self, words, process, log):
         try:

@@ -14,27 +14,12 @@ from sst_ros.host import child_process
 
 PAGES = pages()
 LONG = (
-    "README",
-    "batch",
-    "controller",
-    "evaluate",
-    "fast",
-    "faults",
-    "follow",
-    "geometry",
-    "identify",
-    "lockstep",
-    "look",
-    "many",
-    "plot",
-    "record",
-    "simulate",
-    "sweep",
-    "torque",
+    "README batch controller evaluate fast faults follow geometry identify lockstep look many plot "
+    "record simulate sweep torque"
 )
 """Pages that start nodes or whole runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [
-    pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG else page
+    pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG.split() else page
     for page in PAGES
     if blocks(page)
 ]

@@ -48,43 +48,30 @@ def index(site):
     return json.loads(text.removeprefix("Search.setIndex(").removesuffix(")"))
 
 
-def shown(page):
+def shown(text):
     """Text that a reader of a page sees."""
-    body = re.sub(r"<(script|style)\b.*?</\1>|<!--.*?-->", "", page.read_text(), flags=re.S)
+    body = re.sub(r"<(script|style)\b.*?</\1>|<!--.*?-->", "", text, flags=re.S)
     return html.unescape(re.sub(r"<[^>]+>", "", body))
 
 
-def test_it_fetches_nothing(site):
+def test_a_page_fetches_nothing_names_the_release_and_has_no_trace_of_the_tools(site):
     for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         fetched = re.findall(r"<(?:script|img|link)\b[^>]*(?:src|href)=\"(https?:[^\"]*)\"", text)
         assert fetched == [], page.name
+        assert f"sst_ros {sst_ros.__version__}" in text, page.name
+        traces = r"do not edit|rather than edit|%\(default\)s|AUTOMATICALLY"
+        assert not re.search(traces, shown(text), re.I), page.name
     assert "<math" in (site / "theory.html").read_text(encoding="utf-8")
-
-
-def test_a_reader_sees_no_trace_of_the_tools(site):
-    for page in site.rglob("*.html"):
-        text = shown(page)
-        assert not re.search(
-            r"do not edit|rather than edit|%\(default\)s|AUTOMATICALLY", text, re.I
-        )
-
-
-def test_every_page_names_the_release(site):
-    for page in site.rglob("*.html"):
-        assert f"sst_ros {sst_ros.__version__}" in page.read_text(encoding="utf-8"), page.name
 
 
 @pytest.mark.parametrize(("word", "page"), FOUND.items())
 def test_search_finds_a_term_of_the_field_in_a_title(index, word, page):
-    hits = index["titleterms"].get(word) or index["titleterms"][stem(word)]
-    assert page in [index["docnames"][hit] for hit in (hits if isinstance(hits, list) else [hits])]
-
-
-def stem(word):
     from snowballstemmer import stemmer
 
-    return stemmer("porter").stemWord(word)
+    stem = stemmer("porter").stemWord(word)
+    hits = index["titleterms"].get(word) or index["titleterms"][stem]
+    assert page in [index["docnames"][hit] for hit in (hits if isinstance(hits, list) else [hits])]
 
 
 def test_search_finds_public_names(index):
@@ -93,9 +80,7 @@ def test_search_finds_public_names(index):
 
 
 def test_the_gallery_has_at_least_twelve_pictures_with_their_code(site):
-    pages = [page for page in (site / "gallery").glob("*.html") if page.stem != "index"]
-    drawn = [
-        page for page in pages if "sphx_glr_" in page.read_text() and "_001.png" in page.read_text()
-    ]
+    texts = [page.read_text() for page in (site / "gallery").glob("*.html") if page.stem != "index"]
+    drawn = [text for text in texts if "sphx_glr_" in text and "_001.png" in text]
     assert len(drawn) >= 12
-    assert all("highlight-Python" in page.read_text() for page in drawn)
+    assert all("highlight-Python" in text for text in drawn)

@@ -129,15 +129,11 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
     """As where a recorder hears joint_states first: SciPy refuses quaternions of nan."""
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
-    assert np.flatnonzero(np.isnan(motion.energies(*whole(bag))[0])).tolist() == [60]
+    run = read_signals(bag)
+    assert np.flatnonzero(np.isnan(motion.energies(run, run.scene)[0])).tolist() == [60]
     left = timing.energy_residual(recording.read(bag), [])
     assert np.flatnonzero(np.isnan(left)).tolist() == [60]
     assert np.nanmax(np.abs(left)) < 1e-9
-
-
-def whole(bag):
-    run = read_signals(bag)
-    return run, run.scene
 
 
 def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2, capsys, undrawn):

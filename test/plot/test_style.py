@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 
 from sst_ros.plot import style
 
@@ -33,10 +32,8 @@ def test_a_gap_stays_a_gap():
     curve = np.sin(np.arange(COUNT) / 1e4)
     curve[123_456] = np.nan
     curve[200_000:220_000] = np.nan
-    few = curve[style.envelope([curve], COUNT)]
-    assert np.isnan(few).sum() > 10
     rows = style.envelope([curve], COUNT)
-    assert 123_456 in rows
+    assert 123_456 in rows and np.isnan(curve[rows]).sum() > 10
 
 
 def test_short_curves_are_left_alone():
@@ -52,16 +49,15 @@ from sst_ros.plot.style import save_figure
 figure = Figure()
 figure.subplots().plot(range(3000), [i * i % 97 for i in range(3000)])
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
-try:
-    save_figure(figure, Path(sys.argv[1]))
-except OSError as error:
-    print(error.errno)
+for form in ("pdf", "png", "svg"):
+    try:
+        save_figure(figure, Path(sys.argv[1]) / f"picture.{form}")
+    except OSError as error:
+        print(error.errno)
 """
 
 
-@pytest.mark.parametrize("form", ["pdf", "png", "svg"])
-def test_a_picture_on_a_full_disk(form, tmp_path):
-    command = [sys.executable, "-c", PROGRAM, tmp_path / f"picture.{form}"]
+def test_a_picture_on_a_full_disk(tmp_path):
+    command = [sys.executable, "-c", PROGRAM, tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert done.stdout == f"{errno.EFBIG}\n", done.stderr
-    assert done.stderr == ""
+    assert (done.stdout, done.stderr) == (3 * f"{errno.EFBIG}\n", "")

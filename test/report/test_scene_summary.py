@@ -12,24 +12,9 @@ from dynamics.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics, compile_program
-from sst_ros.report.scene_summary import (
-    TERMS,
-    WIDTH,
-    costs,
-    has,
-    operations,
-    summary,
-    without,
-)
+from sst_ros.report.scene_summary import TERMS, WIDTH, costs, has, operations, summary, without
 from sst_ros.report.step_advice import step_advice
-from sst_ros.scene.loads import (
-    Actuators,
-    Friction,
-    JointFriction,
-    Moment,
-    Spring,
-    Stroke,
-)
+from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment, Spring, Stroke
 from sst_ros.scene.scene import Scene, load, names
 
 EXAMPLE2 = load("example2_heavy")
@@ -54,25 +39,14 @@ def everything() -> Scene:
     )
 
 
-def test_the_plain_scene_costs_what_a_kernel_without_optional_terms_costs():
+@pytest.mark.parametrize("name", ["example2_heavy", "general"])
+def test_the_plain_scene_is_the_same_physics_and_costs_as_a_kernel_without_optional_terms(name):
     """At most 3 % more; example2_heavy has diagonal link inertias, general has full ones."""
-    for name in ("example2_heavy", "general"):
-        scene = load(name)
-        assert operations(scene) <= 1.03 * program_of(scene).operations.total()
-
-
-def test_the_kernel_without_optional_terms_is_the_same_physics():
+    scene, bare = load(name), program_of(load(name))
+    assert operations(scene) <= 1.03 * bare.operations.total()
     inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
-    for name in ("example2_heavy", "general"):
-        bare = compile_program(program_of(load(name)))(*inputs)
-        assert Dynamics.of(load(name)).derivative(*inputs) == pytest.approx(bare, rel=1e-12)
-
-
-@every_scene
-def test_every_term_of_a_scene_adds_operations_or_folds(name):
-    found = costs(load(name))
-    assert all(cost.adds >= 0 for cost in found)
-    assert [cost.name for cost in found] == [term for term in TERMS if has(load(name), term)]
+    expected = pytest.approx(compile_program(bare)(*inputs), rel=1e-12)
+    assert Dynamics.of(scene).derivative(*inputs) == expected
 
 
 @every_scene
@@ -113,14 +87,15 @@ def test_a_viscous_friction_costs_a_few_multiplications_only():
 
 
 @every_scene
-def test_a_summary_has_all_parts(name):
+def test_a_summary_has_all_parts_and_every_term_adds_operations_or_folds(name):
     scene, said = load(name), summary(load(name))
-    total = sum(Dynamics.of(scene).program.operations.values())
     assert said.startswith(f"{name}: {scene.description}\n")
-    assert f"right-hand side: 7 states, {total} operations" in said
-    for cost in costs(scene):
+    assert f"right-hand side: 7 states, {operations(scene)} operations" in said
+    found = costs(scene)
+    assert [cost.name for cost in found] == [term for term in TERMS if has(scene, term)]
+    for cost in found:
         row = rf"^  {cost.name} +{cost.adds} +{cost.without}$"
-        assert re.search(row, said, re.MULTILINE)
+        assert cost.adds >= 0 and re.search(row, said, re.MULTILINE)
     listed = " ".join(said[said.index("terms absent") : said.index("\nends")].split())
     assert all((term in listed) != has(scene, term) for term in TERMS)
     for key, reason in scene.provenance:
@@ -129,17 +104,18 @@ def test_a_summary_has_all_parts(name):
     assert max(map(len, said.splitlines()[1:])) <= WIDTH
 
 
-def test_the_moments_topic_is_there_only_when_the_scene_takes_it():
-    taking = replace(EXAMPLE2, moment=Moment(topic=True))
-    giving = replace(EXAMPLE2, moment=Moment(value=(0.0, 0.0, 1.0)))
-    assert "~/external_moment" in summary(taking)
-    assert "~/external_moment" not in summary(giving)
-    assert "~/external_moment" not in summary(EXAMPLE2)
-
-
-def test_lag_shows_in_the_size_of_the_state():
-    lagging = replace(EXAMPLE2, actuators=Actuators(time_constant=0.1))
-    assert "right-hand side: 10 states" in summary(lagging)
+@pytest.mark.parametrize(
+    ("change", "words", "there"),
+    [
+        ({"moment": Moment(topic=True)}, "~/external_moment", True),
+        ({"moment": Moment(value=(0.0, 0.0, 1.0))}, "~/external_moment", False),
+        ({}, "~/external_moment", False),
+        ({"actuators": Actuators(time_constant=0.1)}, "right-hand side: 10 states", True),
+    ],
+    ids=["a moment from a topic", "a moment of its own", "no moment", "a lag"],
+)
+def test_a_summary_shows_what_a_scene_takes(change, words, there):
+    assert (words in summary(replace(EXAMPLE2, **change))) is there
 
 
 def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):

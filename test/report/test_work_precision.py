@@ -105,15 +105,9 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     said = text(short)
     assert fastest(short) in said and fastest(short).startswith("1e-09 rad over 0.2 s: ")
     assert all(len(line) < 200 for line in said.splitlines())
-    document, drawn = {"studies": [*documents([short])]}, {"picture": figure(short)}
-    write(
-        tmp_path,
-        "accuracy",
-        csv=join_grids([short]),
-        document=document,
-        page=page([short]),
-        figures=drawn,
-    )
+    given = {"page": page([short]), "figures": {"picture": figure(short)}}
+    document = {"studies": [*documents([short])]}
+    write(tmp_path, "accuracy", csv=join_grids([short]), document=document, **given)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
     assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
@@ -136,12 +130,16 @@ def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scene_that_rests_has_no_fastest_setting():
-    """A controller drives it; without torques every setting is right to rounding."""
-    spiral = work_precision(dataclasses.replace(scene.load("spiral"), duration=0.2), compiled=False)
-    assert spiral.rests and spiral.best(1e-6) is None and "rests" in fastest(spiral)
-    shown = page([spiral])
-    assert "| spiral | at rest |" in shown and "accuracy_spiral.png" not in shown
+def test_a_scene_that_rests_has_no_fastest_setting_and_is_drawn(tmp_path):
+    """A controller drives it; no method errs, and a logarithm of that does not exist."""
+    resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
+    found = work_precision(resting, compiled=False, longest_s=0.002)
+    assert found.rests and found.best(1e-6) is None and "rests" in fastest(found)
+    said = page([found])
+    assert "| point_to_point | at rest |" in said and "accuracy_point_to_point.png" not in said
+    assert found.reference.own.gamma_dot == 0.0
+    assert (found.rows.largest_gamma_dot_rad_per_s == 0.0).any()
+    save_figure(figure(found), tmp_path / "picture.png")
 
 
 def graded(study, *errors):
@@ -204,16 +202,6 @@ def test_failures_stay_in_sight(tmp_path):
     assert len(failed) and failed[ERROR].isna().all()
     assert text(found).count("FAILED") == len(failed)
     assert join_grids([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
-    save_figure(figure(found), tmp_path / "picture.png")
-
-
-@pytest.mark.slow
-def test_a_scene_that_stays_at_rest_is_drawn(tmp_path):
-    """No method errs there, and a logarithm of that does not exist."""
-    resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
-    found = work_precision(resting, compiled=False, longest_s=0.002)
-    assert found.reference.own.gamma_dot == 0.0
-    assert (found.rows.largest_gamma_dot_rad_per_s == 0.0).any()
     save_figure(figure(found), tmp_path / "picture.png")
 
 
