@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from sst_ros.errors import SstError
 from sst_ros.host.output import require_free, slices
@@ -22,35 +22,35 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
-def parser(name: str, description: str, out: Path) -> argparse.ArgumentParser:
-    """Make the parser of a study's arguments, with the folder of its results."""
-    made = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
-    made.add_argument(
-        "--out", type=Path, default=out, help=f"folder of the results; default: {out}"
-    )
-    return made
-
-
 def run(
     study: Callable[[argparse.Namespace], bool],
-    arguments: argparse.ArgumentParser,
+    name: str,
+    out: Path,
     words: Sequence[str] | None,
     *,
     careful: bool = False,
+    **options: dict[str, Any],
 ) -> int:
-    """Run a study; return the exit status: 1, too, where its results are not as they should be.
+    """Run a study from the command line; return the exit status.
 
-    A careful one refuses to overwrite earlier results without `--force`.
+    The study gets the options, with the folder `out`, and says whether its results are as they
+    should be. A careful one does not overwrite earlier results without `--force`. Further `options`
+    are what `add_argument` takes, by name.
     """
+    about = (sys.modules[study.__module__].__doc__ or "").partition("\n")[0]
+    parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=about)
+    parser.add_argument("--out", type=Path, default=out, help=f"folder of the results; {out}")
     if careful:
-        arguments.add_argument("--force", action="store_true", help="overwrite earlier results")
-    options = arguments.parse_args(words)
+        parser.add_argument("--force", action="store_true", help="overwrite earlier results")
+    for option, given in options.items():
+        parser.add_argument(f"--{option}", **given)
+    found = parser.parse_args(words)
     try:
         if careful:
-            require_free(options.out, arguments.prog, force=options.force)
-        return 0 if study(options) else 1
+            require_free(found.out, parser.prog, force=found.force)
+        return 0 if study(found) else 1
     except SstError as error:
-        print(f"{arguments.prog}: {error}", file=sys.stderr)
+        print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
 
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -88,19 +89,21 @@ class ModelError:
         return bool(self.channel) or self.model(plant) != plant
 
 
-def make_heavier(scene: Scene, factor: float) -> Scene:
+BODIES = ("star", "actuated_links", "intermediate_links", "payload", "actuators")
+
+
+def make_heavier(scene: Scene, factor: float, kinds: Sequence[str] = BODIES) -> Scene:
     """Return a scene whose bodies have `factor` times the mass and inertia, in the same places.
 
-    Then every torque of inertia and of weight is `factor` times as large.
+    With all kinds of bodies every torque of inertia and of weight is `factor` times as large.
     """
     document = values_of(scene)
-    bodies = [document["star"], *document["actuated_links"], *document["intermediate_links"]]
-    for body in [*bodies, *filter(None, [document.get("payload")])]:
-        body["mass"] *= factor
-        for part in body.get("inertia", ()):
-            body["inertia"][part] *= factor
-    if "actuators" in document:
-        document["actuators"]["rotor_inertia"] *= factor
+    for found in filter(None, map(document.get, kinds)):
+        for body in found if isinstance(found, list) else [found]:
+            for name in {"mass", "rotor_inertia"} & body.keys():
+                body[name] *= factor
+            for part in body.get("inertia", ()):
+                body["inertia"][part] *= factor
     return build(Scene, document, scene.name)
 
 
@@ -122,67 +125,48 @@ TorqueOf = Callable[[Simulation], Any]
 """Torques of the tick that begins now [N m], constant or a `SineTorque`."""
 
 
-class FunctionRun:
-    """Input and output of a run whose torques come from a function instead of messages.
-
-    Attributes:
-        states: those of all samples.
-        times: processor time of the thread at each [s].
-
-    """
-
-    moment, unread = ZERO, False
-
-    def __init__(self, torque: TorqueOf) -> None:
-        self._torque = torque
-        self.states: list[State] = []
-        self.times: list[float] = []
-
-    def torque(self, simulation: Simulation, _: int) -> Any:
-        """Return the torques of the tick that begins now."""
-        return simulation.acting(self._torque(simulation))
-
-    def constant(self, _: int) -> bool:
-        """Return that the torques of the last tick do not act any longer."""
-        return False
-
-    def now_ns(self) -> int:
-        """Return any time but zero, which means that there is none."""
-        return NANOSECONDS
-
-    def sample(self, simulation: Simulation, _: int) -> None:
-        """Keep the state."""
-        self.states.append(simulation.state)
-        self.times.append(time.thread_time())
-
-    def _nothing(self, *_: Any) -> None:
-        """Do nothing: no command gets old, and there is nothing to publish to."""
-
-    refresh = start = ticks = _nothing
-
-
 def run_in_loop(
     simulation: Simulation, torque: TorqueOf, period_ns: int, ticks: int, *, warm: bool = False
-) -> FunctionRun:
+) -> tuple[list[State], list[float]]:
     """Run a simulation from its start for some ticks, with a sample at each.
 
     With `warm` the code of all methods is loaded before, so that all ticks take equally long.
+
+    Returns:
+        The states of all samples, and the processor time of the thread at each [s].
 
     Raises:
         RunStopped: it ended before.
 
     """
-    run: Any = FunctionRun(torque)
+    states: list[State] = []
+    times: list[float] = []
+
+    def sample(simulation: Simulation, _: int) -> None:
+        states.append(simulation.state)
+        times.append(time.thread_time())
+
+    def nothing(*_: Any) -> None: ...
+
+    # Input and output of a run without messages: no torque gets old, and nobody listens.
+    ends: Any = SimpleNamespace(
+        torque=lambda simulation, _: simulation.acting(torque(simulation)),
+        constant=lambda _: False,
+        now_ns=lambda: NANOSECONDS,
+        sample=sample,
+        **dict.fromkeys(("refresh", "start", "ticks"), nothing),
+        moment=ZERO,
+        unread=False,
+    )
     settings, pacer = RunSettings(period_ns, last_tick=ticks), Pacer(period_ns, 0.0, SteadyTime())
-    loop = TickLoop(simulation, settings, run, pacer, run)
+    loop = TickLoop(simulation, settings, ends, pacer, ends)
     if warm:
         loop.warm_up()
     loop.begin()
     loop.resume()
     while not loop.complete:
         loop.to_next_sample(paced=True)
-    done: FunctionRun = run
-    return done
+    return states, times
 
 
 @dataclass(frozen=True)
@@ -249,18 +233,6 @@ def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scen
     return replace(plant, initial=initial)
 
 
-class RestMotion(ReferenceMotion):
-    """A motion that stays where another one begins."""
-
-    def __init__(self, motion: ReferenceMotion, duration: float) -> None:
-        super().__init__(duration, (0.0, duration))
-        start = motion.at(0.0)
-        self._pose = Reference(start.quaternion, ZERO, ZERO, start.gamma, ZERO, ZERO)
-
-    def _inside(self, time: float) -> Reference:
-        return self._pose
-
-
 def ideal_plant(scene: Scene) -> Scene:
     """Return the plant of the theory: no friction, which acts between samples too, and no lag."""
     actuators = scene.actuators
@@ -285,7 +257,9 @@ def bandwidth_limit(loop: ControlLoop) -> float:
 def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
     """Return whether a small error is less in the last quarter of a run than in the second."""
     ticks = 600 + 200 * loop.settings.delay
-    rest = RestMotion(loop.motion, ticks * loop.period_ns / NANOSECONDS)
+    start, seconds = loop.motion.at(0.0), ticks * loop.period_ns / NANOSECONDS
+    pose = Reference(start.quaternion, ZERO, ZERO, start.gamma, ZERO, ZERO)
+    rest: Any = SimpleNamespace(duration=seconds, at=lambda _: pose)
     settings = replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
     held = replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)
     track, _, failure = run_loop(held)

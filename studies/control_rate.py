@@ -7,6 +7,7 @@ continuous motion; `sampled_data` derives the orders of the hold.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import math
 import textwrap
@@ -28,18 +29,15 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, free_figure, note, styled
 from sst_ros.recording import recording
-from sst_ros.report.reference_solution import (
-    InitialValueProblem,
-    ReferenceSolution,
-    solve_reference,
-)
+from sst_ros.report import reference_solution as truth
+from sst_ros.report.reference_solution import InitialValueProblem, ReferenceSolution
 from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.report.states import of_samples
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
-from studies import DOCS, parser, run
+from studies import DOCS, run
 from studies.control_loop import run_in_loop
 from studies.sampled_data import ORDERS, slope
 
@@ -104,11 +102,11 @@ def run_controlled(
     ticks = math.ceil(seconds * rate - 1e-6)
     fast = compiled and numba_version() is not None
     simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
-    samples = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
-    rows = [(*state.quaternion, *state.body_rate) for state in samples.states]
+    states, times = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
+    rows = [(*state.quaternion, *state.body_rate) for state in states]
     return ControlRun(
-        rate, method, hold, np.array([state.time_ns for state in samples.states]), np.array(rows),
-        simulation.error_estimate, float(np.median(np.diff(samples.times))),
+        rate, method, hold, np.array([state.time_ns for state in states]), np.array(rows),
+        simulation.error_estimate, float(np.median(np.diff(times))),
     )  # fmt: skip
 
 
@@ -121,24 +119,20 @@ class ControlStudy:
     reference: ReferenceSolution
     rows: DataFrame
 
-    def resolved_from(self, method: str) -> float:
-        """Least rate [Hz] from which on the error is that of the hold; infinite if there is none.
+    @cached_property
+    def least_rates(self) -> dict[str, float]:
+        """Least rate [Hz] from which on the error is that of the hold, by method; or infinite.
 
         From there on the method's own error, that with the exact profile, is below a part OWN_ERROR
         of that with held torques. Below, errors of either sign may cancel.
         """
-        runs = self.rows[(self.rows.by == RUN_LOOP) & (self.rows.method == method)]
-        errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
-        held = errors.drop(columns=EXACT).min(axis=1)
-        unresolved = np.flatnonzero(~(errors[EXACT] <= OWN_ERROR * held).to_numpy())
-        resolved = errors.index[unresolved[-1] + 1 if len(unresolved) else 0 :]
-        return float(resolved[0]) if len(resolved) else math.inf
-
-    @cached_property
-    def least_rates(self) -> dict[str, float]:
-        """`resolved_from` of each method [Hz]."""
-        methods = self.rows[self.rows.by == RUN_LOOP].method.unique()
-        return {method: self.resolved_from(method) for method in methods}
+        found = {}
+        for method, runs in self.rows[self.rows.by == RUN_LOOP].groupby("method", sort=False):
+            errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
+            resolved = errors[EXACT] <= OWN_ERROR * errors.drop(columns=EXACT).min(axis=1)
+            from_here_on = resolved[::-1].cummin()
+            found[str(method)] = float(min(errors.index[from_here_on[::-1]], default=math.inf))
+        return found
 
     def resolved(self, hold: str) -> DataFrame:
         """Rows of the run loop whose error is that of the hold."""
@@ -178,7 +172,8 @@ def control_study(
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
     problem = InitialValueProblem(scene)
-    reference = solve_reference(problem, compiled=compiled and numba_version() is not None)
+    fast = compiled and numba_version() is not None
+    reference = truth.solve_reference(problem, compiled=fast)
     whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
     points = list(itertools.product(whole, methods, HOLDS))
     run = partial(run_controlled, scene, seconds=problem.seconds, compiled=compiled)
@@ -251,16 +246,16 @@ of simulator, player and recorder in lockstep; their time is the mean wall time 
 """
 
 
-def report(names: Sequence[str], out: Path, *, nodes: bool = False) -> bool:
-    """Study scenes; print each, and write control_rate.csv, .json, .md and figures into `out`."""
+def report(options: argparse.Namespace) -> bool:
+    """Study scenes; print each, and write control_rate.csv, .json, .md and figures."""
     studies = []
-    for name in names:
-        recorded = partial(record_run, name, out / "bags") if nodes else None
+    for name in options.scene:
+        recorded = partial(record_run, name, options.out / "bags") if options.nodes else None
         studies.append(control_study(scenes.load(name), recorded=recorded, shown=True))
         print(section(studies[-1]), flush=True)
         whole = data_frame(row for study in studies for row in records(study.rows))
         write(
-            out, "control_rate", csv=whole,
+            options.out, "control_rate", csv=whole,
             document={"rows": records(whole), "advice": {s.scene: advice(s) for s in studies}},
             page=page(studies), figures={f"control_rate_{s.scene}": figure(s) for s in studies},
         )  # fmt: skip
@@ -345,12 +340,9 @@ def figure(study: ControlStudy) -> Figure:
         found = f"slope {power} (found {study.order(hold):.3f})"
         left.annotate(found, (period[k], line[k]), (8, -14), textcoords="offset points",
                       color=colour, fontsize=9)  # fmt: skip
-    for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-    left.set_xlabel("control period [ms]")
-    left.set_ylabel("largest error of the orientation [rad]")
-    right.set_xlabel("processor time of the run loop, share of a core [%]")
+    log = {"xscale": "log", "yscale": "log"}
+    left.set(xlabel="control period [ms]", ylabel="largest error of the orientation [rad]", **log)
+    right.set(xlabel="processor time of the run loop, share of a core [%]", **log)
     handles = [Line2D([], [], color=colour, label=name) for colour, name in HOLD_NAMES.values()]
     handles += [
         Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="none",
@@ -382,11 +374,11 @@ def section(study: ControlStudy) -> str:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Study scenes from the command line."""
-    arguments = parser("control_rate", "Error against control rate, method and hold.", DOCS)
-    what = "scenes with torques: names, or .yaml files"
-    arguments.add_argument("--scene", nargs="+", default=SCENES, help=what)
-    arguments.add_argument("--nodes", action="store_true", help="run the real nodes, too")
-    return run(lambda given: report(given.scene, given.out, nodes=given.nodes), arguments, words)
+    return run(
+        report, "control_rate", DOCS, words,
+        scene={"nargs": "+", "default": SCENES, "help": "with torques: names, or .yaml files"},
+        nodes={"action": "store_true", "help": "run the real nodes, too"},
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

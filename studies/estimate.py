@@ -13,7 +13,7 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,10 @@ from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot.style import free_figure
 from sst_ros.report.results import data_frame, markdown, provenance, write
 from sst_ros.scene.scene import Scene
-from studies import DOCS, parser, run, run_jobs
+from studies import DOCS, run, run_jobs
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 METHODS = ("dopri5", "dop853", "rk4", "rodas4", "auto")
 TIGHTER = 1e-3
@@ -163,45 +166,43 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
     return row | {"state": "resolved" if resolved else "not resolved"}
 
 
-def summarise(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def summarise(rows: DataFrame) -> DataFrame:
     """Return the table of the page: quantiles of estimate over true error, by class."""
     found = []
+    heads = ("least", *(f"{100 * q:g} %" for q in QUANTILES[1:-1]), "largest")
     for name in (*CLASSES, "all"):
-        mine = [row for row in rows if name in (row["class"], "all")]
-        resolved = [row for row in mine if row["state"] == "resolved"]
-        ratios = np.array([row["estimate"] / row["error"] for row in resolved])
-        beyond = sum(row["status"] == 0 and row["error"] > 3 * row["tolerance"] for row in resolved)
-        cells = {"class": name, "runs": str(len(mine)), "resolved": str(len(resolved))}
-        values = np.quantile(ratios, QUANTILES) if len(ratios) else [math.nan] * len(QUANTILES)
-        heads = ("least", *(f"{100 * q:g} %" for q in QUANTILES[1:-1]), "largest")
-        cells |= {head: f"{value:.2g}" for head, value in zip(heads, values, strict=True)}
-        low = [str(int(np.sum(ratios < bound))) for bound in (1 / 3, 1 / 10)]
-        cells |= {"below 1/3": low[0], "below 1/10": low[1], "beyond 3 tolerances": str(beyond)}
-        found.append(cells)
-    return found
+        runs = rows if name == "all" else rows[rows["class"] == name]
+        resolved = runs[runs.state == "resolved"]
+        ratios = resolved.estimate / resolved.error
+        beyond = (resolved.status == 0) & (resolved.error > 3 * resolved.tolerance)
+        quantiles = map("{:.2g}".format, ratios.quantile(QUANTILES))
+        found.append({
+            "class": name, "runs": len(runs), "resolved": len(resolved),
+            **dict(zip(heads, quantiles, strict=True)), "below 1/3": (ratios < 1 / 3).sum(),
+            "below 1/10": (ratios < 1 / 10).sum(), "beyond 3 tolerances": beyond.sum(),
+        })  # fmt: skip
+    return data_frame(found)
 
 
-def report(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
-    """Write docs/estimate.md, its table and its picture."""
-    frame = data_frame(rows)
-    summary = markdown(data_frame(summarise(rows)))
+def report(options: argparse.Namespace) -> bool:
+    """Run the cases; write docs/estimate.md, its table and its picture."""
+    jobs = [(name, options.seed, number) for number in range(options.count) for name in CLASSES]
+    rows = data_frame(run_jobs(measure, jobs, "estimate        "))
     figure = free_figure(8.0, 4.5)
     axes = figure.subplots()
+    resolved = rows[rows.state == "resolved"]
     for name in CLASSES:
-        mine = [r["estimate"] / r["error"] for r in rows
-                if r["class"] == name and r["state"] == "resolved"]  # fmt: skip
-        axes.plot(np.sort(mine), np.linspace(0.0, 1.0, len(mine)), label=name.replace("_", " "))
+        mine = resolved[resolved["class"] == name]
+        ratios = np.sort(mine.estimate / mine.error)
+        share = np.linspace(0.0, 1.0, len(ratios))
+        axes.plot(ratios, share, label=name.replace("_", " "))
     axes.axvspan(1.0 / 3.0, 30.0, color="0.93")
     axes.set(xscale="log", xlabel="estimate over true error", ylabel="share of the runs")
     axes.legend(fontsize=8)
-    page = PAGE.format(
-        count=options.count,
-        seed=options.seed,
-        methods=", ".join(METHODS),
-        table=summary,
-        provenance=provenance(),
-    )
-    write(options.out, "estimate", csv=frame, document={}, page=page, figures={"estimate": figure})
+    texts = {"methods": ", ".join(METHODS), "table": markdown(summarise(rows))}
+    page = PAGE.format(**vars(options), **texts, provenance=provenance())
+    write(options.out, "estimate", csv=rows, document={}, page=page, figures={"estimate": figure})
+    return True
 
 
 PAGE = """# How far the error estimate can be trusted
@@ -227,16 +228,11 @@ picture reaches from 1/3 to 30.
 
 def main(words: Sequence[str] | None = None) -> int:
     """Calibrate from the command line."""
-    arguments = parser("estimate", "Estimate over true error in random scenes.", DOCS)
-    arguments.add_argument("--count", type=int, default=200, help="scenes of each class")
-    arguments.add_argument("--seed", type=int, default=1, help="of the random numbers")
-
-    def study(options: argparse.Namespace) -> bool:
-        jobs = [(name, options.seed, k) for k in range(options.count) for name in CLASSES]
-        report(run_jobs(measure, jobs, "estimate        "), options)
-        return True
-
-    return run(study, arguments, words)
+    return run(
+        report, "estimate", DOCS, words,
+        count={"type": int, "default": 200, "help": "scenes of each class"},
+        seed={"type": int, "default": 1, "help": "of the random numbers"},
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

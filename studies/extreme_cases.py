@@ -107,10 +107,7 @@ def from_stiffer_bounce(case: Case, simulation: Simulation) -> float:
 
 def energy_drift(_: Case, simulation: Simulation) -> float:
     """Energy residual relative to the energy."""
-    state, dynamics = simulation.state, simulation.dynamics
-    drive = (0.0,) * len(dynamics.drive)
-    kinetic, potential, _power = dynamics.energies(*state.quaternion, *state.body_rate, *drive)
-    return abs(simulation.energy_residual) / (kinetic + potential)
+    return abs(simulation.energy_residual) / simulation.dynamics.total_energy(simulation.sample[0])
 
 
 def residuals(_: Case, simulation: Simulation) -> float:

@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of an extreme case, and what they have to agree with.
 
-A case runs interpreted, one control period a call; through the tick loop of the simulator node; and
-compiled, in as few calls as possible: all must end in the same bits, and as the truth says.
-Its error estimate is checked at a loose tolerance, where the true error is the distance from the
-run at the default tolerance. Cases whose scenes have the same terms are scenarios of one batch: it
-has the bits of fixed steps of each scene alone, and where its local error estimate is as small as
-that of a simulation, the end of the simulation, or the same limit within a step of the same time.
+The introduction of the page, in `extreme`, says what is run and compared.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +21,7 @@ from sst_ros.integration.batch_source import NOT_FINITE
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.yaml_document import values_of
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
@@ -47,14 +43,13 @@ BATCH_TOLERANCE = 1e-10
 """Local error estimate of a step up to which the end is that of a simulation: its default."""
 
 SAME_ORIENTATION, SAME_RATE = 1e-9, 1e-8
-"""Differences of quaternions, and of body rates relative to the largest or 1 rad/s, allowed."""
+"""Differences allowed: angle [rad], and of body rates relative to the largest or 1 rad/s."""
 
 _NO_EFFECT = ("name", "description", "provenance", "initial", "torque", "motion", "duration")
 """Sections of a scene that are given to a run, or have no effect on it."""
 
 
-@dataclass(frozen=True)
-class CaseRun:
+class CaseRun(NamedTuple):
     """A simulation at its end, or the refusal and the simulation at its last state."""
 
     simulation: Simulation | None
@@ -107,15 +102,22 @@ class CaseResult:
         return self.correct and self.same_bits is not False and self.run_loop is not False
 
 
-def run(case: Case, *, compiled: bool = False, tolerance: float | None = None) -> CaseRun:
-    """Run a case; refusals are results. A given tolerance allows steps of any length."""
+def run(
+    case: Case, *, compiled: bool = False, tolerance: float | None = None, looped: bool = False
+) -> CaseRun:
+    """Run a case, also through the tick loop of the node; refusals are results.
+
+    A given tolerance allows steps of any length.
+    """
     simulation = None
     try:
         simulation = Simulation(
             case.scene(), case.integrator, tolerance=tolerance or 1e-10, compiled=compiled,
             step_budget=WHOLE_MOTION_BUDGET,
         )  # fmt: skip
-        if not callable(case.torque) and tolerance is not None:
+        if looped:
+            run_in_loop(simulation, case.torque_at, case.period_ns, case.steps)
+        elif not callable(case.torque) and tolerance is not None:
             simulation.step(case.torque, case.steps * case.period_ns)
         elif not callable(case.torque) and compiled:
             simulation.steps(case.torque, case.period_ns, case.steps)
@@ -127,53 +129,37 @@ def run(case: Case, *, compiled: bool = False, tolerance: float | None = None) -
     return CaseRun(simulation, None)
 
 
-def run_through_loop(case: Case) -> CaseRun:
-    """Run a case through the tick loop of the node, interpreted."""
-    simulation = Simulation(case.scene(), case.integrator, step_budget=WHOLE_MOTION_BUDGET)
-    try:
-        run_in_loop(simulation, case.torque_at, case.period_ns, case.steps)
-    except SstError as error:
-        return CaseRun(simulation, error)
-    return CaseRun(simulation, None)
-
-
 def evaluate_case(case: Case, *, compiled: bool = True) -> CaseResult:
     """Run a case, compare it with the truth, with the tick loop, and with its compiled run."""
     jit = numba_version() is not None and (compiled or case.compiled_only)
     began = time.perf_counter()
     first = run(case, compiled=case.compiled_only and jit)
-    first_s = time.perf_counter() - began
+    clock = "compiled_s" if case.compiled_only else "wall_s"
+    found: dict[str, Any] = {clock: time.perf_counter() - began}
+    deviation, correct, result = _judge(case, first)
     check = estimate_check(case, first)
-    found = CaseResult(
-        case.name, case.group, case.difficulty, case.expected, case.bound, "finished",
-        loose_error=check.true, loose_estimate=check.estimate, check=check.verdict,
-        wall_s=None if case.compiled_only else first_s,
-        compiled_s=first_s if case.compiled_only else None,
-    )  # fmt: skip
-    found = _judge(found, case, first)
-    remarks = []
-    if first.simulation is not None and not case.compiled_only:
-        found = replace(found, run_loop=first.same_as(run_through_loop(case)))
-        remarks += [] if found.run_loop else ["the run loop differs"]
-        if jit:
-            began = time.perf_counter()
-            same = first.same_as(run(case, compiled=True))
-            found = replace(found, compiled_s=time.perf_counter() - began, same_bits=same)
-            remarks += [] if found.same_bits else ["the compiled run differs"]
+    remarks = [result]
+    if first.simulation is not None:
+        found |= _measure_end(first.simulation)
+        if not case.compiled_only:
+            found["run_loop"] = first.same_as(run(case, looped=True))
+            remarks += [] if found["run_loop"] else ["the run loop differs"]
+            if jit:
+                began = time.perf_counter()
+                found["same_bits"] = first.same_as(run(case, compiled=True))
+                found["compiled_s"] = time.perf_counter() - began
+                remarks += [] if found["same_bits"] else ["the compiled run differs"]
     remarks += [] if check.holds else [f"error estimate: {check.verdict}"]
-    result = "; ".join([found.result, *remarks])
-    return replace(found, result=result, correct=found.correct and check.holds)
+    return CaseResult(
+        case.name, case.group, case.difficulty, case.expected, case.bound, "; ".join(remarks),
+        deviation=deviation, correct=correct and check.holds, loose_error=check.true,
+        loose_estimate=check.estimate, check=check.verdict, **found,
+    )  # fmt: skip
 
 
-def _judge(found: CaseResult, case: Case, done: CaseRun) -> CaseResult:
-    """Compare the end of a run with the truth."""
-    simulation, error = done.simulation, done.error
-    if simulation is not None:
-        now, began = simulation.state, initial_state(simulation.scene, simulation.geometry)
-        ends = (_stored(simulation, y) for y in ((*now.quaternion, *now.body_rate), began))
-        energy = abs(simulation.energy_residual) / max(*map(abs, ends), 1e-300)
-        found = replace(found, energy=energy, closure=simulation.closure_residual,
-                        estimate=simulation.error_estimate)  # fmt: skip
+def _judge(case: Case, done: CaseRun) -> tuple[float | None, bool, str]:
+    """Compare the end of a run with the truth: deviation, whether it is correct, and words."""
+    simulation, error = done
     if error is not None:
         result = f"{type(error).__name__}: {str(error).splitlines()[0]}"
         correct = type(error).__name__ == case.refusal
@@ -182,11 +168,21 @@ def _judge(found: CaseResult, case: Case, done: CaseRun) -> CaseResult:
             late = abs(error.time - exact)
             result += f" ({late:.1e} s off)"
             correct = late <= 1e-6 * exact + 1e-15
-        return replace(found, result=result, correct=correct)
+        return None, correct, result
     if simulation is None or case.deviation is None:
-        return found
+        return None, False, "finished"
     deviation = float(case.deviation(case, simulation))
-    return replace(found, deviation=deviation, correct=deviation <= case.bound)
+    return deviation, deviation <= case.bound, "finished"
+
+
+def _measure_end(simulation: Simulation) -> dict[str, float]:
+    began = *initial_state(simulation.scene, simulation.geometry), 0.0, 0.0, 0.0
+    energies = map(simulation.dynamics.total_energy, (simulation.sample[0], began))
+    return {
+        "energy": abs(simulation.energy_residual) / max(*map(abs, energies), 1e-300),
+        "closure": simulation.closure_residual,
+        "estimate": simulation.error_estimate,
+    }
 
 
 def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
@@ -213,15 +209,7 @@ def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
         words = f"true error below {resolved:.0e} rad, which is not resolved; so is the estimate"
         holds = estimate <= FACTOR * resolved
         unresolved = unresolved or EstimateCheck(true, estimate, words, holds)
-    none = EstimateCheck(None, None, "there is no run at a loose tolerance", holds=False)
-    return unresolved or none
-
-
-def _stored(simulation: Simulation, y: Sequence[float]) -> float:
-    """Kinetic and potential energy [J] of a quaternion and a body rate."""
-    dynamics = simulation.dynamics
-    rest = (0.0,) * (len(dynamics.state) - 7 + len(dynamics.drive))
-    return float(sum(dynamics.energies(*y, *rest)[:2]))
+    return unresolved or EstimateCheck(None, None, "there is no run at a loose tolerance", False)
 
 
 def batch_groups(cases: Sequence[Case]) -> list[tuple[int, ...]]:
@@ -277,51 +265,34 @@ def compare_row(batch: Batch, row: int, case: Case, count: int) -> tuple[str, bo
     when, error = np.full(1, np.nan), np.zeros(1)
     y[:7, 0] = initial_state(scene, Geometry.of(scene))
     alone: list[float] = y[:, 0].tolist()
-    for first, steps, torque in _spans(case):
+    spans: list[tuple[int, int, Vector3]]  # first step, number of steps, constant torque
+    if callable(case.torque):
+        spans = [(k, 1, case.torque(k, None)) for k in range(case.steps)]
+    else:
+        spans = [(0, case.steps, case.torque)]
+    for first, steps, torque in spans:
         given = np.ascontiguousarray(batch.drives(torque, count)[:, [row]])
         batch.advance(first, steps, h, y, given, code, when, error, threads=1)
-    done = case.steps
-    if code[0]:  # the step in which it ends is left out
-        done = int(whole_steps(when, h)[0])
+    # The step in which it ends is left out.
+    done = int(whole_steps(when, h)[0]) if code[0] else case.steps
     own = CompiledMethod(ODE(Dynamics.of(scene)), DOP853, compiled=False)
     with np.errstate(all="ignore"):
-        for first, steps, torque in _spans(case):
+        for first, steps, torque in spans:
             alone = own.step_fixed(0.0, h, max(0, min(steps, done - first)), alone, torque)
     if alone != y[:, 0].tolist():
         return "another end than fixed steps of its own", False
     if error[0] > BATCH_TOLERANCE or code[0] >= NOT_FINITE:
         return "bits", True
-    reason, stop = "", float(when[0])
+    simulation, ended = run(case)
+    agree = False
     if code[0]:
         index = int(np.broadcast_to(batch.columns.geometry, count)[row])
-        limits = batch.model.limits(batch.columns.geometries.of_rows(index))
-        reason = limits[int(code[0]) - 1].reason
-    agree = _agree(run(case), y[:7, 0].tolist(), reason, stop, h)
+        limit = batch.model.limits(batch.columns.geometries.of_rows(index))[int(code[0]) - 1]
+        if isinstance(ended, RunStopped) and ended.reason == limit.reason:
+            agree = abs(float(when[0]) - ended.time) <= h + 1e-12
+    elif ended is None and simulation is not None:
+        turned = angle_between(simulation.state.quaternion, y[:4, 0])
+        rate = np.array(simulation.state.body_rate)
+        faster = np.abs(rate - y[4:7, 0]).max() / max(1.0, np.abs(rate).max())
+        agree = bool(turned < SAME_ORIENTATION and faster < SAME_RATE)
     return ("bits and end" if agree else "another end than the simulation"), agree
-
-
-def _spans(case: Case) -> Iterator[tuple[int, int, Vector3]]:
-    """Yield first step, number of steps and torque of the spans of constant torque."""
-    if callable(case.torque):
-        for k in range(case.steps):
-            yield k, 1, case.torque(k, None)
-    else:
-        yield 0, case.steps, case.torque
-
-
-def _agree(direct: CaseRun, y: list[float], reason: str, stop: float, h: float) -> bool:
-    """Whether a simulation ends as a scenario does that ended in `y`, or at a limit."""
-    if reason or direct.error is not None or direct.simulation is None:
-        ended = direct.error
-        return (
-            isinstance(ended, RunStopped)
-            and ended.reason == reason
-            and abs(stop - ended.time) <= h + 1e-12
-        )
-    state = direct.simulation.state
-    q, rate = np.array(state.quaternion), np.array(state.body_rate)
-    turned = min(np.abs(q - y[:4]).max(), np.abs(q + y[:4]).max())
-    return bool(
-        turned < SAME_ORIENTATION
-        and np.abs(rate - y[4:]).max() < SAME_RATE * max(1.0, np.abs(rate).max())
-    )

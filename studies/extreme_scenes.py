@@ -238,9 +238,8 @@ class SampledPd:
 
 def mass_matrix(scene: Scene) -> Array:
     """Mass matrix in gamma at the start of a scene at rest [kg m^2], from its accelerations."""
-    dt_ns, columns = 1000, []
-    for k in range(3):
-        simulation = Simulation(scene)
-        simulation.step((float(k == 0), float(k == 1), float(k == 2)), dt_ns)
-        columns.append(np.array(simulation.state.joints.gamma_dot) / (1e-9 * dt_ns))
-    return np.asarray(np.linalg.inv(np.stack(columns, axis=1)))
+    rates = [
+        Simulation(scene).step(torque, 1000).joints.gamma_dot
+        for torque in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    ]
+    return np.asarray(np.linalg.inv(np.transpose(rates) / 1e-6))

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good feedforward is: every control mode with every model error, as a grid.
 
-Loops run in lockstep on `Simulation`: state at the start of a period, command, one step under it.
-All have the plant of one scene and its reference motion; the errors are in the controller's model,
-or in the channel between them (`control_loop.model_errors`).
-
 **Theory.** With an exact model the error of feedforward alone is that of the hold, and falls with
 the period as `sampled_data` derives. With equal gains, the error of gamma obeys one linear equation
 as long as it is small, driven by the torque that the feedforward lacks: all of it for pd, the share
@@ -21,28 +17,25 @@ of `sampled_data.stability_limit`.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from operator import methodcaller
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
-from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking
-from sst_ros.errors import InputError, Problem
 from sst_ros.report.results import data_frame, markdown, provenance, records, write
 from sst_ros.scene.scene import Scene, load
-from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulate import simulate
 from sst_ros.state import NANOSECONDS, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
-from studies import DOCS, parser, run, run_jobs
+from studies import DOCS, run, run_jobs
 from studies import control_loop as loops
 from studies.control_loop import SHARE, ControlLoop, ModelError, model_errors, run_loop
 from studies.feedforward_figure import draw_study
@@ -64,6 +57,8 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of the table of loops; those from rms_rad on are empty for a failure."""
 
+_motion = lru_cache(maxsize=4)(reference_motion)
+
 RESTLESS = "does not come to rest"
 """A failure: the loop is unstable, or its measurements are too coarse for its gains."""
 
@@ -75,7 +70,6 @@ class FeedforwardPlan:
     scene: Scene  # the plant, with its reference motion
     period_ns: int = 1_000_000  # control period
     bandwidths: tuple[float, ...] = (20.0, 60.0, 180.0)  # of the feedback [rad/s]
-    damping_ratio: float = 1.0  # of the feedback
     seed: int = 8  # of all noise; every loop draws the same numbers
     errors: tuple[ModelError, ...] = tuple(model_errors())
     multiples: tuple[int, ...] = (1, 2, 4, 8)  # periods for the order of the hold
@@ -88,7 +82,6 @@ class FeedforwardStudy:
 
     Attributes:
         plan, seconds: its grid, and the length of the motion [s].
-        left_out: errors that the plant cannot have.
         loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
         holds: feedforward alone, exact model: instant `at` of the torque that is held, period_s,
             largest error of gamma [rad].
@@ -100,30 +93,26 @@ class FeedforwardStudy:
 
     plan: FeedforwardPlan
     seconds: float
-    left_out: tuple[str, ...]
     loops: DataFrame
     holds: DataFrame
     unheld: tuple[float, float]
     limits: DataFrame
 
-    def rms(self, error: str, mode: str, bandwidth: float) -> float | None:
-        """Root of the mean square error of all gamma [rad]; None where the loop failed."""
+    def rms(self, error: str, mode: str, bandwidth: float) -> float:
+        """Root of the mean square error of all gamma [rad]; nan where the loop failed."""
         rows = self.loops[(self.loops.error == error) & (self.loops["mode"] == mode)]
         if mode != OPEN_LOOP:
             rows = rows[rows.bandwidth_rad_per_s == bandwidth]
-        known = rows.rms_rad.dropna()
-        return None if known.empty else float(known.iloc[0])
+        return float(rows.rms_rad.iloc[0]) if len(rows) else math.nan
 
-    def benefit(self, error: str, bandwidth: float) -> float | None:
-        """RMS(pd) / RMS(feedforward_pd) at equal gains; None where one of them failed."""
-        pd, both = (self.rms(error, mode, bandwidth) for mode in ("pd", "feedforward_pd"))
-        return None if pd is None or not both else pd / both
+    def benefit(self, error: str, bandwidth: float) -> float:
+        """RMS(pd) / RMS(feedforward_pd) at equal gains; nan where one of them failed."""
+        return self.rms(error, "pd", bandwidth) / self.rms(error, "feedforward_pd", bandwidth)
 
-    def least_benefit(self, error: str, bandwidth: float) -> float | None:
+    def least_benefit(self, error: str, bandwidth: float) -> float:
         """Return the bound of linear theory on the benefit where bodies weigh SHARE too much."""
-        pd = self.rms(error, "pd", bandwidth)
         exact = self.rms("nominal", "feedforward_pd", bandwidth)
-        return None if not pd or exact is None else 1.0 / (SHARE + exact / pd)
+        return 1.0 / (SHARE + exact / self.rms(error, "pd", bandwidth))
 
     @property
     def failed(self) -> DataFrame:
@@ -132,17 +121,16 @@ class FeedforwardStudy:
 
     def orders(self) -> dict[str, float]:
         """Power of the period with which the error of a hold falls, by instant."""
-        found = {}
-        for at, holds in self.holds.groupby("at", sort=False):
-            errors = holds.period_s.tolist(), holds.error.tolist()
-            found[str(at)] = slope(*errors) if len(holds) > 1 else float("nan")
-        return found
+        groups = self.holds.groupby("at", sort=False)
+        return {str(at): slope(group.period_s, group.error) for at, group in groups}
 
 
 def feedforward_study(
     plan: FeedforwardPlan, *, workers: int | None = None, shown: bool = False
 ) -> FeedforwardStudy:
     """Run the grid on all cores; the same bits for any number of workers.
+
+    Errors that the plant cannot have, as unknown friction where there is none, are left out.
 
     Raises:
         InputError: the scene has no reference motion, or one that cannot be made.
@@ -151,42 +139,41 @@ def feedforward_study(
     """
     scene, motion = plan.scene, _motion(plan.scene)
     errors = [error for error in plan.errors if error.name == "nominal" or error.changes(scene)]
-    left_out = tuple(error.name for error in plan.errors if error not in errors)
-    basic = SampledControl(damping_ratio=plan.damping_ratio, period=plan.period_ns / NANOSECONDS)
-    # What takes longest comes first, so that no core waits for another at the end.
-    jobs: list[Callable[[], Any]] = [
-        partial(_limit, scene, replace(basic, delay=delay)) for delay in plan.delays
-    ]
+    basic = SampledControl(period=plan.period_ns / NANOSECONDS)
+    shown_as = f"{scene.name:<16}" if shown else ""
+    limits = [replace(basic, delay=delay) for delay in plan.delays]
     schemes = [
         replace(basic, mode=mode, bandwidth=bandwidth)
         for mode in MODES
         for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
     ]
-    jobs += [partial(_track, plan, error, settings) for error in errors for settings in schemes]
     holds = [
         replace(basic, mode=OPEN_LOOP, feedforward_at=at, period=plan.period_ns * n / NANOSECONDS)
         for at in INSTANTS
         for n in plan.multiples
     ]
-    jobs += [partial(_held, scene, each) for each in holds]
-    jobs.append(partial(_unheld, scene))
-    found = run_jobs(methodcaller("__call__"), jobs, f"{scene.name:<16}" if shown else "", workers)
-    limits, count = len(plan.delays), len(holds)
+    tracked = list(itertools.product(errors, schemes))
     return FeedforwardStudy(
-        plan, motion.duration, left_out, data_frame(found[limits : -count - 1], COLUMNS),
-        data_frame(found[-count - 1 : -1]), found[-1],
-        data_frame(found[:limits], ("delay", "theory", "ideal", "real")),
-    )  # fmt: skip
+        plan,
+        motion.duration,
+        data_frame(run_jobs(partial(_track, plan), tracked, shown_as, workers), COLUMNS),
+        data_frame(run_jobs(partial(_held, scene), holds, shown_as, workers)),
+        _unheld(scene),
+        data_frame(
+            run_jobs(partial(_limit, scene), limits, shown_as, workers),
+            ("delay", "theory", "ideal", "real"),
+        ),
+    )
 
 
-def _track(plan: FeedforwardPlan, error: ModelError, settings: SampledControl) -> dict[str, Any]:
-    """Run a loop: its row of the table."""
+def _track(plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]) -> dict[str, Any]:
+    """Run a loop with a model error: its row of the table."""
+    error, settings = job
     motion, open_loop = _motion(plan.scene), settings.mode == OPEN_LOOP
     named = {
         "scene": plan.scene.name, "error": error.name, "mode": settings.mode,
         "bandwidth_rad_per_s": None if open_loop else settings.bandwidth,
-        "damping_ratio": plan.damping_ratio, "period_s": settings.period,
-        "seed": plan.seed,
+        "damping_ratio": settings.damping_ratio, "period_s": settings.period, "seed": plan.seed,
     }  # fmt: skip
     model, settings = error.model(plan.scene), replace(settings, **error.channel)
     loop = ControlLoop(model, motion, settings, plan.scene, plan.seed, REST_S)
@@ -238,23 +225,12 @@ def _unheld(plant: Scene) -> tuple[float, float]:
     def torque(time: float) -> Vector3:
         return inverse.reference_torque(motion.at(time))
 
-    simulation = Simulation(
-        loops.at_start(plant, motion), "dop853", tolerance=1e-13,
-        step_budget=WHOLE_MOTION_BUDGET,
+    found = simulate(
+        loops.at_start(plant, motion), torque, motion.duration, method="dop853", tolerance=1e-12,
+        t_eval=np.linspace(0.0, motion.duration, 21),
     )  # fmt: skip
-    largest, step = 0.0, round(motion.duration * NANOSECONDS / 20)
-    for _ in range(20):
-        state = simulation.step(torque, step)
-        desired = motion.at(state.time_ns / NANOSECONDS).gamma
-        largest = max(largest, float(np.abs(np.subtract(desired, state.joints.gamma)).max()))
-    return largest, simulation.error_estimate
-
-
-@lru_cache(maxsize=4)
-def _motion(scene: Scene) -> ReferenceMotion:
-    from sst_ros.recording.recording import read_run_motion
-
-    return reference_motion(scene, read_run_motion)
+    desired = [motion.at(t).gamma for t in found.t.tolist()]
+    return float(np.abs(desired - found.gamma).max()), found.error_estimate
 
 
 INTRODUCTION = """\
@@ -275,33 +251,30 @@ as one that leaves its stroke or its workspace. `studies/feedforward.py` and
 """
 
 
-def report(plan: FeedforwardPlan, out: Path, *, workers: int | None = None) -> FeedforwardStudy:
-    """Run a study; print it, and write feedforward.csv, .json, .md and .png into `out`."""
-    study = feedforward_study(plan, workers=workers, shown=True)
+def report(options: argparse.Namespace) -> bool:
+    """Run a study; print it, and write feedforward.csv, .json, .md and .png."""
+    study = feedforward_study(FeedforwardPlan(load(options.scene)), shown=True)
     print(page(study), flush=True)
-    write(out, "feedforward", csv=study.loops, document=document(study), page=page(study),
+    write(options.out, "feedforward", csv=study.loops, document=document(study), page=page(study),
           figures={"feedforward": draw_study(study, title(study))})  # fmt: skip
-    return study
+    return True
 
 
 def rms_table(study: FeedforwardStudy) -> DataFrame:
     """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
-    footnotes = {
-        (row.error, row.mode, None if row.mode == OPEN_LOOP else row.bandwidth_rad_per_s): number
-        for number, row in enumerate(study.failed.itertuples(), start=1)
-    }
+    failed = study.failed[["error", "mode", "bandwidth_rad_per_s"]].fillna(0.0).to_numpy().tolist()
+    footnotes = {tuple(key): f"[{number}]" for number, key in enumerate(failed, start=1)}
     rows = []
-    for error in study.loops.error.unique():
-        for bandwidth in study.plan.bandwidths:
-            row = {"error": error, "rad/s": f"{bandwidth:g}"}
-            for mode in MODES:
-                rms = study.rms(error, mode, bandwidth)
-                again = mode == OPEN_LOOP and bandwidth != study.plan.bandwidths[0]
-                key = (error, mode, None if mode == OPEN_LOOP else bandwidth)
-                found = f"[{footnotes[key]}]" if rms is None else f"{rms:.1e}"
-                row[mode] = "" if again else found
-            benefit = study.benefit(error, bandwidth)
-            rows.append({**row, "pd / feedforward_pd": f"{benefit:.3g}" if benefit else "-"})
+    for error, bandwidth in itertools.product(study.loops.error.unique(), study.plan.bandwidths):
+        row = {"error": error, "rad/s": f"{bandwidth:g}"}
+        for mode in MODES:
+            key = error, mode, 0.0 if mode == OPEN_LOOP else bandwidth
+            row[mode] = footnotes.get(key, f"{study.rms(error, mode, bandwidth):.1e}")
+        if bandwidth != study.plan.bandwidths[0]:
+            row[OPEN_LOOP] = ""
+        benefit = study.benefit(error, bandwidth)
+        row["pd / feedforward_pd"] = "-" if math.isnan(benefit) else f"{benefit:.3g}"
+        rows.append(row)
     return data_frame(rows)
 
 
@@ -309,7 +282,7 @@ def title(study: FeedforwardStudy) -> str:
     """Return scene and settings in one line."""
     plan, period = study.plan, f"control period {study.plan.period_ns / 1e6:g} ms"
     text = f"Feedforward on {plan.scene.name}: {study.seconds:g} s of motion, {period}"
-    return f"{text}, damping ratio {plan.damping_ratio:g}, seed {plan.seed}"
+    return f"{text}, damping ratio {study.loops.damping_ratio[0]:g}, seed {plan.seed}"
 
 
 def findings(study: FeedforwardStudy) -> Iterator[str]:
@@ -329,7 +302,7 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
         error = f"inertia {sign}{SHARE:.0%}"
         for bandwidth in study.plan.bandwidths:
             benefit, bound = study.benefit(error, bandwidth), study.least_benefit(error, bandwidth)
-            if benefit is not None and bound is not None:
+            if not math.isnan(benefit + bound):
                 yield (
                     f"{error}, {bandwidth:g} rad/s: the error of feedforward_pd is {benefit:.2f} "
                     f"times smaller than that of pd with equal gains; theory: at least {bound:.2f}"
@@ -342,24 +315,17 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
         )
 
 
-def notes(study: FeedforwardStudy) -> Iterator[str]:
-    """Yield what failed and what was left out, line by line."""
-    for number, row in enumerate(study.failed.itertuples(), start=1):
-        at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
-        yield f"[{number}] {row.error}, {row.mode}{at}: {row.failure}"
-    for name in study.left_out:
-        yield f"Left out: {name}, which this scene cannot have."
-
-
 def page(study: FeedforwardStudy) -> str:
     """Write a study as one Markdown page."""
     lines = [
         INTRODUCTION, f"**{title(study)}.**", "", "![the study](feedforward.png)", "",
         "## Theory and findings", "", *(f"- {line.strip()}" for line in findings(study)), "",
         "## RMS error of gamma [rad]", "", markdown(rms_table(study)), "",
-        *(f"- {line}" for line in notes(study)), "", provenance(), "",
     ]  # fmt: skip
-    return "\n".join(lines)
+    for number, row in enumerate(study.failed.itertuples(), start=1):
+        at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
+        lines.append(f"- [{number}] {row.error}, {row.mode}{at}: {row.failure}")
+    return "\n".join([*lines, "", provenance(), ""])
 
 
 def document(study: FeedforwardStudy) -> dict[str, Any]:
@@ -367,49 +333,17 @@ def document(study: FeedforwardStudy) -> dict[str, Any]:
     return {
         "scene": study.plan.scene.name,
         "motion_s": study.seconds,
-        "left_out": list(study.left_out),
         "loops": records(study.loops),
-        "holds": [
-            {"at": at, "order": None if np.isnan(order) else order, "order_of_theory": ORDERS[at],
-             "errors": records(study.holds[study.holds["at"] == at])}
-            for at, order in study.orders().items()
-        ],
+        "holds": records(study.holds),
         "exact_holds": dict(zip(("error", "estimate"), study.unheld, strict=True)),
         "limits": records(study.limits),
-    }  # fmt: skip
+    }
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run a study from the command line."""
-    arguments = parser("feedforward", "Every mode of control with every model error.", DOCS)
-    what = "scene with a motion: name, or path of a .yaml file"
-    arguments.add_argument("--scene", default="reach", help=what)
-    arguments.add_argument("--period", type=float, default=1e-3, help="control period [s]")
-    what, usual = "of the feedback [rad/s]; default: 20 60 180", FeedforwardPlan.bandwidths
-    arguments.add_argument("--bandwidths", type=float, nargs="+", default=usual, help=what)
-    arguments.add_argument("--damping-ratio", type=float, default=1.0, help="of the feedback")
-    arguments.add_argument("--seed", type=int, default=8, help="of the noise; default: 8")
-    arguments.add_argument("--workers", type=int, help="processes; default: one a core")
-    return run(_from_command_line, arguments, words)
-
-
-def _from_command_line(options: argparse.Namespace) -> bool:
-    allowed = {
-        "period": (1e-6 <= options.period <= 1.0, "must be from 1e-6 to 1 s"),
-        "seed": (options.seed >= 0, "must be >= 0"),
-        "workers": (options.workers is None or options.workers >= 1, "must be >= 1"),
-    }
-    if wrong := [
-        Problem(f"--{name}", getattr(options, name), text)
-        for name, (right, text) in allowed.items() if not right
-    ]:  # fmt: skip
-        raise InputError("feedforward", wrong)
-    plan = FeedforwardPlan(
-        load(options.scene), round(options.period * 1e9),
-        tuple(dict.fromkeys(options.bandwidths)), options.damping_ratio, options.seed,
-    )  # fmt: skip
-    report(plan, options.out, workers=options.workers)
-    return True
+    """Run the study of the page from the command line."""
+    scene = {"default": "reach", "help": "with a motion: name, or path of a .yaml file"}
+    return run(report, "feedforward", DOCS, words, scene=scene)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -43,7 +44,13 @@ def draw_study(study: FeedforwardStudy, title: str) -> Figure:
         first = first or axes
     _holds(figure.add_subplot(lower[0, 0]), study)
     _limits(figure.add_subplot(lower[0, 1]), study.limits)
-    figure.legend(handles=_legend(len(study.failed)), loc="center", bbox_to_anchor=(0.5, 0.945),
+    handles = [
+        Line2D([], [], color=colour, marker=marker, linestyle="none", label=mode)
+        for mode, (colour, marker) in MARKERS.items()
+    ]
+    label = f"failed: {len(study.failed)}, see below"
+    failed = Line2D([], [], color=INK, marker="x", linestyle="none", label=label)
+    figure.legend(handles=[*handles, failed], loc="center", bbox_to_anchor=(0.5, 0.945),
                   ncol=7, fontsize=9, frameon=False)  # fmt: skip
     figure.suptitle(title, fontsize=12, y=0.985)
     note(figure, "\n".join([*_reasons(study.failed.failure), provenance()]), 200)
@@ -52,13 +59,11 @@ def draw_study(study: FeedforwardStudy, title: str) -> Figure:
 
 def _reasons(failures: Iterable[str]) -> Iterator[str]:
     """Yield the most frequent reasons of failures in a line, if there are any."""
-    reasons: dict[str, int] = {}
-    for failure in failures:
-        first, _, last = failure.partition(": ")
-        reason = last if "stopped at" in first else first
-        reasons[reason] = reasons.get(reason, 0) + 1
+    reasons = Counter(
+        text.partition(": ")[2 if "stopped at" in text else 0] for text in failures
+    ).most_common(4)
     if reasons:
-        listed = "; ".join(f"{count} × {kind}" for kind, count in list(reasons.items())[:4])
+        listed = "; ".join(f"{count} × {reason}" for reason, count in reasons)
         yield f"Failed: {listed}. The table and the CSV have the reason of each."
 
 
@@ -71,22 +76,20 @@ def _errors(axes: Axes, loops: DataFrame, bandwidth: float, *, labelled: bool) -
         colour, marker = MARKERS[loop.mode]
         place = list(MARKERS).index(loop.mode)
         y = names.index(loop.error) + (place - 2) * _SPREAD
-        failed = loop.failure != ""
-        x = high * _FAILED ** ((place + 0.5) / len(MARKERS)) if failed else loop.rms_rad
-        axes.plot(x, y, marker, color=colour, markerfacecolor="white" if failed else colour,
-                  markersize=5.5, zorder=3)  # fmt: skip
-        if failed:
+        if loop.failure:
+            x = high * _FAILED ** ((place + 0.5) / len(MARKERS))
+            axes.plot(x, y, marker, color=colour, markerfacecolor="white", markersize=5.5, zorder=3)
             axes.plot(x, y, "x", color=INK, markersize=4, zorder=4)
+        else:
+            axes.plot(loop.rms_rad, y, marker, color=colour, markersize=5.5, zorder=3)
     for row in range(len(names)):
         axes.axhline(row + 0.5, color="#cccccc", linewidth=0.6)
     axes.axvspan(high, high * _FAILED, color="#f4e3d7", linewidth=0)
-    axes.set_xlim(low, high * _FAILED)
-    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set(xlim=(low, high * _FAILED), ylim=(len(names) - 0.5, -0.5))
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", labelleft=labelled, length=0)
     axes.grid(axis="y", visible=False)
-    axes.set_title(f"feedback at {bandwidth:g} rad/s")
-    axes.set_xlabel("RMS error of γ [rad]")
+    axes.set(title=f"feedback at {bandwidth:g} rad/s", xlabel="RMS error of γ [rad]")
 
 
 def _holds(axes: Axes, study: FeedforwardStudy) -> None:
@@ -104,11 +107,9 @@ def _holds(axes: Axes, study: FeedforwardStudy) -> None:
     axes.axhline(unheld, color=GREEN, linewidth=2.0, label=f"nothing held: {unheld:.0e} rad")
     periods = 1e3 * np.unique(holds.period_s.to_numpy())
     axes.set_xscale("log", base=2)
-    axes.set_yscale("log")
+    axes.set(yscale="log", ylim=(0.2 * unheld, 10.0 * holds.error.max()))
     axes.set_xticks(periods, [f"{period:g}" for period in periods])
-    axes.set_ylim(0.2 * unheld, 10.0 * holds.error.max())
-    axes.set_xlabel("control period [ms]")
-    axes.set_ylabel("largest error of γ [rad]")
+    axes.set(xlabel="control period [ms]", ylabel="largest error of γ [rad]")
     axes.set_title("Exact model, feedforward alone")
     axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.33), fontsize=8.5)
 
@@ -116,8 +117,7 @@ def _holds(axes: Axes, study: FeedforwardStudy) -> None:
 def _limits(axes: Axes, limits: DataFrame) -> None:
     """Largest stable bandwidth over delay: theory as a line, simulations as markers."""
     axes.set_title("computed_torque, exact model: stable below")
-    axes.set_xlabel("delay of the command [samples]")
-    axes.set_ylabel("largest stable bandwidth [rad/s]")
+    axes.set(xlabel="delay of the command [samples]", ylabel="largest stable bandwidth [rad/s]")
     if limits.empty:
         return
     axes.fill_between(limits.delay, 1.0, limits.theory, color=GREEN, alpha=0.12, linewidth=0.0)
@@ -127,18 +127,6 @@ def _limits(axes: Axes, limits: DataFrame) -> None:
               label="simulated, without friction and lag")  # fmt: skip
     axes.plot(limits.delay, limits.real, "o", color=BLUE, markersize=8, markerfacecolor="none",
               label="simulated, the plant as it is")  # fmt: skip
-    axes.set_yscale("log")
-    axes.set_ylim(0.5 * limits.theory.min(), 2.0 * limits.theory.max())
+    axes.set(yscale="log", ylim=(0.5 * limits.theory.min(), 2.0 * limits.theory.max()))
     axes.set_xticks(limits.delay)
     axes.legend(loc="upper right", fontsize=8.5)
-
-
-def _legend(failed: int) -> list[Line2D]:
-    handles = [
-        Line2D([], [], color=colour, marker=marker, linestyle="none", label=mode)
-        for mode, (colour, marker) in MARKERS.items()
-    ]
-    if failed:
-        handles.append(Line2D([], [], color=INK, marker="x", linestyle="none",
-                              label=f"failed: {failed}, see below"))  # fmt: skip
-    return handles

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 
 from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
@@ -28,15 +29,13 @@ from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
-from studies import parser, run
+from studies import run
 
 NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
 """Largest differences that are expected: of angles [rad], and of torques [N m]."""
 
 STEP = 1e-3
-"""Spacing of the central differences of the inverse-dynamics check [s]."""
-DIFFERENCES = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
-"""First derivative of order 8 at the middle of nine values, times the spacing."""
+"""Spacing of the samples in the check by inverse dynamics, whole nanoseconds [s]."""
 
 
 class LargestDifference(NamedTuple):
@@ -172,26 +171,21 @@ def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
 def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]:
     """Check Example 1 as the paper does: inverse dynamics of the motion gives the torques back.
 
-    Accelerations are central differences of the rates, so that no direct dynamics enters.
+    Accelerations are those of a spline through the rates, so that no direct dynamics enters.
     """
     assert scene.torque is not None and scene.duration is not None
-    count = int(scene.duration / STEP)
-    motion = simulate(scene, t_eval=np.arange(count + 1) * STEP, tolerance=1e-12)
-    reach = len(DIFFERENCES) // 2
-    middle = slice(reach, count + 1 - reach)
-    acceleration = np.stack(
-        [np.correlate(column, DIFFERENCES, "valid") / STEP for column in motion.gamma_dot.T], 1
-    )
+    times = np.arange(0.0, scene.duration, STEP)
+    motion = simulate(scene, t_eval=times, tolerance=1e-12)
+    accelerations = make_interp_spline(times, motion.gamma_dot, k=7).derivative()(times)
     mechanism = virtual_work.Mechanism.of(scene)
-    rows = zip(motion.gamma[middle], motion.gamma_dot[middle], acceleration,
-               rotation_matrix(motion.quaternion[middle]), strict=True)  # fmt: skip
+    rows = zip(motion.gamma, motion.gamma_dot, accelerations,
+               rotation_matrix(motion.quaternion), strict=True)  # fmt: skip
     torque = np.array([
         virtual_work.inverse_dynamics(
             mechanism, virtual_work.posture(mechanism.geometry, gamma, rotation), rate, change
         )
         for gamma, rate, change, rotation in rows
     ])  # fmt: skip
-    times = motion.t[middle]
     given = scene.torque.amplitude[0] * np.sin(scene.torque.frequency[0] * times)
     apart = np.abs(torque - given[:, None]).max(axis=1)
     labels = ["torque [N m]", "largest difference\nof three actuators [N m]"]
@@ -225,9 +219,8 @@ def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Draw the figures from the command line."""
-    arguments = parser("paper", "Figs. 8 to 14 of the paper.", Path("paper_out"))
-
-    return run(lambda given: all(each.within for each in paper(given.out)), arguments, words,
+    out = Path("paper_out")
+    return run(lambda given: all(each.within for each in paper(given.out)), "paper", out, words,
                careful=True)  # fmt: skip
 
 

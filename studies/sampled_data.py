@@ -70,5 +70,7 @@ def largest_stable(
 
 
 def slope(periods: Sequence[float], errors: Sequence[float]) -> float:
-    """Power of the period with which errors fall: least squares on logarithms."""
+    """Power of the period with which errors fall, by least squares; nan for a single one."""
+    if len(periods) < 2:
+        return math.nan
     return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])

@@ -29,7 +29,6 @@ from studies.extreme_runs import (
     evaluate_case,
     run,
     run_batch,
-    run_through_loop,
 )
 from studies.extreme_scenes import (
     about_e,
@@ -121,7 +120,7 @@ def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
     assert estimate_check(case, done).holds
     monkeypatch.setattr(Simulation, "error_estimate", 1e-9)
     monkeypatch.setattr(extreme_runs, "ROUNDING", 1e-11)
-    done = replace(done, simulation=Accurate(done.simulation))
+    done = done._replace(simulation=Accurate(done.simulation))
     assert not estimate_check(case, done).holds
 
 
@@ -143,7 +142,7 @@ LOOPED = (
 
 @pytest.mark.parametrize("name", LOOPED)
 def test_the_run_loop_ends_in_the_same_bits(name):
-    direct, looped = run(named(name)), run_through_loop(named(name))
+    direct, looped = run(named(name)), run(named(name), looped=True)
     assert looped.simulation.state == direct.simulation.state
     assert str(looped.error) == str(direct.error)
 
@@ -151,8 +150,9 @@ def test_the_run_loop_ends_in_the_same_bits(name):
 def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
     case = named("control period of 333333 ns")
     shorter = replace(case, steps=case.steps - 1)
-    looped = run_through_loop(shorter)
-    monkeypatch.setattr(extreme_runs, "run_through_loop", lambda _: looped)
+    monkeypatch.setattr(
+        extreme_runs, "run", lambda case, looped=False, **_: run(shorter if looped else case)
+    )
     bad = evaluate_case(case, compiled=False)
     assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
 
