@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The process that compiles a scene for the next start: late, of low priority, one only."""
 
+import contextlib
 import fcntl
+import os
+import re
 import sys
-import time
 from types import SimpleNamespace as Box
 
 import pytest
@@ -17,10 +19,9 @@ from sst_ros.nodes.simulator import CodeCompiler
 from sst_ros.runtime.settings import SimulatorParameters
 
 FAKE = """#!{python}
-import os, pathlib
-here = pathlib.Path({folder!r})
-with (here / "started").open("a") as file:
-    file.write(f"{{os.nice(0)}}\\n")
+import os
+with open({path!r}, "a") as file:
+    print(os.nice(0), file=file)
 """
 
 
@@ -47,38 +48,30 @@ def node(tmp_path, monkeypatch):
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("SST_ROS_NUMBA", raising=False)
     program = tmp_path / "python"
-    program.write_text(FAKE.format(python=sys.executable, folder=str(tmp_path)))
+    program.write_text(FAKE.format(python=sys.executable, path=str(tmp_path / "started")))
     program.chmod(0o755)
     monkeypatch.setattr(simulator.sys, "executable", str(program))
     return Node()
 
 
-def compiler(node):
+@pytest.fixture
+def compiling(node):
     return CodeCompiler(node, load_scene("example2"), SimulatorParameters())
 
 
-def written(path, timeout=20.0):
-    """Wait for a whole line of a file."""
-    deadline = time.monotonic() + timeout
-    while not (path.exists() and path.read_text().endswith("\n")):
-        assert time.monotonic() < deadline, f"no {path.name} within {timeout} s"
-        time.sleep(0.01)
-    return path.read_text()
-
-
-def test_it_starts_late_once_and_of_the_lowest_priority(node, tmp_path):
-    compiling = compiler(node)
+def test_it_starts_late_once_and_of_the_lowest_priority(node, compiling, tmp_path):
     ((delay_s, start),) = node.timers
     assert not compiling.available and delay_s >= 5.0 and not (tmp_path / "started").exists()
     start()
     compiling.start()  # as the end of the node does
     assert node.timers == []
     assert sum("compiles the scene for the next start" in line for line in node.lines) == 1
-    assert written(tmp_path / "started") == "19\n"
+    with contextlib.suppress(ChildProcessError):  # it has ended, and is waited for
+        os.waitpid(int(re.search(r"process (\d+) compiles", "".join(node.lines))[1]), 0)
+    assert (tmp_path / "started").read_text() == "19\n"
 
 
-def test_there_is_one_while_another_process_compiles(node, tmp_path):
-    compiling = compiler(node)
+def test_there_is_one_while_another_process_compiles(node, compiling, tmp_path):
     with (tmp_path / "cache" / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         compiling.start()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real nodes in real processes, each test in a ROS domain of its own on localhost."""
 
+import contextlib
 import faulthandler
 import os
 import select
@@ -289,41 +290,37 @@ class Observer:
         rclpy.try_shutdown(context=self.context)
 
 
-def _closing(started):
-    yield started
-    started.close()
-
-
-@pytest.fixture
-def domain():
+def own_domain():
     with child_process.own_domain() as number:
         yield number
+
+
+domain = pytest.fixture(own_domain)
+domain_of_module = pytest.fixture(own_domain, scope="module")
 
 
 @pytest.fixture
 def nodes(domain):
-    yield from _closing(Nodes())
+    with contextlib.closing(Nodes()) as started:
+        yield started
 
 
 @pytest.fixture
 def observer(domain):
-    yield from _closing(Observer(domain))
-
-
-@pytest.fixture(scope="module")
-def domain_of_module():
-    with child_process.own_domain() as number:
-        yield number
+    with contextlib.closing(Observer(domain)) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")
 def nodes_of_module(domain_of_module):
-    yield from _closing(Nodes())
+    with contextlib.closing(Nodes()) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")
 def observer_of_module(domain_of_module):
-    yield from _closing(Observer(domain_of_module))
+    with contextlib.closing(Observer(domain_of_module)) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")

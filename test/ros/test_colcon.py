@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from sensor_msgs.msg import JointState
+from programs import python
+
+from sst_ros.nodes.arguments import COMMANDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 SOURCE = Path(__file__).parents[2]
@@ -40,40 +42,25 @@ def overlay(prefix):
     return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages), "PATH": path}
 
 
-def test_the_ament_index_names_the_package(prefix):
-    assert (prefix / "share/ament_index/resource_index/packages/sst_ros").is_file()
-    assert (prefix / "share/sst_ros/package.xml").is_file()
-
-
-def test_all_data_files_are_installed(prefix):
+def test_all_is_installed_where_ros_looks_for_it(prefix):
     share = prefix / "share" / "sst_ros"
+    assert (prefix / "share/ament_index/resource_index/packages/sst_ros").is_file()
+    assert (share / "package.xml").is_file()
     for folder in ("config", "launch"):
         for path in (SOURCE / folder).rglob("*.*"):
             if "__pycache__" not in path.parts:
                 assert (share / path.relative_to(SOURCE)).read_bytes() == path.read_bytes()
-
-
-@pytest.mark.parametrize("name", ["simulator", "torque_player", "inverse_dynamics", "recorder"])
-def test_ros2_run_finds_the_executables(prefix, name):
-    executable = prefix / "lib" / "sst_ros" / name
-    assert executable.is_file()
-    assert os.access(executable, os.X_OK)
+    for name in COMMANDS:  # as `ros2 run` finds it
+        assert os.access(prefix / "lib" / "sst_ros" / name, os.X_OK)
 
 
 def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes, observer):
-    states = observer.listen(JointState, "/joint_states")
     executable = [str(prefix / "lib" / "sst_ros" / "simulator")]
     words = ["--ros-args", "-p", "scene:=example1", "-p", "duration:=0.0"]
     process = nodes.start("", *words, executable=executable, env=overlay)
-    observer.until(lambda: states, "states")
+    observer.preview()
     status, _, err = nodes.stop(process)
     assert status == 0, err
-    found = subprocess.run(
-        [sys.executable, "-c", "from sst_ros.scene.scene import share_directory as s; print(s())"],
-        env={**os.environ, **overlay},
-        cwd=prefix,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert Path(found.stdout.strip()) == prefix / "share" / "sst_ros"
+    text = "from sst_ros.scene.scene import share_directory as s; print(s())"
+    found = python(text, env=overlay, cwd=prefix).stdout
+    assert Path(found.strip()) == prefix / "share" / "sst_ros"

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pause, step, reset and set_state of a real simulator."""
+"""Pause, step, reset and set_state of a real simulator; its speed, /clock given and followed."""
 
 import math
 
 import pytest
 from rcl_interfaces.msg import Log
 from ros.conftest import NAMES, NODE
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+
+from sst_ros.state import nanoseconds
 
 pytestmark = pytest.mark.ros
 
@@ -68,3 +71,107 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
     assert observer.told("resets", 1)["states_set"] == "1"
     _, _, err = nodes.stop(process)
     assert err.count("set_state refused: ") + err.count("set_state: refused: ") == 5
+
+
+def clock(time_ns):
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
+    return message
+
+
+@pytest.mark.parametrize("speed", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_other_speeds_are_kept_and_lose_no_sample(nodes, observer, speed):
+    heard = "[joint_states, /diagnostics]"  # by this process before the run, which is short
+    given = {"duration": 2.0, "publish_rate": 100, "wait_for_subscribers": heard}
+    observer.listen(JointState, "/joint_states")
+    process = nodes.run("simulator", real_time_factor=speed, **given)
+    said = observer.told("phase", "finished")
+    if speed:  # a tick that a busy machine has dropped took its time, too
+        passed_s = (int(said["ticks"]) + int(said["ticks_missed"])) / 1000.0
+        assert 0.5 * speed < passed_s / float(said["wall_time_s"]) <= speed
+    else:  # no tick waits, none can be late
+        assert (float(said["late_max_us"]), said["ticks_missed"]) == (0.0, "0")
+    observer.until(lambda: len(observer.stamps()) >= 201, "the 201 samples")
+    stamps = observer.stamps()
+    assert stamps == [stamps[0] + 10_000_000 * k for k in range(201)]
+    assert nodes.ended(process)[0] == 0
+
+
+def test_a_clock_is_given_and_a_second_one_refused(nodes, observer):
+    clocks = observer.listen(Clock, "/clock")
+
+    def times():
+        return [nanoseconds(message.clock) for message in clocks]
+
+    # Not each: a reader that was held up finds the last time only.
+    nodes.run("simulator", publish_clock=True)
+    observer.until(lambda: len({*times()} & {*observer.stamps()}) > 20, "the time of the states")
+    assert times() == sorted(times()) and times()[0] > 0
+    assert observer.pause(True).success
+    observer.until(lambda: clocks[-1] == clocks[-2], "the time of the pause, repeated")
+    (info,) = observer.node.get_publishers_info_by_topic("/clock")
+    assert info.qos_profile.depth in (0, 1)  # DDS does not tell it everywhere
+
+    other = nodes.run("simulator", "--ros-args", "-r", "__node:=other", publish_clock=True)
+    status, _, err = nodes.ended(other)
+    assert status == 1 and f"/clock is published already, by {NODE}" in err
+
+
+@pytest.mark.slow
+def test_a_rival_that_comes_later_is_told(nodes, observer):
+    nodes.run("simulator", publish_clock=True)
+    observer.phase("running")
+    observer.node.create_publisher(Clock, "/clock", 1)
+    observer.told("said", lambda said: "/clock is also published by /observer" in said)
+
+
+def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
+    nodes.run("simulator", use_sim_time=True)
+    publisher = observer.publisher(Clock, "/clock")
+    assert observer.stamp(observer.preview()) == 0  # no time, no run
+    at = [100 * 10**9]
+
+    def run(samples, what):
+        """Publish time, 10 ms further each time, until there are so many samples more."""
+        begin, before = at[0], len(observer.stamps())
+
+        def condition():
+            new = len(observer.stamps()) - before
+            # A busy simulator is waited for: from 200 ms on it would drop the time.
+            if at[0] - begin - 2_000_000 * new < 100_000_000:
+                at[0] += 10_000_000
+            publisher.publish(clock(at[0]))
+            observer.executor.spin_once(timeout_sec=0.002)
+            return new > samples
+
+        observer.until(condition, what)
+
+    run(50, "samples by the clock")
+    stamps = observer.stamps()
+    assert 0 <= stamps[0] - 100 * 10**9 < 10**9
+    assert stamps[-1] <= at[0]
+    observer.told("ticks_missed", 0)
+
+    publisher.publish(clock(at[0]))  # the clock stands still, and so do the ticks
+    count = len(observer.said("ticks"))
+
+    def stands():
+        _, *told = observer.said("ticks")[count - 1 :]
+        return len(told) > 1 and told[-1] == told[-2]
+
+    observer.until(stands, "a standstill")
+    settled = int(observer.said("ticks")[-1])
+
+    at[0] += 3600 * 10**9  # a leap: dropped, no burst
+    observer.publish_until(  # /clock is best effort
+        publisher,
+        clock(at[0]),
+        lambda: int(observer.said("ticks_missed")[-1]) > 3_000_000,
+        "the dropped ticks",
+    )
+    assert int(observer.said("ticks")[-1]) < settled + 1000
+
+    at[0] -= 1800 * 10**9  # back: stamps never are
+    run(20, "samples after the return")
+    assert observer.told("clock_jumps", 1)["fault"] == ""
+    assert observer.stamps() == sorted(set(observer.stamps()))

@@ -11,14 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from mcap.writer import MCAP0_MAGIC
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros.conftest import COMMANDS, NODE
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
-from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros.errors import InputError
 from sst_ros.nodes import topics
@@ -57,21 +54,12 @@ def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path
 
 def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observer, tmp_path):
     """Who commands waits for their readers: what the recorder has not found would be lost."""
-    kinds = {
-        "/joint_states": (JointState, 10),
-        f"{NODE}/orientation": (QuaternionStamped, 10),
-        f"{NODE}/euler_zyz": (Vector3Stamped, 10),
-        f"{NODE}/applied_torques": (JointTrajectory, 10),
-        f"{NODE}/scene": (String, LATCHED),
-        f"{NODE}/phase": (String, LATCHED),
-        "/diagnostics": (DiagnosticArray, 10),
-    }
 
     def make(topic):
-        kind, qos = kinds[topic]
-        return observer.node.create_publisher(kind, topic, qos), kind()
+        return observer.node.create_publisher(topic.kind, topic.at(NODE), topic.qos()), topic.kind()
 
-    speak = [make(topic) for topic in kinds if "orientation" not in topic]
+    own = [one for one in topics.SIMULATOR.values() if one.name in topics.SAMPLED]
+    speak = [make(topic) for topic in own if topic.name != "~/orientation"]
     observer.node.create_subscription(Float64MultiArray, COMMANDS, print, 10)
     recorder = nodes.run("recorder", output=tmp_path / "bag")
     said = 0
@@ -86,7 +74,7 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
     commanded = partial(observer.node.count_subscribers, COMMANDS)
     observer.until(partial(say_all, 20), "readers of all but one")  # 20 x 0.05 s: many looks
     assert commanded() == 1
-    speak.append(make(f"{NODE}/orientation"))
+    speak.append(make(topics.SIMULATOR["orientation"]))
     observer.until(lambda: say_all(0) and commanded() == 2, "reader of the commands")
     assert nodes.line(recorder) == "ready: 8 topics\n"
 
@@ -108,17 +96,12 @@ def test_a_latched_topic_is_heard_though_its_subscriber_is_seen_first(
         simulator.close()
 
 
-@pytest.mark.parametrize("ending", ["timeout", "signal"])
-def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, observer, tmp_path, ending):
-    timeout = 0.5 if ending == "timeout" else 0.0
+@pytest.mark.parametrize("timeout", [0.5, 0.0])
+def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, tmp_path, timeout):
     recorder = nodes.run("recorder", output=tmp_path / "bag", timeout=timeout)
-    if ending == "timeout":
-        status, _, err = nodes.ended(recorder, 60)
-        assert "given up after 0.5 s" in err
-    else:
-        assert "recording to" in recorder.stderr.readline()
-        status, _, err = nodes.stop(recorder)
-    assert status == 1
+    assert "recording to" in recorder.stderr.readline()
+    status, _, err = nodes.ended(recorder) if timeout else nodes.stop(recorder)
+    assert status == 1 and ("given up after 0.5 s" in err) == (timeout > 0.0)
     assert "is incomplete: no message of /diagnostics, /joint_states, /sst_simulator/app" in err
     assert COMMANDS not in err  # no run needs it
 
@@ -168,8 +151,7 @@ def test_rosbag2_is_given_the_declared_qos():
 def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path):
     states = observer.states  # from the beginning of the run
     recorder = nodes.run("recorder", output=tmp_path / "bag")
-    run = {"sync": "lockstep", "real_time_factor": 0.0, "duration": 1.0}
-    simulator = nodes.run("simulator", **run)
+    simulator = nodes.run("simulator", sync="lockstep", real_time_factor=0.0, duration=1.0)
     assert nodes.line(recorder).startswith("ready")
     nodes.run("torque_player", stamped=True, min_subscribers=2)
     observer.until(observer.samples, "the run")
@@ -179,8 +161,7 @@ def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path)
     observer.until(lambda: len(states) > heard + 200 or ended() is not None, "samples")
     recorder.send_signal(signal.SIGCONT)
     assert simulator.wait(timeout=40) == 0
-    status, _, err = nodes.stop(recorder)
-    assert status == 0, err
+    assert nodes.stop(recorder)[0] == 0
 
 
 @pytest.mark.slow  # the campaign does the same
@@ -221,13 +202,12 @@ def test_what_cannot_be_recovered_is_refused(tmp_path):
     (tmp_path / "noise.mcap").write_bytes(b"no bag at all")
     (tmp_path / "empty.mcap").write_bytes(MCAP0_MAGIC)
     (tmp_path / "folder").mkdir()
-    for name, said in (
-        ("noise.mcap", "must be an MCAP file"),
-        ("empty.mcap", "holds no message"),
-        ("nowhere.mcap", "must be readable"),
-        ("folder", "must hold one .mcap file"),
+    for names, said in (
+        (["noise.mcap"], "must be an MCAP file"),
+        (["empty.mcap"], "holds no message"),
+        (["nowhere.mcap"], "must be readable"),
+        (["folder"], "must hold one .mcap file"),
+        (["empty.mcap", "folder"], "must be a new folder"),
     ):
         with pytest.raises(InputError, match=said):
-            bag_writer.recover(tmp_path / name)
-    with pytest.raises(InputError, match="must be a new folder"):
-        bag_writer.recover(tmp_path / "empty.mcap", tmp_path / "folder")
+            bag_writer.recover(*(tmp_path / name for name in names))

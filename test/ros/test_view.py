@@ -144,7 +144,7 @@ def test_make_view_in_a_copy_that_has_nothing_yet(tmp_path, domain):
         lines = iter(process.stdout.readline, "")
         url = next(filter(None, (re.search(r"http://\S+", line) for line in lines))).group()
         with browse() as page:
-            page.open(url, (820, 560))
+            page.open(url, SIZE)
             page.until(lambda: page.time() is not None, "time of a run")
             first = page.time()
             page.until(lambda: page.time() > first, "motion")
