@@ -25,7 +25,8 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.methods import DOP853, RK4, Tableau
 from sst_ros.scene import scene as scenes
-from sst_ros.scene.scene import Link, Scene, Star
+from sst_ros.scene.bodies import Link, Star
+from sst_ros.scene.scene import Scene
 
 METHODS = {"rk4": RK4, "dop853": DOP853}
 SIMD = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")

@@ -28,7 +28,8 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
-from sst_ros.scene.scene import Initial, Scene
+from sst_ros.scene.loads import Initial
+from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import build, values_of
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, State, Vector3

@@ -6,17 +6,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from sst_ros.scene.scene import (
+from sst_ros.scene.loads import (
     Actuators,
     Friction,
     JointFriction,
     Moment,
-    Scene,
     Spring,
     Stroke,
     Workspace,
-    load,
 )
+from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 
 REST = (0.0, 0.0, 0.0)

@@ -19,7 +19,9 @@ from sst_ros.dynamics import kernel
 from sst_ros.mechanism import kinematics, virtual_work, workspace
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Base, Inertia, Initial, Link, Scene, Star, load
+from sst_ros.scene.bodies import Base, Inertia, Link, Star
+from sst_ros.scene.loads import Initial
+from sst_ros.scene.scene import Scene, load
 from sst_ros.state import Assembly
 
 COUNT = 64

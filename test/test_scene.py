@@ -12,7 +12,8 @@ import yaml
 
 from sst_ros.errors import InputError
 from sst_ros.scene import scene as scenes
-from sst_ros.scene.scene import Inertia, Scene, load, names
+from sst_ros.scene.bodies import Inertia
+from sst_ros.scene.scene import Scene, load, names
 from sst_ros.scene.yaml_document import dump, read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"

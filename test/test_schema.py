@@ -13,18 +13,9 @@ from hypothesis import strategies as st
 from models import FAST
 
 from sst_ros.errors import InputError
-from sst_ros.scene.scene import (
-    Base,
-    Inertia,
-    Initial,
-    Link,
-    Scene,
-    Star,
-    Stroke,
-    Workspace,
-    load,
-    text_of,
-)
+from sst_ros.scene.bodies import Base, Inertia, Link, Star
+from sst_ros.scene.loads import Initial, Stroke, Workspace
+from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.schema import Section, flag, integer, texts
 from sst_ros.scene.yaml_document import dump, read
 

@@ -18,7 +18,8 @@ from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import Actuators, Scene
+from sst_ros.scene.loads import Actuators
+from sst_ros.scene.scene import Scene
 
 SAMPLES = 16
 """Parts of a piece of the motion; even, for Simpson's rule."""

@@ -42,8 +42,8 @@ from sst_ros.description.tree import (
 )
 from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import JOINTS
-from sst_ros.scene.scene import LARGEST, Friction, Scene
+from sst_ros.scene.loads import JOINTS, Friction
+from sst_ros.scene.scene import LARGEST, Scene
 from sst_ros.state import Vector3
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"

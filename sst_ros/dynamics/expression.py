@@ -15,8 +15,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
-from types import SimpleNamespace
 from typing import Any, NamedTuple
+
+from sst_ros.scene.schema import Place
+from sst_ros.scene.yaml_document import rebuild
 
 Value = Any  # an Expression, a Number or a float
 
@@ -302,22 +304,16 @@ def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Pr
     return with_jacobian(function, inputs, ())
 
 
-def number_constants(value: Any, origin: tuple[str | int, ...] = ()) -> Any:
+def number_constants(value: Any, origin: Place = ()) -> Any:
     """Return a tree of constants with a Number for each that is neither 0 nor 1 nor -1.
 
     Its sections become objects that are not checked.
     """
-    if isinstance(value, float):
-        return value if value in (0.0, 1.0, -1.0) else Number(value, origin)
-    if value is None or isinstance(value, (Expression, str)):
-        return value
-    if isinstance(value, tuple):
-        parts = [number_constants(part, (*origin, i)) for i, part in enumerate(value)]
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-    fields = vars(value).items()
-    return SimpleNamespace(
-        **{name: number_constants(part, (*origin, name)) for name, part in fields}
-    )
+
+    def number(place: Place, x: float) -> float:
+        return x if x in (0.0, 1.0, -1.0) else Number(x, (*origin, *place))
+
+    return rebuild(value, number)
 
 
 def with_jacobian(

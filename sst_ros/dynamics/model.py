@@ -216,11 +216,6 @@ class Limit(NamedTuple):
     sign: float
     end: Any
 
-    @property
-    def leg(self) -> int:
-        """Leg of the joint, 0 to 2."""
-        return self.joint % 3
-
     def distance(self, joints: Sequence[float]) -> float:
         """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
         distance: float = self.sign * (joints[self.joint] - self.end)

@@ -14,7 +14,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Program, number_constants, trace, with_jacobian
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.scene import Scene
 
 FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
 Function = Callable[..., tuple[float, ...]]
@@ -264,8 +265,7 @@ def compile_program(program: Program) -> Function:
 def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element."""
     names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
-    names |= {"atan2": np.arctan2, "max": np.maximum}
-    return _compile(program, names)
+    return _compile(program, names | {"atan2": np.arctan2, "max": np.maximum})
 
 
 def _compile(program: Program, names: dict[str, Any]) -> Function:

@@ -132,7 +132,7 @@ def limit_distances(
     rows = rotation_rows((x, y, z, w))
     legs = [leg_motion(leg, rows, (rate[0], rate[1], rate[2])) for leg in model.legs]
     pairs = [
-        _distance(limit, *end, legs[limit.leg], model.legs[limit.leg])
+        _distance(limit, *end, legs[limit.joint % 3], model.legs[limit.joint % 3])
         for limit, end in zip(limits, ends, strict=True)
     ]
     return tuple(pair[0] for pair in pairs) + tuple(pair[1] for pair in pairs)

@@ -27,7 +27,8 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.integration.events import limit_distances
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import LARGEST, SMALLEST, Scene, SineTorque
+from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.scene import LARGEST, SMALLEST, Scene
 from sst_ros.scene.schema import Place, Spec
 from sst_ros.scene.yaml_document import (
     NO_NUMBER,
@@ -307,7 +308,7 @@ class ParametricModel:
             for entry in inputs
         ]
         numbers: dict[Any, Any] = self._fixed | dict(zip(self._varied, given, strict=True))
-        tree: Constants = rebuild(self._tree, numbers)
+        tree: Constants = rebuild(self._tree, lambda place, _: numbers[place])
         return tree
 
     def _numbers(self, scenarios: Scenarios) -> tuple[Constants, dict[Place, Any]]:

@@ -41,7 +41,8 @@ from sst_ros.integration.events import (
 )
 from sst_ros.integration.methods import DOP853, RK4
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS, Vector3
 
 _ROUNDING = 64 * 2.220446049250313e-16

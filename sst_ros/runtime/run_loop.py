@@ -21,7 +21,8 @@ from sst_ros.errors import RunStopped, SstError
 from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.tick_loop import NoAnswer, RunOutput, TickLoop
 from sst_ros.runtime.torque_input import TorqueInput
-from sst_ros.scene.scene import Initial, Scene
+from sst_ros.scene.loads import Initial
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 

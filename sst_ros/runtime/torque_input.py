@@ -10,8 +10,7 @@ from typing import Any, Protocol
 
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import RunSettings
-from sst_ros.scene.loads import JOINTS
-from sst_ros.scene.scene import Actuators
+from sst_ros.scene.loads import JOINTS, Actuators
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, Vector3, clamp, finite_vector, nanoseconds
 

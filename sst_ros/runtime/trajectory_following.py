@@ -31,7 +31,8 @@ from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.scene import Actuators, Scene
+from sst_ros.scene.loads import Actuators
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.bodies import Base, Inertia, Link, Payload, Star
+from sst_ros.scene.bodies import Base, Link, Payload, Star
 from sst_ros.scene.loads import (
     Actuators,
     DesiredMotion,
-    Friction,
     Gravity,
     Initial,
     JointFriction,
@@ -50,30 +49,6 @@ _BODIES = (
     ("star", None),
     *((name, k) for name in ("actuated_links", "intermediate_links") for k in range(3)),
 )
-
-__all__ = [
-    "Actuators",
-    "Base",
-    "DesiredMotion",
-    "Friction",
-    "Gravity",
-    "Inertia",
-    "Initial",
-    "JointFriction",
-    "Link",
-    "Moment",
-    "Payload",
-    "Scene",
-    "SineTorque",
-    "Spring",
-    "Star",
-    "Stroke",
-    "Workspace",
-    "load",
-    "names",
-    "share_directory",
-    "text_of",
-]
 
 
 @dataclass(frozen=True)

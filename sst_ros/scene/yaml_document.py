@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
@@ -85,7 +85,14 @@ def read(cls: type[S], source: str, origin: str) -> S:
         raise InputError(origin, [Problem("", reason, "must be YAML", line)]) from None
     lines: dict[str, int] = {}
     problems: list[Problem] = []
-    return build(cls, _values(node, "", lines, problems), origin, lines=lines, known=problems)
+    result = _build(cls, _values(node, "", lines, problems), "", problems, of_row=False)
+    if problems or result is None:
+        placed = (
+            one if one.line else dataclasses.replace(one, line=line_at(lines, one.key))
+            for one in problems
+        )
+        raise InputError(origin, sorted(placed, key=lambda problem: problem.line or 0))
+    return result
 
 
 def dump(document: Section) -> str:
@@ -231,16 +238,7 @@ def broken_rows(cls: type[Section], columns: Any) -> Any:
     return broken
 
 
-def build(
-    cls: type[S],
-    values: Any,
-    origin: str,
-    *,
-    path: str = "",
-    of_row: bool = False,
-    lines: Mapping[str, int] | None = None,
-    known: Sequence[Problem] = (),
-) -> S:
+def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: bool = False) -> S:
     """Build a section from nested dicts and lists.
 
     Args:
@@ -250,23 +248,16 @@ def build(
         path: key of the section in a larger document, for messages.
         of_row: leave out what has no effect, as a friction whose coefficients are zero; a document
             that says such a thing is refused.
-        lines: of keys, for messages.
-        known: problems that were found before.
 
     Raises:
         InputError: lists every fault.
 
     """
-    problems = list(known)
+    problems: list[Problem] = []
     result = _build(cls, plain(values), path, problems, of_row)
-    if not problems and result is not None:
-        return result
-    if lines is not None:
-        problems = [
-            one if one.line else dataclasses.replace(one, line=line_at(lines, one.key))
-            for one in problems
-        ]
-    raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
+    if problems or result is None:
+        raise InputError(origin, problems)
+    return result
 
 
 def line_at(lines: Mapping[str, int], key: str) -> int | None:
@@ -367,11 +358,14 @@ def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
         yield from leaves(entry, (*place, name))
 
 
-def rebuild(tree: Any, numbers: Mapping[Place, Any], place: Place = ()) -> Any:
-    """Return a tree with other numbers; its sections are objects that are not checked."""
+def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -> Any:
+    """Return a tree with other numbers or columns; its sections are objects that are not checked.
+
+    `change` gives the new number for a place and what is there.
+    """
     if isinstance(tree, (float, np.ndarray)):
-        return numbers[place]
-    parts = {name: rebuild(entry, numbers, (*place, name)) for name, entry in _entries(tree)}
+        return change(place, tree)
+    parts = {name: rebuild(entry, change, (*place, name)) for name, entry in _entries(tree)}
     if isinstance(tree, tuple):
         entries = parts.values()
         return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)

@@ -19,7 +19,8 @@ from sst_ros.integration.events import first_event, limit_distances
 from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion, tables
 from sst_ros.integration.propagator import orientation_distance
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.scene import Scene, SineTorque
+from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate_steps import Task
 from sst_ros.simulation.simulation import start_of
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile

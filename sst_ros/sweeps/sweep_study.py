@@ -19,7 +19,8 @@ from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.scene import Scene, SineTorque, scene_of
+from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Section, anything, choice, integer, number, section, specs, texts
 from sst_ros.scene.yaml_document import build, plain, values_of
 from sst_ros.state import QUANTITIES, finite_vector

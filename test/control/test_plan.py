@@ -25,18 +25,21 @@ from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.loads import DesiredMotion, Spiral, Sweep, ToAngles, ToOrientation
-from sst_ros.scene.scene import (
+from sst_ros.scene.loads import (
     Actuators,
+    DesiredMotion,
     Friction,
     Initial,
     JointFriction,
+    Spiral,
     Spring,
     Stroke,
+    Sweep,
+    ToAngles,
+    ToOrientation,
     Workspace,
-    load,
-    text_of,
 )
+from sst_ros.scene.scene import load, text_of
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.simulation.torque_profile import TorqueTable
 

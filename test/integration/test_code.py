@@ -16,7 +16,9 @@ from loaded_scenes import IGNORE, REST, start_of
 
 from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import code_is_there, make_code
-from sst_ros.scene.scene import Inertia, Initial, load
+from sst_ros.scene.bodies import Inertia
+from sst_ros.scene.loads import Initial
+from sst_ros.scene.scene import load
 from sst_ros.simulation.simulate_gauss import GaussMotion
 from sst_ros.simulation.simulation import Simulation
 

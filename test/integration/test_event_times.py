@@ -22,7 +22,9 @@ from sst_ros.integration.events import first_crossing
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Friction, Initial, JointFriction, Link, Stroke, Workspace, load
+from sst_ros.scene.bodies import Link
+from sst_ros.scene.loads import Friction, Initial, JointFriction, Stroke, Workspace
+from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")
