@@ -12,13 +12,15 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from sst_ros.scene.schema import Place
-from sst_ros.scene.yaml_document import rebuild
+import numpy as np
+
+from sst_ros.scene.schema import Place, Section
 
 Value = Any  # an Expression, a Number or a float
 
@@ -314,6 +316,34 @@ def number_constants(value: Any, origin: Place = ()) -> Any:
         return x if x in (0.0, 1.0, -1.0) else Number(x, (*origin, *place))
 
     return rebuild(value, number)
+
+
+def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Yield the place of each number or column of a tree, and what is there."""
+    if isinstance(tree, (float, np.ndarray)):
+        yield place, tree
+    for name, entry in _entries(tree):
+        yield from leaves(entry, (*place, name))
+
+
+def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -> Any:
+    """Return a tree with other numbers or columns; its sections are objects that are not checked.
+
+    `change` gives the new number for a place and what is there.
+    """
+    if isinstance(tree, (float, np.ndarray)):
+        return change(place, tree)
+    parts = {name: rebuild(entry, change, (*place, name)) for name, entry in _entries(tree)}
+    if isinstance(tree, tuple):
+        entries = parts.values()
+        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
+    return SimpleNamespace(**parts) if parts else tree
+
+
+def _entries(tree: Any) -> list[tuple[Any, Any]]:
+    if isinstance(tree, tuple):
+        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
+    return list(vars(tree).items()) if isinstance(tree, (Section, SimpleNamespace)) else []
 
 
 def with_jacobian(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, Program, trace
+from sst_ros.dynamics.expression import Expression, Program, leaves, rebuild, trace
 from sst_ros.dynamics.model import Limit, damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
 from sst_ros.errors import InputError, Problem
@@ -35,9 +35,7 @@ from sst_ros.scene.yaml_document import (
     broken_rows,
     build,
     find_fields,
-    leaves,
     open_values,
-    rebuild,
     replace_values,
     values_of,
 )

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A document as YAML text, as nested values, and as a tree of numbers with keys.
+"""A document as YAML text, as nested values, and as numbers with keys.
 
 Text is read into nested dicts and lists, which are built into a checked `Section`, and back; every
 fault has its key and its line. A key is "star.inertia.zz" or "springs[0].rest"; a list without an
-index means all of its entries. A tree is a section, or an object like it that is not checked, whose
-numbers may be symbols, or columns of many scenarios.
+index means all of its entries.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
@@ -348,34 +347,6 @@ def split(key: str) -> list[tuple[str, int | None]]:
             raise ValueError(word)
         found.append((parts[1], None if parts[2] is None else int(parts[2])))
     return found
-
-
-def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the place of each number or column of a tree, and what is there."""
-    if isinstance(tree, (float, np.ndarray)):
-        yield place, tree
-    for name, entry in _entries(tree):
-        yield from leaves(entry, (*place, name))
-
-
-def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -> Any:
-    """Return a tree with other numbers or columns; its sections are objects that are not checked.
-
-    `change` gives the new number for a place and what is there.
-    """
-    if isinstance(tree, (float, np.ndarray)):
-        return change(place, tree)
-    parts = {name: rebuild(entry, change, (*place, name)) for name, entry in _entries(tree)}
-    if isinstance(tree, tuple):
-        entries = parts.values()
-        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
-    return SimpleNamespace(**parts) if parts else tree
-
-
-def _entries(tree: Any) -> list[tuple[Any, Any]]:
-    if isinstance(tree, tuple):
-        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
-    return list(vars(tree).items()) if isinstance(tree, (Section, SimpleNamespace)) else []
 
 
 def find_fields(
