@@ -15,8 +15,9 @@ from sst_ros.errors import Diverged, InputError, RunStopped, StepBudgetExceeded,
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
-from sst_ros.scene.loads import Friction, JointFriction
-from sst_ros.scene.scene import Inertia, Initial, Link, Workspace, load
+from sst_ros.scene.bodies import Inertia, Link
+from sst_ros.scene.loads import Friction, Initial, JointFriction, Workspace
+from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")

@@ -23,7 +23,8 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, ode_with_work
 from sst_ros.integration import codegen, gauss
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
-from sst_ros.scene.scene import Friction, JointFriction, load
+from sst_ros.scene.loads import Friction, JointFriction
+from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section
 
 DRIVE = (3.0, -2.0, 1.0)
