@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error estimate of simulate() where a motion is not smooth, against far finer solutions."""
 
-import math
-
 import numpy as np
 import pytest
 
 from sst_ros import TorqueTable, load_scene, simulate
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.torque_profile import PolynomialTorque
 
@@ -15,15 +14,10 @@ SINE = SineTorque(amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0
 STEPPED = ("rk4", "dopri5", "dop853", "rodas4")
 
 
-def angle(one, other):
-    near = min(math.dist(one, other), math.dist(one, -np.asarray(other)))
-    return 2.0 * near
-
-
 def check(truth, **arguments):
     """The run meets its tolerance, and its estimate holds, is not far too large, and says so."""
     found = simulate(**arguments)
-    error = angle(found.quaternion[-1], truth.quaternion[-1])
+    error = angle_between(found.quaternion[-1], truth.quaternion[-1])
     assert found.success, found.message
     assert error <= arguments["tolerance"]
     assert found.error_estimate <= arguments["tolerance"]
@@ -105,8 +99,8 @@ def test_breakpoints_of_a_table_are_not_rounded_to_nanoseconds():
 
     other = simulate(torque=same, breaks=times[1:], method="dopri5", **arguments)
     rounded = simulate(torque=TorqueTable(times.round(9), torques), method="dop853", **arguments)
-    assert angle(found.quaternion[-1], other.quaternion[-1]) < 1e-12
-    assert angle(found.quaternion[-1], rounded.quaternion[-1]) > 1e-10
+    assert angle_between(found.quaternion[-1], other.quaternion[-1]) < 1e-12
+    assert angle_between(found.quaternion[-1], rounded.quaternion[-1]) > 1e-10
 
 
 def test_a_tolerance_that_is_not_met_is_said():
@@ -125,7 +119,7 @@ def test_samples_do_not_change_the_motion(method):
         assert one.quaternion[-1].tobytes() == ends[0].quaternion[-1].tobytes()
         assert one.error_estimate == ends[0].error_estimate
     few, finer = ends[3], simulate(EXAMPLE2, jumping, 0.4, t_eval=ends[3].t, tolerance=1e-11)
-    assert max(map(angle, few.quaternion, finer.quaternion)) < 1e-7
+    assert max(map(angle_between, few.quaternion, finer.quaternion)) < 1e-7
 
 
 def test_nine_samples_cost_little_more_than_none():
@@ -166,7 +160,7 @@ def test_auto_is_implicit_under_a_stiff_feedback():
     assert "rodas4" in found.method
     explicit = simulate(scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5], method="dopri5")
     assert found.evaluations < 0.5 * explicit.evaluations
-    assert angle(found.quaternion[-1], explicit.quaternion[-1]) < 2e-6
+    assert angle_between(found.quaternion[-1], explicit.quaternion[-1]) < 2e-6
 
 
 @pytest.mark.parametrize(

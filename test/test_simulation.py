@@ -37,15 +37,16 @@ def energy(simulation):
     return kinetic_energy(model, (*state.quaternion, *state.body_rate))
 
 
-def run_until_stopped(simulation, torque, steps):
-    """Step by milliseconds; return the error that ends the run and the state before it."""
-    for _ in range(steps):
-        before = simulation.state
-        try:
+def end_of(scene, torque):
+    """Step by milliseconds; return the error that ends the run at the last valid state."""
+    simulation = Simulation(scene)
+    with pytest.raises(RunStopped) as caught:
+        for _ in range(1000):
+            before = simulation.state
             simulation.step(torque, MILLISECOND)
-        except RunStopped as error:
-            return error, before
-    raise AssertionError("the run did not stop")
+    assert caught.value.state is before is simulation.state
+    assert 0.0 <= caught.value.time - before.time_ns / 1e9 <= 1e-3
+    return caught.value
 
 
 @pytest.mark.parametrize("driven", [False, True])
@@ -117,27 +118,17 @@ def test_the_quaternion_stays_of_unit_length():
 
 @pytest.mark.parametrize(("leg", "sign"), [(0, -1.0), (1, -1.0), (2, -1.0), (1, 1.0), (2, 1.0)])
 def test_each_end_of_each_stroke_stops_the_run(leg, sign):
-    torque = [0.0] * 3
-    torque[leg] = 5.0 * sign
-    scene = replace(EXAMPLE2, workspace=Workspace(at_edge="ignore"))
-    simulation = Simulation(scene)
-    error, before = run_until_stopped(simulation, tuple(torque), 1000)
-    end = "< 0" if sign < 0 else r"> 1.570796 rad"
+    torque = tuple(5.0 * sign * (k == leg) for k in range(3))
+    error = end_of(replace(EXAMPLE2, workspace=Workspace(at_edge="ignore")), torque)
     assert isinstance(error, StrokeExceeded)
-    assert error.reason == f"gamma_{leg + 1} {end}"
-    assert error.state is before is simulation.state
-    assert before.time_ns / 1e9 <= error.time <= before.time_ns / 1e9 + 1e-3
+    assert error.reason == f"gamma_{leg + 1} {'< 0' if sign < 0 else '> 1.570796 rad'}"
 
 
 def test_the_largest_beta_stops_the_run():
-    scene = replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0))
-    simulation = Simulation(scene)
-    error, before = run_until_stopped(simulation, scene.torque.at, 1000)
+    error = end_of(replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0)), EXAMPLE2.torque.at)
     assert isinstance(error, WorkspaceLeft)
-    assert error.reason.endswith("> 0.698132 rad")
-    assert error.reason.startswith("beta_")
-    assert max(before.joints.beta) < np.radians(40.0)
-    assert error.state is before
+    assert error.reason.startswith("beta_") and error.reason.endswith("> 0.698132 rad")
+    assert max(error.state.joints.beta) < np.radians(40.0)
 
 
 @pytest.mark.parametrize("push", [1e308, -1e308], ids=str)

@@ -142,27 +142,24 @@ PROFILES = {
 }
 
 
-@pytest.mark.parametrize("torque", PROFILES.values(), ids=PROFILES)
-def test_between_samples_it_is_as_accurate_as_at_them(torque):
+LIMITED = replace(EXAMPLE2, actuators=Actuators(torque_limit=0.5))
+CASES = {name: (EXAMPLE2, torque) for name, torque in PROFILES.items()}
+CASES["clamped"] = (LIMITED, TorqueTable([0.0, 0.03], [[2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]]))
+
+
+@pytest.mark.parametrize(("scene", "torque"), CASES.values(), ids=CASES)
+def test_between_samples_it_is_as_accurate_as_at_them(scene, torque):
     times = [0.0123, 0.0717, 0.1001, 0.1777]
-    coarse = simulate(EXAMPLE2, torque, 0.2, t_eval=np.linspace(0.0, 0.2, 6), tolerance=1e-12)
-    direct = simulate(EXAMPLE2, torque, 0.2, t_eval=times, tolerance=1e-12)
+    coarse, direct = (
+        simulate(scene, torque, 0.2, t_eval=at, tolerance=1e-12)
+        for at in (np.linspace(0.0, 0.2, 6), times)
+    )
     found = coarse.at(times)
     np.testing.assert_allclose(found.quaternion, direct.quaternion, rtol=0, atol=1e-11)
     np.testing.assert_allclose(found.body_rate, direct.body_rate, rtol=0, atol=1e-10)
     np.testing.assert_allclose(found.torque, direct.torque, rtol=0, atol=1e-12)
     with pytest.raises(InputError, match=r"must be times from 0 to 0.2"):
         coarse.at(0.3)
-
-
-def test_between_samples_the_actuators_clamp_as_at_them():
-    scene = replace(EXAMPLE2, actuators=Actuators(torque_limit=0.5))
-    table = TorqueTable([0.0, 0.03], [[2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]])
-    coarse, fine = (
-        simulate(scene, table, 0.05, t_eval=np.linspace(0.0, 0.05, samples), tolerance=1e-12)
-        for samples in (3, 11)
-    )
-    np.testing.assert_allclose(coarse.at(fine.t).quaternion, fine.quaternion, rtol=0, atol=1e-11)
 
 
 def test_samples_under_held_torques_need_nothing_else():

@@ -59,10 +59,10 @@ RANGES = {
 """Factors of what the document says, and whether zero is allowed too."""
 
 LOADED = dataclasses.replace(
-    loaded(), stroke=load_scene("elastic_stops").stroke, torque=EXAMPLE2.torque
-)
-LOADED = dataclasses.replace(
-    LOADED, actuators=dataclasses.replace(LOADED.actuators, torque_limit=None)
+    loaded(),
+    stroke=load_scene("elastic_stops").stroke,
+    torque=EXAMPLE2.torque,
+    actuators=dataclasses.replace(loaded().actuators, torque_limit=None),
 )
 
 

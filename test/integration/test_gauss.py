@@ -17,6 +17,7 @@ from sst_ros.errors import InputError
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation, tables
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.propagator import orientation_distance as apart
 from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
 
@@ -52,10 +53,6 @@ def solved(method, *at, **options):
     """Last change of a motion, and the state at its end."""
     motion = method.prepare(*at, **options)
     return motion.run(), motion.end
-
-
-def apart(y, truth):
-    return 2.0 * min(math.dist(y[:4], truth[:4]), math.dist(y[:4], -truth[:4]))
 
 
 @pytest.mark.parametrize(

@@ -176,18 +176,6 @@ def test_estimate_bounds_the_true_error_of_each_step(tableau, steps):
         y = moved
 
 
-@every_method
-def test_times_of_the_stages_are_those_of_the_nodes(tableau):
-    seen = []
-
-    def derivative(t, *y):
-        seen.append(t)
-        return 0.0, 0.0
-
-    assert stepper(tableau, derivative, 2)(2.0, 0.5, (1.0, 2.0)) == ((1.0, 2.0), 0.0)
-    np.testing.assert_allclose(seen, 2.0 + 0.5 * np.array(tableau.c), rtol=1e-15)
-
-
 # RODAS4: L-stable, stiffly accurate, of order 4 for any system.
 
 
