@@ -17,10 +17,10 @@ def main(arguments: list[str] | None = None) -> int:
     if given and given[0] in NODES:
         signals.handle()
     try:
-        from sst_ros.cli.main import run
+        from sst_ros.cli.main import run_command
     except KeyboardInterrupt:
         return 130
-    return run(given)
+    return run_command(given)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from programs import python
 
 from sst_ros.__main__ import main
 from sst_ros.cli.commands import COMMANDS, NODES, function, parser
+from sst_ros.extras import EXTRAS
 from sst_ros.simulation.trajectory import Trajectory
 
 BLOCKED = """
@@ -157,42 +158,29 @@ def test_output_that_is_not_taken_is_no_traceback(reader, said):
     assert done.stderr == said
 
 
+NEEDED = {
+    "rclpy": [*NODES, "demo", "demo feedforward"],
+    "rosbags": ["export bag", "export bag --format parquet", "recover bag"],
+    "rosbags|matplotlib": ["report run bag", "report accuracy", "plot bag", "plot --list"],
+    "matplotlib": ["workspace example2", "simulate example2 --plot"],
+    "pyarrow": ["simulate example2 --out x.parquet"],
+    "viser": ["view bag", "view --scene swing"],
+    "numba": ["compile"],
+}
+
+
 @pytest.mark.parametrize(
-    ("words", "module", "extra"),
-    [
-        (["simulator"], "rclpy", "ros"),
-        (["torque_player"], "rclpy", "ros"),
-        (["inverse_dynamics"], "rclpy", "ros"),
-        (["recorder"], "rclpy", "ros"),
-        (["viewer"], "rclpy", "ros"),
-        (["demo"], "rclpy", "ros"),
-        (["demo", "feedforward"], "rclpy", "ros"),
-        (["export", "bag"], "rosbags", "record"),
-        (["export", "bag", "--format", "parquet"], "rosbags", "record"),
-        (["recover", "bag"], "rosbags", "record"),
-        (["report", "run", "bag"], "rosbags|matplotlib", "record|plot"),
-        (["report", "accuracy"], "rosbags|matplotlib", "record|plot"),
-        (["plot", "bag"], "rosbags|matplotlib", "record|plot"),
-        (["plot", "--list"], "rosbags|matplotlib", "record|plot"),
-        (["workspace", "example2"], "matplotlib", "plot"),
-        (["simulate", "example2", "--plot"], "matplotlib", "plot"),
-        (["simulate", "example2", "--out", "x.parquet"], "pyarrow", "record"),
-        (["view", "bag"], "viser", "view"),
-        (["view", "--scene", "swing"], "viser", "view"),
-        (["compile"], "numba", "fast"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+    ("line", "modules"), [(line, name) for name, lines in NEEDED.items() for line in lines]
 )
-def test_what_needs_an_extra_says_which(words, module, extra, tmp_path):
+def test_what_needs_an_extra_says_which(line, modules, tmp_path):
     """After a plain installation, every path ends in the line that says what to install."""
-    done = python(BLOCKED.format(names=OPTIONAL, commands=[words]), status=1, cwd=tmp_path)
-    assert done.stderr.count("\n") == 1, done.stderr
-    found = [
-        name
-        for name, brings in zip(module.split("|"), extra.split("|"), strict=True)
-        if f"{name} is not installed: " in done.stderr and f"sst_ros[{brings}]'" in done.stderr
-    ]
-    assert found, done.stderr
+    program = BLOCKED.format(names=OPTIONAL, commands=[line.split()])
+    said = python(program, status=1, cwd=tmp_path).stderr
+    assert said.count("\n") == 1, said
+    assert any(
+        f"{name} is not installed: " in said and f"sst_ros[{EXTRAS.get(name, 'ros')}]'" in said
+        for name in modules.split("|")
+    ), said
     assert not list(tmp_path.iterdir())
 
 

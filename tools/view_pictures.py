@@ -28,7 +28,7 @@ from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing
 from sst_ros.view.server import PageServer
-from sst_ros.view.source import ViewState, simulator
+from sst_ros.view.source import ViewState, run_simulator
 from tools.browser import Browser, browse
 
 SCENE = "example2"
@@ -117,7 +117,7 @@ def film(path: Path) -> None:
     """
     command = [sys.executable, "-m", "sst_ros", "view"]
     with (
-        simulator(FILMED, SLOW),
+        run_simulator(FILMED, SLOW),
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
     ):
         try:

@@ -15,7 +15,7 @@ from sst_ros.extras import explanation, require
 FAILED, BUG, INTERRUPTED = 1, 3, 130
 
 
-def run(words: list[str]) -> int:
+def run_command(words: list[str]) -> int:
     """Run a command or a node; return the exit status. Errors are one line on stderr."""
     debug, words = _without_debug(words)
     try:

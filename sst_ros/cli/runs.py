@@ -30,7 +30,7 @@ from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.yaml_document import line_of, read
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import INTEGRATORS, Simulation
-from sst_ros.view.source import Replay, simulator
+from sst_ros.view.source import Replay, run_simulator
 
 PICTURES = (".png", ".pdf", ".svg")
 MOST_SAMPLES = 10_000_000
@@ -184,7 +184,7 @@ def view(options: argparse.Namespace) -> int:
         load(options.scene)  # refused before a process of its own would be
     given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
     words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace}"]
-    with simulator(options.scene) if options.scene else contextlib.nullcontext():
+    with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
         status: int = function("nodes.process:run")([*words, *child_process.words(given)])
     return status
 

@@ -308,7 +308,12 @@ class Recording:
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
         self.ticks = _ticks(self.path, ticks, self.start_ns)
-        self.commands = _commands(found)
+        # The commands of both topics in order of their reception.
+        parts = [_rows(found, table) for table in (COMMANDS, STAMPED_COMMANDS)]
+        order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
+        names = ("stamp_ns", "received_ns", "values")
+        columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
+        self.commands = Series(COMMANDS.columns, *columns)
 
     @property
     def period_ns(self) -> int:
@@ -453,15 +458,6 @@ def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
     moment = series.values[:, 4:]
     known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
     return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
-
-
-def _commands(found: Signals) -> Series:
-    """Put the commands of both topics in order of their reception."""
-    parts = [_rows(found, table) for table in (COMMANDS, STAMPED_COMMANDS)]
-    order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
-    names = ("stamp_ns", "received_ns", "values")
-    columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
-    return Series(COMMANDS.columns, *columns)
 
 
 def _usual(lengths_ns: Integers) -> int:

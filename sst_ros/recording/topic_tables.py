@@ -215,16 +215,14 @@ def _read_ticks(message: Any) -> Rows:
     start = nanoseconds(message.header.stamp)
     if not start:
         return []
-    names = tuple(message.joint_names)
-    at, moments = [0, 1, 2], []
-    if names:
-        at = _places(ACTUATED, names)
-        moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
+    names = tuple(message.joint_names) or ACTUATED
+    at = _places(ACTUATED, names)
+    moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
     rows: Rows = []
     end = start
     for point in message.points:
         effort = point.effort.tolist()
-        if len(effort) != max(3, len(names)):
+        if len(effort) != len(names):
             allowed = f"must be a torque for each actuator (stamp {start} ns)"
             raise InvalidMessage(effort, allowed)
         begin, end = end, start + nanoseconds(point.time_from_start)

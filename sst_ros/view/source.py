@@ -165,7 +165,7 @@ class Replay:
         self._since = now
 
 
-def simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
+def run_simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
     return child_process.run_beside(

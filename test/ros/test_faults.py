@@ -179,7 +179,7 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
 
 
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
-    looking = "from sst_ros.view.source import simulator\nwith simulator('swing'): input()"
+    looking = "from sst_ros.view.source import run_simulator\nwith run_simulator('swing'): input()"
     viewer = subprocess.Popen([sys.executable, "-c", looking], stdin=subprocess.PIPE)
     observer.until(lambda: "sst_simulator" in observer.node.get_node_names(), "simulator")
     (simulator,) = children(viewer)
