@@ -40,9 +40,8 @@ def browser():
         yield started
 
 
-@pytest.fixture
-def interpreted(monkeypatch):
-    """Batches and sweeps run by the interpreter, in narrow blocks: the text that numba compiles."""
+def interpret_batches(monkeypatch):
+    """Have batches and sweeps run by the interpreter, in narrow blocks: what numba compiles."""
     from sst_ros.sweeps import controlled_batch
 
     def load(texts, constants, **_):
@@ -53,6 +52,20 @@ def interpreted(monkeypatch):
         monkeypatch.setattr(module, "codegen", plain)
     for module in (batch, batch_source, controlled_batch):
         monkeypatch.setattr(module, "SIMD_WIDTH", 4)
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """Batches and sweeps are interpreted: to compile one takes 20 s of the processor."""
+    interpret_batches(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def interpreted_module():
+    """Batches and sweeps are interpreted in a whole module."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        interpret_batches(monkeypatch)
+        yield
 
 
 @pytest.fixture

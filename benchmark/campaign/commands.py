@@ -116,7 +116,7 @@ def command_lines(ledger: Ledger) -> None:
         (folder / "folder").mkdir()
         (folder / "empty.yaml").write_text("")
         (folder / "binary.yaml").write_bytes(os.urandom(300))
-        count = len(ledger.numbers(150, least=8))
+        count = len(ledger.numbers(150, least=4))
         for words in WRONG if ledger.share >= 1 else rng.sample(WRONG, min(len(WRONG), count)):
             sst_ros(ledger, words, folder=folder, fails=True)
         words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]

@@ -162,8 +162,7 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
 
 
-@pytest.mark.slow
-def test_rest_at_an_end_of_the_stroke_is_no_fault():
+def test_rest_at_an_end_of_the_stroke_is_no_fault(interpreted):
     """Rounding puts gamma_3 below 0 by 5e-16 rad; `Simulation` stays at rest there."""
     batch = Batch(EXAMPLE2)
     found = batch.run([(0.0,) * 3, (0.7, 0.7, 0.0)], REST, step=1e-3, count=10)
@@ -258,7 +257,7 @@ def test_the_result_has_the_quantities_of_simulate(changes, interpreted):
     np.testing.assert_allclose(found.kept.t, [[0.0] * 2, [0.05] * 2, [0.1] * 2], rtol=1e-15)
 
 
-def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
+def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation(interpreted):
     """The actuator turns near its end in the first of two steps, which end inside again."""
     scene = replace(EXAMPLE2, torque=None)
     depth = np.random.default_rng(5).uniform(3.2e-3, 4.8e-3, N)

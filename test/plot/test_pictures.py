@@ -148,7 +148,7 @@ def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2,
 
 
 def test_one_picture_may_be_asked_for(run, tmp_path, capsys, undrawn):
-    words = ["plot", str(run.path), "--out", str(tmp_path), "--only", "phase"]
+    words = ["plot", str(run.bag.path), "--out", str(tmp_path), "--only", "phase"]
     assert cli.main(words) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["phase.pdf", "phase.png"]
     assert cli.main(words) == 1
