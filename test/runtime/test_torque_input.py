@@ -66,12 +66,6 @@ def test_a_command_acts_from_the_tick_that_begins_after_its_arrival():
     assert bench.board.constant(now + 600_000_000)
 
 
-def test_names_may_come_in_any_order():
-    bench = Bench()
-    bench.stamped.append(stamped(5, [3.0, 1.0, 2.0], ["gamma_3", "gamma_1", "gamma_2"]))
-    assert bench.torque() == (1.0, 2.0, 3.0)
-
-
 @pytest.mark.parametrize(
     ("names", "effort", "kind"),
     [
