@@ -19,7 +19,7 @@ from sst_ros.dynamics.expression import Program
 from sst_ros.integration.codegen import combination
 from sst_ros.integration.events import GRAZING
 from sst_ros.integration.methods import Tableau
-from sst_ros.integration.simd_source import Layout, evaluated, indented, loop
+from sst_ros.integration.simd_source import Layout, evaluate_lanes, indent, loop
 
 SIMD_WIDTH = 32
 """Scenarios of a block; a multiple of what a vector unit takes, and all fit the cache."""
@@ -78,10 +78,10 @@ class SampledFeedback(NamedTuple):
         lines = [
             "sample = step // hold",
             *(_over_lanes(noise) if noise else ()),
-            *evaluated(self.program, given, at, "command"),
+            *evaluate_lanes(self.program, given, at, "command"),
             *loop(at, accepted),
         ]
-        return ["if step % hold == 0:", *indented(4, lines)]
+        return ["if step % hold == 0:", *indent(4, lines)]
 
     def store(self, at: Layout) -> list[str]:
         """Lines that keep the memory and the torques of lane i."""
@@ -109,7 +109,7 @@ def batch_source(
         size: numbers in the state.
         feedback: gives the first three numbers of the drive; none by default.
 
-    Of RK4, ten lines without those of `evaluated` and `crossings`:
+    Of RK4, ten lines without those of `evaluate_lanes` and `crossings`:
 
         def batch(h, first, count, begin, end, y, d, code, when, error):
             block = vector(4512)
@@ -157,20 +157,20 @@ def batch_source(
         "    for b in range(begin, end):",
         f"        lo = b * {SIMD_WIDTH}",
         f"        last = min({SIMD_WIDTH}, y.shape[1] - lo) - 1",
-        *indented(8, _over_lanes(load)),
-        *indented(8, feedback.load(at) if feedback else []),
-        *indented(8, evaluated(distances, [*at.rows("y", 7), *parameters], at, "was")),
+        *indent(8, _over_lanes(load)),
+        *indent(8, feedback.load(at) if feedback else []),
+        *indent(8, evaluate_lanes(distances, [*at.rows("y", 7), *parameters], at, "was")),
         "        for step in range(first, first + count):",
-        *indented(12, feedback.act(size, drive, at) if feedback else []),
+        *indent(12, feedback.act(size, drive, at) if feedback else []),
         f"            for stage in range({len(tableau.b)}):",
-        *indented(16, _by_stage(tableau, size, argument)),
-        *indented(16, ["time = step * h + NODES[stage] * h"]),
-        *indented(16, evaluated(program, given, at, "f")),
-        *indented(16, _by_stage(tableau, size, kept)),
-        *indented(12, _results(tableau, size, at)),
-        *indented(12, evaluated(distances, [*at.rows("new", 7), *parameters], at, "far")),
-        *indented(12, crossings(limits, at)),
-        *indented(12, _accepted(size, at)),
+        *indent(16, _by_stage(tableau, size, argument)),
+        *indent(16, ["time = step * h + NODES[stage] * h"]),
+        *indent(16, evaluate_lanes(program, given, at, "f")),
+        *indent(16, _by_stage(tableau, size, kept)),
+        *indent(12, _results(tableau, size, at)),
+        *indent(12, evaluate_lanes(distances, [*at.rows("new", 7), *parameters], at, "far")),
+        *indent(12, crossings(limits, at)),
+        *indent(12, _accept(size, at)),
         f"            for x in range({both}):",
         f"                {at.lane('was', 0, 'x')} = {at.lane('far', 0, 'x')}",
         "        for i in range(last + 1):",
@@ -178,14 +178,14 @@ def batch_source(
         f"            code[lo + i] = int({at.lane('code')})",
         f"            when[lo + i] = {at.lane('when')}",
         f"            error[lo + i] = {at.lane('error')}",
-        *indented(12, feedback.store(at) if feedback else []),
+        *indent(12, feedback.store(at) if feedback else []),
     ]
     return "\n".join(lines) + "\n"
 
 
 def _over_lanes(lines: list[str]) -> list[str]:
     """Put a loop over the scenarios n of a block; the last is repeated, for equal lengths."""
-    return [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indented(4, lines)]
+    return [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indent(4, lines)]
 
 
 def _by_stage(tableau: Tableau, size: int, line: Callable[[int], str]) -> list[str]:
@@ -226,7 +226,7 @@ def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
     return [*lines, *loop(at, [f"factor = 1.0 / sqrt({squares})", *scaled])]
 
 
-def _accepted(size: int, at: Layout) -> list[str]:
+def _accept(size: int, at: Layout) -> list[str]:
     """Accept the new state where it is valid; otherwise record why not, and when."""
     inside = [
         f"found = {at.lane('found')}",
@@ -334,5 +334,5 @@ def crossings(count: int, at: Layout) -> list[str]:
         "if hits > 0.0:",
         f"    for k in range({lanes}):",
         f"        if {at.lane('hit', 0, 'k')} > 0.0:",
-        *indented(12, search),
+        *indent(12, search),
     ]

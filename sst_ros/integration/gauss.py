@@ -26,7 +26,7 @@ from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
-from sst_ros.integration.simd_source import Layout, evaluated, flat_sin, indented, loop, split
+from sst_ros.integration.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, split
 from sst_ros.mechanism.geometry import Array
 
 HEAD = 3
@@ -252,7 +252,7 @@ def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None)
     def read(rows: range) -> list[str]:
         return [f"g{j}_{k} = {at.lane('f', j, k)}" for j in rows for k in range(nodes)]
 
-    def integrated(j: int) -> str:
+    def at_node(j: int) -> str:
         """State j at a node: short sums side by side take less time than a long one."""
         terms = [f"{at.lane('a', k)} * g{j}_{k}" for k in range(nodes)]
         sums = [f"({' + '.join(terms[k : k + 4])})" for k in range(0, nodes, 4)]
@@ -260,9 +260,9 @@ def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None)
 
     def kept(rows: range) -> list[str]:
         """Loop over few rows, for what it reads to find place in registers."""
-        return [*read(rows), *loop(at, [f"{at.lane('s', j)} = {integrated(j)}" for j in rows])]
+        return [*read(rows), *loop(at, [f"{at.lane('s', j)} = {at_node(j)}" for j in rows])]
 
-    def summed(j: int, text: str) -> str:
+    def weigh(j: int, text: str) -> str:
         """Weights times a text with lanes {f} and {old}, over the nodes."""
         return " + ".join(
             f"{at.lane('weight', 0, k)} * "
@@ -290,7 +290,7 @@ def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None)
         *loop(
             at,
             [
-                *(f"u{1 + j} = {integrated(j)}" for j in quaternion),
+                *(f"u{1 + j} = {at_node(j)}" for j in quaternion),
                 *(f"u{1 + j} = {at.lane('s', j)}" for j in rates),
                 *turn,
                 *(f"{at.lane('f', j)} = {result}" for j, result in enumerate(turned)),
@@ -320,7 +320,7 @@ def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None)
     checking = [] if limits is None else [
         *kept(range(2)),
         *kept(range(2, 4)),
-        *evaluated(limits, at.rows("s", 7), at, "far", slots),
+        *evaluate_lanes(limits, at.rows("s", 7), at, "far", slots),
         *loop(at, [nearer(m) for m in distances]),
     ]  # fmt: skip
     lines = [
@@ -329,19 +329,17 @@ def source(system: ODE, nodes: int, limits: Program | None, slots: Slots | None)
         *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
         *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
         *(f"    c{i} = {at.lane('numbers', 0, i)}" for i in range(count)),
-        *indented(
-            4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in distances] or ["pass"])
-        ),
+        *indent(4, loop(at, [f"{at.lane('least', m)} = INFINITE" for m in distances] or ["pass"])),
         *(f"    states[{j}] = y{j}" for j in everything),
         "    worst = 0.0",
         "    for step in range(count):",
         f"        begin = {at.lane('begin', 0, 0)} + step * h",
-        *indented(8, first),
+        *indent(8, first),
         "        for iteration in range(1, iterations):",
-        *indented(12, [*turning, *evaluating]),
-        *indented(8, [*turning, *checking]),
-        *(f"        worst = max(worst, abs({summed(j, '({f} - {old})')}))" for j in range(4, 7)),
-        *(f"        y{j} = y{j} + {summed(j, '{f}')}" for j in everything),
+        *indent(12, [*turning, *evaluating]),
+        *indent(8, [*turning, *checking]),
+        *(f"        worst = max(worst, abs({weigh(j, '({f} - {old})')}))" for j in range(4, 7)),
+        *(f"        y{j} = y{j} + {weigh(j, '{f}')}" for j in everything),
         "        factor = 1.0 / sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)",
         *(f"        y{j} = y{j} * factor" for j in quaternion),
         *(f"        states[{size} * step + {size + j}] = y{j}" for j in everything),

@@ -400,10 +400,10 @@ class TickPropagator(Propagator):
             drives = np.repeat(ticks.drives, parts, axis=0)
             limit = np.inf if self.torque.limit is None else self.torque.limit
             drives[:, :3] = np.clip(drives[:, :3], -limit, limit)
-        reached = self._reached(begin, length, drives, begins)
+        reached = self._follow_parts(begin, length, drives, begins)
         return np.asarray(reached[first + parts - 1])
 
-    def _reached(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:
+    def _follow_parts(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:
         reached: Any = np.full((len(length), 2, len(self.ode.state)), np.nan)
         given: Any = (length, drives, starts)
         if not self.compiled:

@@ -62,7 +62,7 @@ def split(
     return before, after, results
 
 
-def evaluated(
+def evaluate_lanes(
     program: Program, given: Sequence[str], at: Layout, out: str, slots: Slots | None = None
 ) -> list[str]:
     """Lines of a program over all lanes, its results in the rows of `out`.
@@ -92,10 +92,10 @@ def evaluated(
 
 def loop(at: Layout, body: list[str]) -> list[str]:
     """Put a loop over all lanes i around lines."""
-    return [f"for i in range({at.lanes}):", *indented(4, body)]
+    return [f"for i in range({at.lanes}):", *indent(4, body)]
 
 
-def indented(spaces: int, lines: list[str]) -> list[str]:
+def indent(spaces: int, lines: list[str]) -> list[str]:
     """Move lines to the right."""
     return [" " * spaces + line for line in lines]
 

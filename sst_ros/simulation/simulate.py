@@ -131,7 +131,7 @@ def prepare(
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
     span = _nanoseconds("duration", length)
-    period = _checked_period(control_period, profile, span)
+    period = _check_period(control_period, profile, span)
     times = _times(t_eval, span)
     if method not in METHODS:
         _refuse("method", method, "must be one of " + ", ".join(METHODS))
@@ -185,7 +185,7 @@ def _nanoseconds(name: str, value: Any) -> int:
     return round(seconds * NANOSECONDS)
 
 
-def _checked_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
+def _check_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
     if period is None:
         return None
     if not isinstance(profile, (FunctionTorque, FeedbackTorque)):

@@ -89,8 +89,8 @@ class GaussMotion:
         self._y, self._duration, self._finest = list(y), duration, finest
         self.count, self.iterations, self.error = self._settings(tolerance)
         self.h = duration / self.count
-        self._motion = self._prepared(self.count, self.iterations)
-        self._single = self._prepared(1, self.iterations + 1)
+        self._motion = self._prepare(self.count, self.iterations)
+        self._single = self._prepare(1, self.iterations + 1)
         self._lock = threading.Lock()
         self.samples = self.run()
 
@@ -166,7 +166,7 @@ class GaussMotion:
     def _joints(self, k: int, x: float) -> tuple[float, ...]:
         return self._dynamics.joints(*self._inside(k, x)[:7])
 
-    def _prepared(self, count: int, iterations: int) -> PreparedMotion:
+    def _prepare(self, count: int, iterations: int) -> PreparedMotion:
         return self._method.prepare(
             0.0, self._duration / count, count, self._y, self._drive, iterations=iterations
         )
@@ -202,7 +202,7 @@ class GaussMotion:
 
     def _end(self, count: int, iterations: int) -> list[float]:
         """State at the end by so many steps and iterations, nan where it is not finite."""
-        motion = self._prepared(count, iterations)
+        motion = self._prepare(count, iterations)
         try:
             change = motion.run()
         except (ArithmeticError, ValueError):
@@ -245,7 +245,7 @@ class CollocatedMotion:
     """
 
     def __init__(self, task: Task) -> None:
-        torque = _traced(task)
+        torque = _choose_torque(task)
         self._task, asked = task, task.method == GAUSS
         start = [*start_of(task.scene), *((0.0,) * 3 if task.scene.lags else ())]
         duration = task.span / NANOSECONDS
@@ -290,7 +290,7 @@ class CollocatedMotion:
         return Trajectory(self._task.scene, t, y[:, :4], y[:, 4:7], torque, **self._of_the_run)
 
 
-def _traced(task: Task) -> SineTorque | tuple[float, float, float]:
+def _choose_torque(task: Task) -> SineTorque | tuple[float, float, float]:
     """Return the torque that is traced into the code, or three that are constant.
 
     Raises:
