@@ -125,11 +125,11 @@ def made_on() -> dict[str, Any]:
 def processor() -> str:
     """Return the name of the processor."""
     try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8") as file:
-            names = (line.partition(":")[2] for line in file if line.startswith("model name"))
-            return next(names, "").strip() or platform.machine()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return platform.machine()
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.machine()
 
 
 def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:

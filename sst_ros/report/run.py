@@ -205,11 +205,10 @@ def summarise(
 def _read_diagnostics(run: Recording) -> dict[str, Any]:
     """Take numbers and texts from the last diagnostics of the simulator."""
     reported = run.diagnostics
-    texts = ("phase", "fault", "integrator")
     counts = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
     numbers = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
     return {
-        **{key: reported.get(key) for key in texts},
+        **{key: reported.get(key) for key in ("phase", "fault", "integrator")},
         **{key: _count(reported, key) for key in counts},
         **{key: _number(reported, key) for key in numbers},
         "simulator_error_estimate": _number(reported, "error_estimate"),

@@ -375,17 +375,17 @@ def _result(
 ) -> tuple[dict[str, Any], Array]:
     """Run one setting: its row of the grid, and its last state, nan for a failure."""
     states, evaluations, failure = np.full((1, len(problem.start)), np.nan), None, ""
-    wall = (0.0, 0.0)
+    least, median = 0.0, 0.0
     with np.errstate(all="ignore"):
         try:
             states, evaluations = setting.solve()
-            wall = _measure_time(setting.timed)
+            least, median = _measure_time(setting.timed)
         except (SstError, ArithmeticError, ValueError) as error:
             failure = str(error).splitlines()[0] if str(error) else "not finite"
     if not failure and not np.isfinite(states[:, :7]).all():
         failure = "not finite"
     row = {"method": setting.method, "kind": setting.kind, "setting": setting.setting}
-    row |= {"evaluations": evaluations, "wall_min_s": wall[0], "wall_median_s": wall[1]}
+    row |= {"evaluations": evaluations, "wall_min_s": least, "wall_median_s": median}
     if not failure:
         final, largest = problem.errors(states, truth.states)
         if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
@@ -399,6 +399,7 @@ def _result(
 
 
 def _measure_time(run: Callable[[], object]) -> tuple[float, float]:
+    """Shortest and median wall time of some runs [s]."""
     walls: list[float] = []
     while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
         began = time.perf_counter()
