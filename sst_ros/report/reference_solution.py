@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.errors import InputError, Problem, RunStopped
+from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -33,6 +33,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
 from sst_ros.report.step_advice import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
 from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
@@ -166,15 +167,10 @@ class InitialValueProblem:
         return result
 
     def _horizon(self) -> tuple[int, int, str]:
-        whole = self.scene.duration or WHOLE_RUN_S
-        simulation = Simulation(self.scene, tolerance=1e-9, step_budget=WHOLE_MOTION_BUDGET)
-        ends = ""
-        try:
-            for _ in range(100):
-                simulation.step(self.torque, round(whole / 100 * NANOSECONDS))
-        except RunStopped as stopped:
-            ends = f"stop at {stopped.time:.6f} s, {stopped.reason}"
-            whole = stopped.time
+        """Return interval [ns], count of intervals, and why the span ends early."""
+        motion = simulate(self.scene, duration=self.scene.duration or WHOLE_RUN_S)
+        whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
+        ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
         if whole * NANOSECONDS < 1000 * INTERVALS:
             allowed = f"the run is over before it can be studied: {ends or f'{whole} s'}"
             raise InputError(self.scene.name, [Problem("initial", whole, allowed)])
