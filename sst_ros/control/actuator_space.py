@@ -268,7 +268,12 @@ class OrientationObserver:
         """
         found = self._step(gamma)
         if found is None:
-            found = self._follow(gamma)
+            rotation = continuation.advance(
+                self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
+            )
+            x, y, z, w = quaternion_of(rotation).tolist()
+            found = (x, y, z, w)
+            self._sigma, _ = self._measures(found, gamma)
         self._quaternion, self._gamma = found, gamma
         return found
 
@@ -288,14 +293,6 @@ class OrientationObserver:
             return None
         self._sigma = next_sigma
         return found
-
-    def _follow(self, gamma: Vector3) -> Quaternion:
-        rotation = continuation.advance(
-            self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
-        )
-        x, y, z, w = quaternion_of(rotation).tolist()
-        self._sigma, _ = self._measures((x, y, z, w), gamma)
-        return x, y, z, w
 
     def _measures(self, quaternion: Quaternion, gamma: Vector3) -> tuple[float, float]:
         """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""

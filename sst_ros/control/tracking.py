@@ -90,7 +90,7 @@ class TrackingSums:
         self.samples = 0
         self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
         self._largest = np.zeros((2, 3))  # error, torque
-        self._range = np.array([np.full(3, np.inf), np.full(3, -np.inf)])
+        self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
         self._first = self._last = 0.0
         self._last_error = np.zeros(3)
         self._end: float | None = None
@@ -119,13 +119,8 @@ class TrackingSums:
         self._sums += [np.sum(part, axis=0) for part in parts]
         largest = error.max(axis=0), np.abs(torque).max(axis=0)
         self._largest = np.maximum(self._largest, largest)
-        lowest, highest = self._range
-        self._range = np.array(
-            [
-                np.minimum(lowest, track.gamma.min(axis=0)),
-                np.maximum(highest, track.gamma.max(axis=0)),
-            ]
-        )
+        self._lowest = np.minimum(self._lowest, track.gamma.min(axis=0))
+        self._highest = np.maximum(self._highest, track.gamma.max(axis=0))
         self._settle(track, largest_error <= self._band())
         self._first = self._first if self.samples else float(track.time[0])
         self._last, self._last_error = float(track.time[-1]), error[-1]
@@ -162,7 +157,7 @@ class TrackingSums:
         )
 
     def _band(self) -> float:
-        return BAND * float(np.max(self._range[1] - self._range[0]))
+        return BAND * float(np.max(self._highest - self._lowest))
 
     def _settle(self, track: TrackingRecord, inside: NDArray[np.bool_]) -> None:
         """Find the end of the motion, and since when the error has been inside the band."""

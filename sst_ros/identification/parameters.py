@@ -46,8 +46,7 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     if requested is None:
         return tuple(_own(scene))
     names: dict[str, None] = {}
-    problems = []
-    known = _all(scene)
+    problems, known = [], _all(scene)
     for begin in [requested] if isinstance(requested, str) else requested:
         found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
         if str(begin) in LINKS:  # the three alike
@@ -68,10 +67,8 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
 
 def bodies_of(names: Sequence[str]) -> Iterator[str]:
     """Yield the bodies, as "star" or "actuated_links[0]", whose whole inertia is in `names`."""
-    for body in dict.fromkeys(re.split(r"\.", name)[0] for name in names):
-        if f"{body}.inertia.xx" in names and all(
-            f"{body}.{part}" in names for part in STANDARD[4:]
-        ):
+    for body in dict.fromkeys(name.partition(".")[0] for name in names):
+        if all(f"{body}.{part}" in names for part in STANDARD[4:]):
             yield body
 
 
@@ -154,10 +151,10 @@ def _all(scene: Scene) -> list[str]:
     """Names that may be asked for: also separate links, friction not yet known, offsets."""
     names = list(_own(scene))
     for kind in LINKS:
-        links = getattr(scene, kind)
-        for k in range(3):
-            names += _body(f"{kind}[{k}]", links[k], scene)
-        names += _body(kind, links[0], scene)
+        first, second, third = getattr(scene, kind)
+        bodies = {f"{kind}[0]": first, f"{kind}[1]": second, f"{kind}[2]": third, kind: first}
+        for name, body in bodies.items():
+            names += _body(name, body, scene)
     for kind in JOINT_KINDS:
         names += (f"friction.{kind}.{part}" for part in ("viscous", "coulomb"))
     names += ("actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3)))
