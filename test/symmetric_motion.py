@@ -16,15 +16,12 @@ from __future__ import annotations
 import math
 
 from scipy.integrate import solve_ivp
+from scipy.optimize import newton
 
 from sst_ros.scene.scene import Scene
 
 HOME = math.pi / 4
 """gamma_k [rad] at x = 0: every carriage is in the middle of its side."""
-_TOLERANCE = 1e-13
-"""SciPy's tightest; the steps are shorter than it asks for, so that only rounding is left."""
-_STEPS = 50
-"""The secant converges in five steps; more means that there is no such motion."""
 
 
 def inertia(scene: Scene, x: float) -> float:
@@ -60,18 +57,18 @@ def drift_free_rate(scene: Scene) -> float:
         return y[1], push / inertia(scene, y[0])
 
     def drift(rate: float) -> float:
+        # SciPy's tightest; the steps are shorter than it asks for, so that only rounding is left.
         run = solve_ivp(
-            rates, (0.0, period), (0.0, rate), method="DOP853", rtol=_TOLERANCE, atol=1e-15,
+            rates,
+            (0.0, period),
+            (0.0, rate),
+            "DOP853",
+            rtol=1e-13,
+            atol=1e-15,
             max_step=period / 300,
-        )  # fmt: skip
+        )
         return float(run.y[0, -1])
 
     # For a constant inertia the rate is -amplitude cos(phase) / (frequency M1).
-    before = -amplitude * math.cos(phase) / (frequency * inertia(scene, 0.0))
-    rate, moved = 0.9 * before, drift(before)
-    for _ in range(_STEPS):
-        now = drift(rate)
-        if abs(now) < 1e-14 * period or now == moved:
-            return rate
-        before, moved, rate = rate, now, rate - now * (rate - before) / (now - moved)
-    raise AssertionError("no motion repeats itself")
+    near = -amplitude * math.cos(phase) / (frequency * inertia(scene, 0.0))
+    return float(newton(drift, near, x1=0.9 * near, tol=1e-13))  # the secant's last step

@@ -67,28 +67,21 @@ def test_bad_documents_are_refused_where_they_are_bad(key, value, path):
     assert [list(error.absolute_path) for error in errors] == [path]
 
 
+def keys(schema):
+    """Names and schemas of all keys."""
+    for name, entry in schema.get("properties", {}).items():
+        yield name, entry
+        yield from keys(entry)
+        yield from keys(entry.get("items", {}))
+
+
 def test_every_key_is_described_with_its_unit():
     friction = SCHEMA["properties"]["friction"]["properties"]["gamma"]["properties"]
     assert friction["viscous"]["description"] == "viscous coefficient [N m s/rad]"
     assert friction["smoothing"]["default"] == 0.01
-
-    def bare(schema):
-        for name, entry in schema.get("properties", {}).items():
-            if not entry.get("description"):
-                yield name
-            yield from bare(entry)
-            yield from bare(entry.get("items", {}))
-
-    assert list(bare(SCHEMA)) == []
+    assert [name for name, entry in keys(SCHEMA) if not entry.get("description")] == []
 
 
 def test_the_reference_names_every_key():
     said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
-
-    def all_keys(schema):
-        for name, entry in schema.get("properties", {}).items():
-            yield name
-            yield from all_keys(entry)
-            yield from all_keys(entry.get("items", {}))
-
-    assert [name for name in all_keys(SCHEMA) if f"| `{name}` |" not in said] == []
+    assert [name for name, _ in keys(SCHEMA) if f"| `{name}` |" not in said] == []

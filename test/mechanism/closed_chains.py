@@ -5,7 +5,6 @@ Random manipulators and states; all assemblies as the eight complex zeros of thr
 """
 
 from itertools import combinations, combinations_with_replacement, product
-from types import SimpleNamespace
 
 import numpy as np
 from lagrange import exact, solve
@@ -146,12 +145,6 @@ def complex_zeros(forms, seed=7):
     return q, gap
 
 
-def real_rotations(q, near=1e-9):
-    """Rotations (m, 3, 3) of those of the zeros (8, 4) that are real to `near`."""
-    real = np.abs(q.imag).max(axis=1) < near
-    return rotation_of(q.real[real])
-
-
 def exact_rotations(r, e, q, digits=50):
     """Refine eight zeros (8, 4) to `digits`, tell the real ones apart there, and give them.
 
@@ -197,7 +190,8 @@ def census(solve, geometries, gammas, hardest):
     """Compare `solve(geometry, gammas)` -> (owner, rotations, admissible) with the zeros.
 
     Configurations whose zeros are nearest to each other, or not real by least, are decided in 50
-    digits: at least `hardest` of them, and all with a gap below 1e-5.
+    digits: at least `hardest` of them, and all with a gap below 1e-5. Returns how many
+    configurations there were, assemblies that were missing and spurious, and the least gap.
     """
     r = np.concatenate([_carriages(g, x) for g, x in zip(geometries, gammas, strict=True)])
     e = np.concatenate(
@@ -208,7 +202,7 @@ def census(solve, geometries, gammas, hardest):
     doubtful = np.where(imaginary > 1e-10, imaginary, np.inf).min(axis=1)
     order = np.argsort(np.minimum(gap, doubtful))
     exact_rows = set(order[:hardest]) | set(np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0])
-    roots = admissible = missing = spurious = index = 0
+    missing = spurious = index = 0
     for geometry, gamma in zip(geometries, gammas, strict=True):
         owner, rotations, valid = solve(geometry, gamma)
         for row in range(len(gamma)):
@@ -216,21 +210,12 @@ def census(solve, geometries, gammas, hardest):
             if index in exact_rows:
                 expected = exact_rotations(r[index], e[index], zeros[index])
             else:
-                expected = real_rotations(zeros[index])
+                expected = rotation_of(zeros[index].real[imaginary[index] < 1e-9])
             lost, extra = same_rotations(rotations[mine], expected, 1e-9)
             expected_valid = sum(_admissible(geometry, r[index], one) for one in expected)
             assert expected_valid == int(np.sum(valid[mine])), (geometry, gamma[row])
-            roots, admissible = roots + len(expected), admissible + expected_valid
             missing, spurious, index = missing + lost, spurious + extra, index + 1
-    return SimpleNamespace(
-        configurations=index,
-        roots=roots,
-        admissible=admissible,
-        missing=missing,
-        spurious=spurious,
-        in_exact_numbers=len(exact_rows),
-        nearest=float(gap.min()),
-    )
+    return index, missing, spurious, float(gap.min())
 
 
 def _carriages(geometry, gamma):

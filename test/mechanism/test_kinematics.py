@@ -61,11 +61,12 @@ def general(count, rng):
     ("count", "hardest"), [(1000, 10), pytest.param(10_000, 200, marks=pytest.mark.slow)]
 )
 def test_the_assemblies_are_all_the_real_zeros(kind, count, hardest):
-    result = census(solve, *kind(count, np.random.default_rng(1)), hardest)
-    print(result)
-    assert result.configurations == count
-    assert result.nearest > 1e-6  # all eight complex zeros are known and distinct: none is missing
-    assert (result.missing, result.spurious) == (0, 0)
+    configurations, missing, spurious, gap = census(
+        solve, *kind(count, np.random.default_rng(1)), hardest
+    )
+    assert configurations == count
+    assert gap > 1e-6  # all eight complex zeros are known and distinct: none is missing
+    assert (missing, spurious) == (0, 0)
 
 
 def folds(count, seed):
@@ -221,13 +222,6 @@ def test_carriages_and_arcs_of_the_star_are_vectors_turned_about_axes(sample):
     np.testing.assert_allclose(ends, np.roll(geometry.v, -1, axis=0), atol=1e-15)
 
 
-def test_none_of_the_arrays_can_be_written_to():
-    assembly = kinematics.admissible(ISOTROPIC, [0.7, 0.8, 0.9])
-    for array in (ISOTROPIC.v, assembly.rotation, assembly.mu, assembly.beta):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
-
-
 # Which assembly is meant, and what is refused.
 
 
@@ -263,6 +257,9 @@ def test_ambiguity_is_told_with_all_candidates():
     with pytest.raises(AmbiguousAssembly, match=said) as caught:
         kinematics.admissible(geometry, gamma)
     one, two = caught.value.candidates
+    assert not (
+        one.rotation.flags.writeable or one.mu.flags.writeable or geometry.v.flags.writeable
+    )
     assert one.admissible
     assert two.admissible
     assert np.abs(one.rotation - two.rotation).max() > 1e-3

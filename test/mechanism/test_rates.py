@@ -37,17 +37,9 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
     rate, acceleration = sample.gamma_dot, sample.torque
     exact = Motion(Lagrange(sample.scene, sample.rotation), gamma, rate, acceleration)
     here = exact.here
-    omega, omega_dot, of_links, links_dot, joints, joints_dot = (
-        x.astype(float)
-        for x in (
-            exact.omega[0],
-            exact.omega_dot[0],
-            here.own(exact.omega)[1:],
-            here.own(exact.omega_dot)[1:],
-            exact.rates,
-            exact.accelerations,
-        )
-    )
+    omega, omega_dot = (x[0].astype(float) for x in (exact.omega, exact.omega_dot))
+    of_links, links_dot = (here.own(x)[1:].astype(float) for x in (exact.omega, exact.omega_dot))
+    joints, joints_dot = exact.rates.astype(float), exact.accelerations.astype(float)
     at = virtual_work.posture(sample.geometry, gamma, here.rotation.astype(float))
     from_star = rates.of_star(sample.geometry, at.rotation, omega, omega_dot, gamma)
     from_actuators = rates.of_actuators(at, rate, acceleration)
@@ -84,16 +76,11 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
 
 def newton_euler(sample):
     """Accelerations (7, 3) and joint moments (9, 3) in {B}; joints by kind, then by leg."""
-    geometry, scene, rotation = sample.geometry, sample.scene, sample.rotation
-    w = geometry.w
-    t = geometry.e @ rotation.T
-    across = np.cross(w, geometry.v)
-    r = np.cos(sample.gamma)[:, None] * geometry.v + np.sin(sample.gamma)[:, None] * across
+    scene, rotation, at = sample.scene, sample.rotation, sample.posture
+    w, r, t = at.w, at.r, at.t
     joints = [(None, k, w[k]) for k in range(3)]
     joints += [(k, 3 + k, r[k]) for k in range(3)] + [(3 + k, 6, t[k]) for k in range(3)]
-    frames = [np.stack([r[k], np.cross(w[k], r[k]), w[k]], axis=1) for k in range(3)]
-    frames += [np.stack([r[k], np.cross(t[k], r[k]), t[k]], axis=1) for k in range(3)]
-    frames.append(rotation)
+    frames = [*np.concatenate(virtual_work.link_frames(at)), rotation]
     links = [*scene.actuated_links, *scene.intermediate_links, scene.star]
     inertia = [f @ body.inertia.matrix @ f.T for f, body in zip(frames, links, strict=True)]
 

@@ -20,12 +20,6 @@ HEAVY = EXAMPLE1.with_values(
 REST = (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("x", [-0.6, 0.0, 0.2, 0.5])
-def test_the_slope_is_that_of_the_inertia(x):
-    slope = (inertia(HEAVY, x + 1e-6) - inertia(HEAVY, x - 1e-6)) / 2e-6
-    assert inertia_slope(HEAVY, x) == pytest.approx(slope, abs=1e-9)
-
-
 @pytest.mark.parametrize("scene", [EXAMPLE1, HEAVY], ids=["example1", "star x 1.25"])
 def test_with_the_rate_without_drift_the_full_dynamics_return_after_one_period(scene):
     start = {"initial.gamma_dot": [drift_free_rate(scene)] * 3}

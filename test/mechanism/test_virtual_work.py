@@ -8,8 +8,6 @@ also held on every type of number.
 
 from __future__ import annotations
 
-import dataclasses
-
 import lagrange
 import numpy as np
 import pytest
@@ -17,14 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lagrange import Lagrange, Motion, exact
 from mechanism.closed_chains import random_sample
-from models import FAST, agree, inertia_of, samples, seeded_samples
+from models import FAST, agree, samples, seeded_samples
 from mpmath import mp, mpf
 
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism import kinematics, rates, virtual_work
 from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.mechanism.virtual_work import EquationOfMotion
-from sst_ros.scene.scene import Link
 
 SAMPLES = [*seeded_samples(1, 6, isotropic=True), *seeded_samples(2, 6)]
 TINY = 1e-30
@@ -168,15 +165,6 @@ def test_quaternion_rate_turns_the_frame_by_the_body_rate(sample):
     wx, wy, wz = sample.body_rate
     skew = np.array([[0, -wz, wy], [wz, 0, -wx], [-wy, wx, 0]])
     agree(slope, sample.rotation @ skew, 1.0 + np.linalg.norm(sample.body_rate))
-
-
-@every_sample
-def test_only_zz_of_the_actuated_links_matters(sample):
-    drive = sample.scene.actuated_links[0].inertia.matrix
-    plain = Link(inertia=inertia_of(drive[2, 2] * np.eye(3)))
-    links = (plain, *sample.scene.actuated_links[1:])
-    other = dataclasses.replace(sample.scene, actuated_links=links)
-    assert kernel.model_of(other) == sample.model
 
 
 @every_sample

@@ -8,10 +8,9 @@ import re
 from dataclasses import replace
 
 import pytest
-from dynamics.bare_kernel import program_of
 
 from sst_ros import __main__ as cli
-from sst_ros.dynamics.traced_dynamics import Dynamics, compile_program
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.report.scene_summary import TERMS, WIDTH, costs, has, operations, summary, without
 from sst_ros.report.step_advice import step_advice
 from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment, Spring, Stroke
@@ -39,14 +38,10 @@ def everything() -> Scene:
     )
 
 
-@pytest.mark.parametrize("name", ["example2_heavy", "general"])
-def test_the_plain_scene_is_the_same_physics_and_costs_as_a_kernel_without_optional_terms(name):
-    """At most 3 % more; example2_heavy has diagonal link inertias, general has full ones."""
-    scene, bare = load(name), program_of(load(name))
-    assert operations(scene) <= 1.03 * bare.operations.total()
-    inputs = (0.1, 0.2, 0.3, 0.9, 1.0, -2.0, 0.5, 1.0, 2.0, 3.0)
-    expected = pytest.approx(compile_program(bare)(*inputs), rel=1e-12)
-    assert Dynamics.of(scene).derivative(*inputs) == expected
+@pytest.mark.parametrize(("name", "bare"), [("example2_heavy", 290), ("general", 388)])
+def test_a_plain_scene_costs_as_a_kernel_that_knows_no_optional_terms(name, bare):
+    """At most 3 % more than such a kernel, written once by hand, had operations."""
+    assert operations(load(name)) <= 1.03 * bare
 
 
 @every_scene
