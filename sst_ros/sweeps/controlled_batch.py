@@ -119,6 +119,7 @@ class ControlledBatch:
             raise InputError("sweep", [Problem("duration", length, allowed)])
         controller = Controller(self._model, self._motion, control, period)
         self._inertia = np.array(controller.inertia)[:, None]
+        self._space = ActuatorSpaceMap(Geometry.of(self._model))
         varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
@@ -144,8 +145,7 @@ class ControlledBatch:
         text = batch_source(
             model.program, model.limit_distances, DOP853, len(model.ode.state), self._feedback
         )
-        texts = [*NOISE, text]
-        return codegen.load(texts, {"NODES": DOP853.c}, numba=True, nogil=True)
+        return codegen.load([*NOISE, text], {"NODES": DOP853.c}, numba=True, nogil=True)
 
     def run(
         self,
@@ -168,7 +168,7 @@ class ControlledBatch:
             The result, and the tracking figures.
 
         """
-        count, hold = len(rows), steps // self.samples
+        count, hold, drawn_for = len(rows), steps // self.samples, rows
         start = self._motion.at(0.0)
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
@@ -177,7 +177,7 @@ class ControlledBatch:
         gains = self._make_gains(batch, given, count)
 
         def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
-            own: list[Any] = [memory, gains, numbers]
+            own: list[Any] = [memory, gains, drawn_for]
             held, begin = hold, first
             if rows is not None:  # torques are held while a step is repeated, whenever it was
                 own = [np.ascontiguousarray(array[..., rows]) for array in own]
@@ -188,11 +188,10 @@ class ControlledBatch:
             if rows is not None:
                 arrays[3][:] += (first - begin) * step
 
-        numbers = rows.astype(np.int64)
         result = batch.integrate(advance, gamma, rate, step=step, count=steps, keep_every=kept)
-        return result, self._tracking(result, memory, result.t)
+        return result, self._tracking(result, memory)
 
-    def _tracking(self, result: BatchResult, memory: Array, last: Array) -> dict[str, Array]:
+    def _tracking(self, result: BatchResult, memory: Array) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
         found = divide(self._memory_sizes, memory)
         desired = divide(REFERENCES, self._references[-1])
@@ -201,10 +200,10 @@ class ControlledBatch:
         squares = np.stack(found["squares"], axis=1) + np.where(complete, final**2, 0.0)
         largest = np.stack(found["largest"], axis=1)
         largest = np.where(complete, np.maximum(largest, np.abs(final)), largest)
-        samples = np.floor(last / self._control.period + 1e-9) + 1
+        samples = np.floor(result.t / self._control.period + 1e-9) + 1
         rms = np.sqrt(squares / samples[:, None])
-        columns = {f"error_rms_{k + 1}": rms[:, k].copy() for k in range(3)}
-        columns |= {f"error_max_{k + 1}": largest[:, k].copy() for k in range(3)}
+        columns = {f"error_rms_{k + 1}": rms[:, k] for k in range(3)}
+        columns |= {f"error_max_{k + 1}": largest[:, k] for k in range(3)}
         return columns | {"limited_samples": found["limited"][0]}
 
     @cached_property
@@ -316,10 +315,6 @@ class ControlledBatch:
         """W and W_dot of the controller's model."""
         found = self._space.star_accelerations(*q, *gamma_dot, *gamma_ddot)
         return found[:3], found[3:]
-
-    @cached_property
-    def _space(self) -> ActuatorSpaceMap:
-        return ActuatorSpaceMap(Geometry.of(self._model))
 
     def _start_memory(self, gamma: Array, rate: Array, count: int) -> Array:
         """Return the memory before the first sample, a column a scenario."""

@@ -45,7 +45,7 @@ CHUNK = 32_768
 OUTPUTS = (*QUANTITIES, "energy", "extremes")
 """What `outputs` may name: quantities of the final state, and extremes of joints."""
 
-MOST_ROWS, MOST = 2**53, 10_000_000
+MOST = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -72,31 +72,27 @@ class SweepStudy(Section):
         "number of runs; by default that of the grid or of the table",
         default=None,
         least=1,
-        most=MOST_ROWS,
+        most=2**53,
     )
     seed: int = integer("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS, default="random")
     table: Any = anything(
-        "values by column, in place of distributions; a DataFrame, a mapping, or a file",
-        default=None,
+        "values by column in place of distributions: DataFrame, mapping or file", default=None
     )
     duration: float | None = number(
-        "length of a run; by default that of the scene, or of its motion if controlled",
+        "length of a run; by default that of the scene, or of its motion",
         "s",
         default=None,
         above=0.0,
     )
     tolerance: float = number(
-        "largest error of the orientation at the end, for the number of steps",
+        "error of the orientation at the end, for the number of steps",
         "rad",
         default=1e-9,
         above=0.0,
     )
     steps: int | None = integer(
-        "number of steps of a run; chosen by the tolerance if not given",
-        default=None,
-        least=1,
-        most=MOST,
+        "number of steps of a run; by default by the tolerance", default=None, least=1, most=MOST
     )
     torque: Any = anything(
         "None for the scene's own torques if it has some, else zero; three constant torques [N m]; "
@@ -119,9 +115,8 @@ class SweepStudy(Section):
 
     def __post_init__(self) -> None:
         if isinstance(self.control, Mapping):
-            object.__setattr__(
-                self, "control", build(SampledControl, self.control, "sweep", path="control")
-            )
+            control = build(SampledControl, self.control, "sweep", path="control")
+            object.__setattr__(self, "control", control)
         if self.table is not None:
             object.__setattr__(self, "table", read_table(self.table))
         super().__post_init__()

@@ -15,32 +15,34 @@ from studies.extreme import page
 from studies.extreme_cases import catalogue
 from studies.extreme_runs import evaluate_case
 from studies.stability_limits import (
+    FAMILIES,
     LONGEST_S,
     LargestStep,
     draw_regions,
     eigenvalues,
     largest_step,
     limits_of_theory,
-    oscillating,
 )
 
 CASES = catalogue()
 
 
-@pytest.mark.parametrize(("method", "reach"), [("rk4", 2.785), ("dopri5", 3.307)])
-def test_the_largest_step_is_that_of_the_theory(method, reach):
-    """The ends of the real stability intervals, Hairer & Wanner, section IV.2."""
-    found = largest_step("decay", METHODS[method], 1e3)
+@pytest.mark.parametrize(
+    ("family", "method", "coefficient", "reach"),
+    [
+        ("decay", "rk4", 1e3, 2.785),
+        ("decay", "dopri5", 1e3, 3.307),
+        ("oscillation", "rk4", 1e3, 2.0 * math.sqrt(2.0)),
+        ("oscillation", "rk4", 1e6, 2.0 * math.sqrt(2.0)),
+    ],
+)
+def test_the_largest_step_is_that_of_the_theory(family, method, coefficient, reach):
+    """The ends of the real and imaginary stability intervals, Hairer & Wanner, section IV.2."""
+    values = eigenvalues(FAMILIES[family][0](coefficient))
+    if family == "oscillation":
+        assert np.abs(values.real).max() < 1e-3 * np.abs(values).max()
+    found = largest_step(family, METHODS[method], coefficient)
     assert found.step * found.rate == pytest.approx(reach, rel=0.02)
-
-
-@pytest.mark.parametrize("stiffness", [1e3, 1e6])
-def test_the_largest_step_of_oscillations_is_that_of_the_theory(stiffness):
-    """2 sqrt(2) on the imaginary axis, for RK4."""
-    values = eigenvalues(oscillating(stiffness))
-    assert np.abs(values.real).max() < 1e-3 * np.abs(values).max()
-    found = largest_step("oscillation", METHODS["rk4"], stiffness)
-    assert found.step * found.rate == pytest.approx(2.0 * math.sqrt(2.0), rel=0.02)
 
 
 def test_the_implicit_method_is_stable_everywhere():

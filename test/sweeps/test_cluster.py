@@ -2,6 +2,7 @@
 """A study on real `dask scheduler` and `dask worker` processes: killed, replaced, refused, full."""
 
 import dataclasses
+import json
 import os
 import random
 import subprocess
@@ -10,7 +11,6 @@ import threading
 import time
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 from sst_ros import load_scene
@@ -31,25 +31,17 @@ STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40,
 WORKER = "from distributed.cli.dask_worker import main; main()"
 OLD = "from sst_ros import version; version.VERSION = '0.0.9'"
 FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))"
-POISONED = """
-import os, signal
+BEFORE_A_CHUNK = """
+import os, signal, time
 from sst_ros.sweeps.prepared import PreparedSweep
 compute = PreparedSweep.chunk
-def poisoned(self, index):
-    if index == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
+def patched(self, index):
+    {}
     return compute(self, index)
-PreparedSweep.chunk = poisoned
+PreparedSweep.chunk = patched
 """
-SLOW = """
-import time
-from sst_ros.sweeps.prepared import PreparedSweep
-compute = PreparedSweep.chunk
-def slow(self, index):
-    time.sleep(0.1)
-    return compute(self, index)
-PreparedSweep.chunk = slow
-"""
+POISONED = BEFORE_A_CHUNK.format("index == 3 and os.kill(os.getpid(), signal.SIGKILL)")
+SLOW = BEFORE_A_CHUNK.format("time.sleep(0.1)")
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +92,6 @@ class Processes:
 
     @contextmanager
     def client(self, workers):
-        import json
-
         found = connect(json.loads(self.file.read_text())["address"])
         try:
             found.wait_for_workers(workers, timeout=LIMIT_S)
@@ -255,4 +245,4 @@ def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
     assert len(list((tmp_path / "out").glob("part-*"))) == 11
     found = run_study(STUDY, tmp_path / "out", resume=True)
     same(found, expected)
-    assert np.array_equal(found.index, expected.index)
+    assert found.index.equals(expected.index)
