@@ -54,9 +54,6 @@ KINDS = {
     "spiral": Spiral(phi=0.3, theta=7.0, psi=0.4, duration=3.0),
     "waypoints": tuple(Waypoint(time=time, gamma=gamma) for time, gamma in POINTS),
 }
-every_kind = pytest.mark.parametrize("kind", KINDS)
-
-
 GENERAL = replace(load("general"), initial=Initial(gamma=START))
 GEOMETRY = Geometry.of(GENERAL)
 RATES = ("body_rate", "body_acceleration", "gamma_dot", "gamma_ddot")
@@ -322,10 +319,8 @@ def test_sections_that_say_no_motion_are_refused(named, build):
 
 def test_arrays_and_lists_of_points_are_one():
     rows = ([0.5, 1.0], [[0.8, 0.8, 0.7], [0.9, 0.7, 0.8]], [[0.1, 0.2, 0.1], [0.0] * 3])
-    lists, arrays = (
-        through_points(GEOMETRY, pose(), *given) for given in (rows, map(np.array, rows))
-    )
-    assert lists.at(0.7) == arrays.at(0.7)
+    both = [through_points(GEOMETRY, pose(), *given) for given in (rows, map(np.array, rows))]
+    assert both[0].at(0.7) == both[1].at(0.7)
 
 
 def test_a_stop_begins_with_the_motion_and_ends_at_rest_on_its_path():

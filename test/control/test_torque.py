@@ -17,11 +17,6 @@ from sst_ros.simulation.torque_profile import TorqueTable
 HEADER = "time,tau_1,tau_2,tau_3\n"
 
 
-def table(path):
-    read = TorqueTable.read(path)
-    return read, read.times[-1]
-
-
 def written(folder, text, encoding="utf-8"):
     path = folder / "torques.csv"
     path.write_bytes(text.encode(encoding))
@@ -44,8 +39,8 @@ def test_a_sine_starts_at_its_phase():
 
 
 def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_path):
-    profile, last = table(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
-    assert last == 1.0
+    profile = TorqueTable.read(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
+    assert profile.times[-1] == 1.0
     assert profile(math.nextafter(0.5, 0.0)) == profile(-1.0) == (0.0, 0.0, 0.0)
     assert profile(0.5) == profile(0.75) == profile(math.nextafter(1.0, 0.0)) == (1.0, 2.0, 3.0)
     assert profile(1.0) == profile(9.0) == (-4.0, 0.5, 6.0)
@@ -53,7 +48,7 @@ def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_pa
 
 def test_spaces_and_windows_line_ends_are_taken(tmp_path):
     text = "time, tau_1, tau_2, tau_3\r\n0, 1, 2, 3\r\n"
-    assert table(written(tmp_path, text))[0](0.0) == (1.0, 2.0, 3.0)
+    assert TorqueTable.read(written(tmp_path, text))(0.0) == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +73,7 @@ def test_spaces_and_windows_line_ends_are_taken(tmp_path):
 )
 def test_refused_tables(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
-        table(written(tmp_path, text))
+        TorqueTable.read(written(tmp_path, text))
 
 
 @pytest.mark.parametrize(
@@ -90,15 +85,15 @@ def test_refused_tables(tmp_path, text, message):
 )
 def test_all_bad_rows_are_told_with_their_lines_in_the_file(tmp_path, rows, lines):
     with pytest.raises(InputError) as caught:
-        table(written(tmp_path, HEADER + rows))
+        TorqueTable.read(written(tmp_path, HEADER + rows))
     assert [problem.line for problem in caught.value.problems] == lines
 
 
 def test_files_that_cannot_be_read_are_told(tmp_path):
     with pytest.raises(InputError, match=r"none\.csv.*must be readable .*No such file"):
-        table(tmp_path / "none.csv")
+        TorqueTable.read(tmp_path / "none.csv")
     with pytest.raises(InputError, match=r"must be readable"):
-        table(written(tmp_path, HEADER, encoding="utf-16"))
+        TorqueTable.read(written(tmp_path, HEADER, encoding="utf-16"))
 
 
 @FAST
@@ -106,7 +101,8 @@ def test_files_that_cannot_be_read_are_told(tmp_path):
 def test_arbitrary_rows_are_a_profile_or_refused(tmp_path_factory, text):
     path = written(tmp_path_factory.getbasetemp(), HEADER + text, encoding="utf-8")
     try:
-        profile, last = table(path)
+        profile = TorqueTable.read(path)
     except InputError:
         return
+    last = profile.times[-1]
     assert all(map(math.isfinite, (*profile(last), last)))
