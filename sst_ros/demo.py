@@ -26,7 +26,7 @@ FOLLOWED = "reach"
 MODES = ("feedforward", "feedforward_pd")
 HOLD_S = 0.3
 CONTROL_RATE = 500
-_READY_S = 30.0
+_READY_S = 60.0  # a first start compiles, on a busy machine for half a minute
 _END_S = 30.0
 
 
