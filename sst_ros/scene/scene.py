@@ -29,10 +29,10 @@ from sst_ros.scene.loads import (
 from sst_ros.scene.schema import (
     Rules,
     Section,
-    has,
+    has_key,
     notes,
     number,
-    numbers,
+    numbers_of,
     section,
     sections,
     text,
@@ -131,7 +131,7 @@ class Scene(Section):
 
     def check(self) -> Iterator[Problem]:
         """Refuse what contradicts itself across sections, and numbers of another unit."""
-        for key, value, spec in numbers(self):
+        for key, value, spec in numbers_of(self):
             if abs(value) > LARGEST:
                 allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
                 yield Problem(key, value, allowed)
@@ -140,7 +140,7 @@ class Scene(Section):
                 yield Problem(key, value, allowed)
         yield from super().check()
         for key, note in self.provenance:
-            if not has(type(self), key):
+            if not has_key(type(self), key):
                 yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
     def rules(self) -> Rules:

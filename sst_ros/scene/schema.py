@@ -184,26 +184,26 @@ def specs(cls: type[Section]) -> dict[str, Spec]:
     return {field.name: field.metadata["spec"] for field in dataclasses.fields(cls)}
 
 
-def numbers(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
+def numbers_of(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
     """Yield each number of a section with the key of its field, and what the field allows."""
     for name, spec in specs(type(tree)).items():
         value, here = getattr(tree, name), (*place, name)
         if isinstance(value, Section):
-            yield from numbers(value, here)
+            yield from numbers_of(value, here)
         elif spec.kind == "sections":
             for index, entry in enumerate(value):
-                yield from numbers(entry, (*here, index))
+                yield from numbers_of(entry, (*here, index))
         elif spec.kind == "number" and value is not None:
             yield from ((key_of(here), float(x), spec) for x in np.ravel(value))
 
 
-def has(cls: type[Section], key: str) -> bool:
+def has_key(cls: type[Section], key: str) -> bool:
     """Return whether documents of a class may have a key without indices."""
     name, _, rest = key.partition(".")
     spec = specs(cls).get(name)
     if spec is None or not rest:
         return spec is not None
-    return spec.section is not None and has(spec.section, rest)
+    return spec.section is not None and has_key(spec.section, rest)
 
 
 def key_of(place: Place) -> str:

@@ -177,7 +177,7 @@ def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> di
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
         try:
-            _set(changed, split(str(key)), value)
+            _set(changed, split_key(str(key)), value)
         except (AttributeError, IndexError, TypeError, ValueError):
             raise KeyError(key) from None
     return changed
@@ -338,7 +338,7 @@ def _is_some(value: Any) -> bool:
     return any(map(_is_some, value)) if isinstance(value, (list, tuple)) else bool(value)
 
 
-def split(key: str) -> list[tuple[str, int | None]]:
+def split_key(key: str) -> list[tuple[str, int | None]]:
     """Return names and indices of a key; raises ValueError where it is none."""
     found = []
     for word in key.split("."):
@@ -366,7 +366,7 @@ def find_fields(
     """
     word, _, rest = key.partition(".")
     try:
-        ((name, index),) = split(word)
+        ((name, index),) = split_key(word)
     except ValueError:
         name, index = word, None
     known = specs(type(tree))
