@@ -44,6 +44,12 @@ class ForkedNode:
     def returncode(self):
         return self.poll()
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.wait()
+
     def poll(self):
         return self._process.exitcode
 
