@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, TimeoutError
 from multiprocessing import forkserver, resource_tracker
 
 import pytest
@@ -40,6 +40,12 @@ class ForkedNode:
         self.stdout, self.stderr = (os.fdopen(begin, encoding="utf-8") for begin, _ in pipes)
         self._texts = []
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.communicate()
+
     @property
     def returncode(self):
         return self.poll()
@@ -64,7 +70,10 @@ class ForkedNode:
         if not self._texts:
             pool = ThreadPoolExecutor(2)
             self._texts = [pool.submit(pipe.read) for pipe in (self.stdout, self.stderr)]
-        texts = tuple(text.result(timeout) for text in self._texts)
+        try:
+            texts = tuple(text.result(timeout) for text in self._texts)
+        except TimeoutError as error:
+            raise subprocess.TimeoutExpired("node", timeout) from error
         self.wait(timeout)
         return texts
 
