@@ -40,12 +40,6 @@ class ForkedNode:
         self.stdout, self.stderr = (os.fdopen(begin, encoding="utf-8") for begin, _ in pipes)
         self._texts = []
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.communicate()
-
     @property
     def returncode(self):
         return self.poll()

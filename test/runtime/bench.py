@@ -147,3 +147,10 @@ class Bench:
         self.loop.stop()
         self.thread.join(40)
         assert not self.thread.is_alive()
+
+
+def run_here(*args, **given):
+    """A run that ends by itself."""
+    bench = Bench(*args, **given)
+    bench.loop.run()
+    return bench

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from runtime.bench import Bench, HandClock, plain, stamped
+from runtime.bench import Bench, HandClock, plain, run_here, stamped
 
 from sst_ros.errors import RunStopped
 from sst_ros.integration import codegen
@@ -35,13 +35,6 @@ def start():
     yield begin
     for bench in started:
         bench.end()
-
-
-def run_here(*args, **given):
-    """A run that ends by itself."""
-    bench = Bench(*args, **given)
-    bench.loop.run()
-    return bench
 
 
 @pytest.fixture
