@@ -44,7 +44,6 @@ from studies.sampled_data import ORDERS, slope
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-
 REST_S = 0.3
 """Time for which a loop goes on after the motion, to see whether it settles [s]."""
 

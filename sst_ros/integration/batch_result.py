@@ -33,6 +33,10 @@ _REASONS = {
 }
 """How a scenario ended, by the codes that are no limit's: below zero it did not start."""
 
+_HALF = 2 * NOT_FINITE
+_CODES = 2 * _HALF
+"""More than there are codes, of either sign."""
+
 _SCENARIO = ("status", "message", "fault_time", "local_error")
 
 
@@ -179,14 +183,14 @@ class BatchResult(BatchStates):
     def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
         """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
         limited = (self.code > 0) & (self.code < NOT_FINITE)  # only these depend on the geometry
-        pairs = np.stack([np.where(limited, self._columns.geometry, 0), self.code], axis=1)
-        found, index = np.unique(pairs, axis=0, return_inverse=True)
-        texts = [
-            _REASONS.get(code)
-            or self._model.limits(self._columns.geometries.of_rows(geometry))[code - 1].reason
-            for geometry, code in found.tolist()
-        ]
-        return np.array(texts, dtype=object), index.ravel()
+        # One number for both: of pairs np.unique takes a tenth of the time of a sweep.
+        both = np.where(limited, self._columns.geometry, 0) * _CODES + self.code
+        found, index = np.unique(both, return_inverse=True)
+        texts = []
+        for geometry, code in ((one // _CODES, one % _CODES) for one in (found + _HALF).tolist()):
+            limits = self._model.limits(self._columns.geometries.of_rows(geometry))
+            texts.append(_REASONS.get(code - _HALF) or limits[code - _HALF - 1].reason)
+        return np.array(texts, dtype=object), index
 
     def __len__(self) -> int:
         return len(self.status)

@@ -102,13 +102,14 @@ class PreparedSweep:
     def chunk(self, index: int) -> tuple[pa.Table, pa.Table | None]:
         """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
         pyarrow, study = require("pyarrow"), self.study
-        rows = np.array(study.rows_of(index))
+        rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
         values = study.sampler.rows(int(rows[0]), len(rows))
         columns, texts, reason = self._results(values, rows)
         arrays: Columns = {"scenario": rows}
         for one in study.variations:
             arrays |= dict(zip(one.columns, values[one.key].T, strict=True))
-        arrays |= columns
+        # Arrow copies strided columns an entry at a time.
+        arrays = {name: np.ascontiguousarray(x) for name, x in (arrays | columns).items()}
         arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
             reason.astype(np.int32), pyarrow.array(texts, pyarrow.string())
         )
@@ -151,7 +152,8 @@ class PreparedSweep:
         }
         result.compute(*(name for name in COMPUTED if name in self.study.outputs))
         columns |= columns_of(result, self._quantities) | more
-        texts, reason = result.reasons[0].tolist(), result.reasons[1]
+        distinct_texts, reason = result.reasons
+        texts = distinct_texts.tolist()
         if faults:  # no numbers, and the first problem as the reason
             wrong, reason = list(faults), reason.copy()
             for name, array in columns.items():
