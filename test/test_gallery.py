@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sst_ros.cli.runs import check
-from sst_ros.errors import RunStopped, StrokeExceeded
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.errors import RunStopped
 from sst_ros.scene.scene import load, names
 from sst_ros.simulation.simulation import Simulation
 
@@ -68,12 +67,6 @@ def test_a_scene_is_small_commented_and_can_start(name):
     assert check(name).name == name
 
 
-def test_example1_swings_about_a_centre_at_rest():
-    assert np.ptp(of("example1", "gamma")) > 0.04
-    for state in run("example1")[1]:
-        assert rotation_matrix(state.quaternion)[:, 2] == pytest.approx([3.0**-0.5] * 3, abs=1e-11)
-
-
 def test_example2_passes_the_ends_that_it_ignores():
     """With every printed number: gamma_1 from 0.9125 s, beta_2 from 0.9326 s to the end at 1 s."""
     gamma, beta = np.degrees(of("example2", "gamma")), np.degrees(of("example2", "beta"))
@@ -84,23 +77,11 @@ def test_example2_passes_the_ends_that_it_ignores():
     assert np.flatnonzero(beta[:, 1] < 0.0)[0] * STEP_NS == 934_000_000
 
 
-def test_example2_heavy_stays_in_its_stroke_for_the_whole_second():
-    gamma = of("example2_heavy", "gamma")
-    assert run("example2_heavy")[1][-1].time_ns == 1_000_000_000
-    assert gamma.min() > 0.0 and gamma.max() < np.pi / 2
-
-
-def test_example2_stroke_meets_the_end_of_a_stroke():
-    _, states, stopped = run("example2_stroke")
-    assert isinstance(stopped, StrokeExceeded) and stopped.reason.startswith("gamma_1 > ")
-    assert 0.9 < stopped.time < 1.0
-    assert states[-1].joints.gamma[0] == pytest.approx(np.pi / 2, abs=0.02)
-
-
 @pytest.mark.parametrize(("name", "bound"), [("gravity_payload", 1e-8), ("fast_spin", 1e-6)])
 def test_energy_is_conserved_while_it_moves(name, bound):
     assert np.ptp(of(name, "gamma")) > 0.1
     assert drift(name) < bound
+    assert name != "fast_spin" or np.abs(of(name, "gamma_dot")).max() > 100.0
 
 
 def test_friction_keeps_the_kinetic_energy_below_that_of_the_frictionless_scene():
@@ -133,10 +114,6 @@ def test_impacts_bounce_at_upper_and_lower_stops():
             bounces.append((leg, rate[i, leg] > 0.0))
             assert 0.2 < -rate[j + 1, leg] / rate[i, leg] < 0.9
     assert bounces == [(0, True), (0, False), (1, False), (1, True), (2, True)]
-
-
-def test_fast_spin_is_fast():
-    assert np.abs(of("fast_spin", "gamma_dot")).max() > 100.0
 
 
 def test_general_is_general_and_moves():

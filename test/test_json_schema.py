@@ -80,8 +80,3 @@ def test_every_key_is_described_with_its_unit():
     assert friction["viscous"]["description"] == "viscous coefficient [N m s/rad]"
     assert friction["smoothing"]["default"] == 0.01
     assert [name for name, entry in keys(SCHEMA) if not entry.get("description")] == []
-
-
-def test_the_reference_names_every_key():
-    said = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
-    assert [name for name, _ in keys(SCHEMA) if f"| `{name}` |" not in said] == []

@@ -12,7 +12,6 @@ from matplotlib import image
 
 from sst_ros.control.law import MODES
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.errors import InputError
 from sst_ros.report.results import write
 from sst_ros.scene.scene import load
 from sst_ros.sweeps.sweep_study import SampledControl
@@ -71,31 +70,19 @@ def small():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", ORDERS)
-def test_the_error_of_held_torques_falls_at_the_order_of_theory(small, at):
-    assert small.orders()[at] == pytest.approx(ORDERS[at], abs=0.1)
+def test_a_small_study_finds_what_theory_says(small):
+    """Of torques that are not held, error and estimate are rounding: 1e4 operations at 1e-16 each.
 
-
-@pytest.mark.slow
-def test_torques_that_are_not_held_reach_the_floor_of_the_integrator(small):
-    """Both are rounding: some 1e4 operations at 1e-16 each."""
+    A wrong model is helped by 1 / SHARE, less what the hold adds; the curvature may take 5 %.
+    """
+    assert small.orders() == pytest.approx(ORDERS, abs=0.1)
     error, estimate = small.unheld
     assert error < 1e-12 and estimate < 1e-11
     assert error < 10.0 * estimate + 1e-14
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sign", "+-")
-def test_feedforward_helps_a_wrong_model_as_linear_theory_says(small, sign):
-    """1 / SHARE, less what the hold adds; the curvature of the mechanism may take 5 %."""
-    error = f"inertia {sign}20%"
-    benefit, bound = small.benefit(error, 180.0), small.least_benefit(error, 180.0)
-    assert 4.5 < bound < 1.0 / SHARE
-    assert 0.95 * bound < benefit < 1.1 / SHARE
-
-
-@pytest.mark.slow
-def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
+    for name in ("inertia +20%", "inertia -20%"):
+        benefit, bound = small.benefit(name, 180.0), small.least_benefit(name, 180.0)
+        assert 4.5 < bound < 1.0 / SHARE
+        assert 0.95 * bound < benefit < 1.1 / SHARE
     found = small.limits.iloc[0]
     assert found.theory == pytest.approx(1e9 / PERIOD_NS, rel=1e-5)  # Jury: 1 / zeta
     assert found.ideal == pytest.approx(found.theory, rel=0.02)
@@ -104,18 +91,6 @@ def test_the_limit_of_the_bandwidth_is_that_of_theory(small):
 def test_with_delay_the_limit_lies_where_theory_says():
     loop, bound = held(ideal_plant(SHORT), 2), stability_limit(1.0, 2) * 1e9 / PERIOD_NS
     assert is_stable(loop, 0.97 * bound) and not is_stable(loop, 1.03 * bound)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damping", [0.7, 1.0])
-@pytest.mark.parametrize("delay", range(6))
-def test_every_bandwidth_up_to_the_limit_is_stable(delay, damping):
-    loop = held(ideal_plant(SHORT), delay, damping)
-    bound = stability_limit(damping, delay) * 1e9 / PERIOD_NS
-    assert all(
-        is_stable(loop, share * bound) for share in (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.98)
-    )
-    assert not any(is_stable(loop, share * bound) for share in (1.02, 1.1, 1.5, 3.0))
 
 
 @pytest.mark.slow
@@ -185,19 +160,7 @@ def test_errors_that_a_scene_cannot_have_are_left_out():
     assert "nominal" in page(found)
 
 
-def test_a_scene_without_a_motion_is_refused():
-    with pytest.raises(InputError, match="the scene has no desired motion"):
-        feedforward_study(FeedforwardPlan(load("example2_heavy")))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--scene", "nowhere"], "must be a readable .yaml file or one of"),
-        (["--scene", "example2_heavy"], "the scene has no desired motion"),
-    ],
-)
-def test_what_is_not_allowed_is_told_without_a_traceback(words, said, capsys):
-    assert feedforward.main(words) == 1
+def test_a_scene_without_a_motion_is_refused_without_a_traceback(capsys):
+    assert feedforward.main(["--scene", "example2_heavy"]) == 1
     error = capsys.readouterr().err
-    assert said in error and "Traceback" not in error
+    assert "the scene has no desired motion" in error and "Traceback" not in error

@@ -5,7 +5,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
 from sst_ros.control.controller import Measurement
@@ -31,9 +30,6 @@ def test_bodies_that_weigh_more_need_torques_as_much_larger():
     rotors = dataclasses.replace(REACH, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0))
     scene = dataclasses.replace(rotors, friction=None)
     np.testing.assert_allclose(torque(make_heavier(scene, 1.2)), 1.2 * torque(scene), rtol=1e-12)
-
-
-def test_the_factor_one_changes_nothing():
     assert make_heavier(REACH, 1.0) == REACH
 
 
@@ -57,15 +53,10 @@ def test_an_error_keeps_the_motion(error):
 GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 
 
-def test_a_channel_that_loses_nothing_changes_nothing():
-    wire = ChannelState(ControlChannel(), 0)
-    assert wire.measure(GAMMA, RATE) == Measurement(GAMMA, RATE)
-    assert wire.transmit((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
-
-
 @pytest.mark.parametrize("delay", [0, 1, 5])
 def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
     wire = ChannelState(ControlChannel(delay=delay), 0)
+    assert wire.measure(GAMMA, RATE) == Measurement(GAMMA, RATE)
     came = [wire.transmit((float(k), 0.0, 0.0))[0] for k in range(10)]
     assert came == [max(k - delay, 0) for k in range(10)]
 
@@ -126,18 +117,6 @@ def test_the_poles_are_the_eigenvalues_of_the_sampled_loop(damping, delay):
 @pytest.mark.parametrize("damping", [0.1, 0.4, 0.5, 0.7, 1.0, 3.0])
 def test_without_delay_the_limit_is_that_of_jury(damping):
     assert stability_limit(damping, 0) == pytest.approx(min(4.0 * damping, 1.0 / damping), rel=3e-6)
-
-
-@pytest.mark.parametrize("damping", [0.5, 1.0])
-def test_with_long_delay_the_limit_is_that_of_continuous_time(damping):
-    """A hold and d samples are a delay of (d + 1/2) T: the phase margin over the crossover."""
-
-    def gain(x):
-        return np.hypot(1.0, 2.0 * damping * x) - x * x
-
-    x = brentq(gain, 0.5, 10.0)
-    margin = np.arctan(2.0 * damping * x) / x
-    assert stability_limit(damping, 30) * 30.5 == pytest.approx(margin, rel=1e-3)
 
 
 @pytest.mark.parametrize("delay", range(6))

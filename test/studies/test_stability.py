@@ -10,7 +10,6 @@ from matplotlib import image
 
 from sst_ros.integration.methods import METHODS
 from sst_ros.plot.style import save_figure
-from sst_ros.report.step_advice import stability_function
 from studies.extreme import page
 from studies.extreme_cases import catalogue
 from studies.extreme_runs import evaluate_case
@@ -47,16 +46,6 @@ def test_the_largest_step_is_that_of_the_theory(family, method, coefficient, rea
 
 def test_the_implicit_method_is_stable_everywhere():
     assert largest_step("decay", METHODS["rodas4"], 1e5).step == LONGEST_S
-
-
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-def test_stability_functions_agree_with_the_exponential_to_the_order(method):
-    for direction in (-1.0, 1j, 0.6 + 0.8j):
-        z = 0.1 * direction * np.array([1.0, 0.5])
-        errors = np.abs(stability_function(method, z) - np.exp(z))
-        if errors.min() > 1e-15:
-            order = math.log2(errors[0] / errors[1]) - 1.0
-            assert order == pytest.approx(method.order, abs=0.3) or order > method.order
 
 
 def test_right_and_wrong_results_are_distinguished():
