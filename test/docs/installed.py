@@ -16,6 +16,12 @@ from sst_ros.scene.schema import specs
 from tools.reference_pages import NODES
 
 STANDARD = {"use_sim_time"}
+ENDPOINTS = {
+    "topic": ("echo hz pub info bw delay", PUBLISHES, SUBSCRIBES),
+    "service": ("call", SERVES),
+    "action": ("send_goal", EXECUTES),
+}
+"""Verbs of a command of ros2, and what its names are to a node of ours."""
 SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")
 
 
@@ -30,10 +36,6 @@ def names(*uses):
                 name = name.format(simulator="/sst_simulator")
                 found[name if name.startswith("/") else f"/{name}"] = endpoint
     return found
-
-
-def topics():
-    return names(PUBLISHES, SUBSCRIBES)
 
 
 def parameters(command):
@@ -56,14 +58,11 @@ def _ros2(words):
     elif words[0] in ("run", "launch"):
         assert words[1] == "sst_ros", words
         (run if words[0] == "run" else _launch)(words[2:])
-    elif words[0] == "topic":
-        _topic(words[1], [word for word in words[2:] if word[0] in "/{" or "/msg/" in word])
-    elif words[0] == "service":
-        assert words[1] == "call", words
-        _service(*words[2:])
-    elif words[0] == "action":
-        assert words[1] == "send_goal", words
-        _goal(*(word for word in words[2:] if not word.startswith("-")))
+    elif words[0] in ENDPOINTS:
+        verbs, *uses = ENDPOINTS[words[0]]
+        assert words[1] in verbs.split(), words
+        given = [w for w in words[2:] if w[0] in "/{" or re.search("/(msg|srv|action)/", w)]
+        _endpoint(names(*uses), *given)
     elif words[0] == "param":
         assert words[1] in ("get", "set"), words
         (node,) = (node for node in NODES if f"/{node.name}" == words[2])
@@ -73,7 +72,7 @@ def _ros2(words):
             _value(spec, words[4])
     elif words[0] == "bag":
         for word in words:
-            assert not word.startswith("/") or word in topics(), word
+            assert not word.startswith("/") or word in names(PUBLISHES, SUBSCRIBES), word
     else:
         assert words[0] in ("pkg", "security"), f"ros2 {words[0]} is not known to this test"
 
@@ -114,34 +113,20 @@ def _launch(words):
         assert f'"{argument}"' in text, f"{name} has no argument {argument}"
 
 
-def _topic(verb, words):
-    assert verb in ("echo", "hz", "pub", "info", "bw", "delay"), verb
-    name, *rest = words
-    assert name in topics(), name
-    if rest:
-        assert rest[0] == topics()[name].type_name, rest[0]
-        _message(topics()[name].kind, rest[1])
-
-
-def _goal(name, kind, content):
-    assert kind == names(EXECUTES)[name].type_name, kind
-    trajectory = yaml.safe_load(content)["trajectory"]
-    for point in trajectory.pop("points"):
-        Duration(check_fields=True, **point.pop("time_from_start"))
-        JointTrajectoryPoint(check_fields=True, **point)
-    JointTrajectory(check_fields=True, **trajectory)
-
-
-def _service(name, kind, content="{}"):
-    offered = names(SERVES)
+def _endpoint(offered, name, kind=None, content="{}"):
+    """Check a name, its type, and that a message of it can be made of the YAML."""
     assert name in offered, name
-    assert kind == offered[name].type_name, kind
-    _message(offered[name].kind.Request, content)
-
-
-def _message(kind, text):
-    """Check that a message can be made of the YAML."""
-    kind(check_fields=True, **yaml.safe_load(text))
+    if kind is not None:
+        assert kind == offered[name].type_name, kind
+        fields = yaml.safe_load(content)
+        if offered[name].use == EXECUTES:  # control_msgs is in no wheel
+            fields, made = fields["trajectory"], JointTrajectory
+            for point in fields.pop("points"):
+                Duration(check_fields=True, **point.pop("time_from_start"))
+                JointTrajectoryPoint(check_fields=True, **point)
+        else:
+            made = offered[name].kind
+        getattr(made, "Request", made)(check_fields=True, **fields)
 
 
 def _make(words):
@@ -156,17 +141,11 @@ def _pip(words):
             assert f'"{name}": ' in SETUP, f"there is no extra {name}"
 
 
-def _rviz(words):
-    for word in words:
-        assert not word.endswith(".rviz") or (ROOT / word).exists(), word
-
-
 def _known(_):
     """Pass over commands of others that name nothing of ours."""
 
 
 KINDS = {
-    "ros2": _ros2, "make": _make, "pip": _pip, "rviz2": _rviz, "colcon": _known, "git": _known,
-    "cd": _known, "source": _known, "sudo": _known, "rosdep": _known, "ulimit": _known,
-    "export": _known, "for": _known, "done": _known, "do": _known,
+    "ros2": _ros2, "make": _make, "pip": _pip,
+    **dict.fromkeys(("cd", "export", "for", "done"), _known),
 }  # fmt: skip

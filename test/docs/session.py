@@ -23,6 +23,31 @@ RECORDED_BYTES = 20_000
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 
+class Terminal:
+    """A command that runs until it is stopped, and a file of what it says."""
+
+    def __init__(self, line, words, log, given):
+        self.words, self.log = words, log
+        with log.open("w") as file:
+            self.process = subprocess.Popen(
+                ["bash", "-c", f"exec {line}"], stdout=file, stderr=subprocess.STDOUT, **given
+            )
+
+    def wait_for(self, condition):
+        """Wait until the condition holds or the command has ended."""
+        deadline = time.monotonic() + LIMIT_S
+        while not condition() and self.process.poll() is None:
+            assert time.monotonic() < deadline, self
+            time.sleep(0.05)
+
+    def end(self):
+        self.wait_for(lambda: False)
+        assert self.process.returncode == 0, self
+
+    def __str__(self):
+        return f"{shlex.join(self.words)}: {self.process.returncode}\n{self.log.read_text()}"
+
+
 class Session:
     """Runs blocks in order; what a node was told to write is there for the next command."""
 
@@ -57,25 +82,30 @@ class Session:
 
     def settle(self):
         """Wait for what ends by itself, for recorders to have something, and press Ctrl-C."""
-        for words, process, log in self._terminals:
-            self._wait_ready(words, process, log)
-        for words, process, log in self._terminals:
-            if _ends_by_itself(words):
-                self._ended(words, process, log)
-        for words, process, log in self._terminals:
-            self._wait_recorded(words, process, log)
-        for words, process, log in self._terminals:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                self._ended(words, process, log)
+        for terminal in self._terminals:
+            self._wait_ready(terminal)
+        for terminal in self._terminals:
+            if _ends_by_itself(terminal.words):
+                terminal.end()
+        for terminal in self._terminals:
+            if "recorder" in terminal.words:
+                files = (self.folder / _value(terminal.words, "output")).glob
+                terminal.wait_for(
+                    lambda files=files: (
+                        sum(p.stat().st_size for p in files("*.mcap")) > RECORDED_BYTES
+                    )
+                )
+        for terminal in self._terminals:
+            if terminal.process.poll() is None:
+                terminal.process.send_signal(signal.SIGINT)
+                terminal.end()
         self._terminals = []
 
     def close(self):
         """Leave no process behind."""
-        for _, process, _ in self._terminals:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+        for terminal in self._terminals:
+            terminal.process.kill()
+            terminal.process.wait()
 
     def _file(self, name, block):
         shown = ROOT / name
@@ -112,41 +142,15 @@ class Session:
         if words[1] == "-m" and words[3] != "view":
             installed.run(words[3:])
         log = self.folder / f"terminal_{len(list(self.folder.glob('terminal_*')))}"
-        with log.open("w") as file:
-            process = subprocess.Popen(
-                ["bash", "-c", f"exec {line}"], cwd=self.folder, env=self.environment, stdout=file,
-                stderr=subprocess.STDOUT,
-            )  # fmt: skip
-        self._terminals.append((words, process, log))
+        given = {"cwd": self.folder, "env": self.environment}
+        self._terminals.append(Terminal(line, words, log, given))
 
-    def _wait_ready(self, words, process, log):
+    def _wait_ready(self, terminal):
         """Wait until a node listens to Ctrl-C, and a recorder to its simulator."""
-
-        def has_said(text):
-            said = log.read_text()
-            return (said and text in said) or process.poll() is not None
-
-        if words[1] == "-m":
-            _until(lambda: has_said(""), words, log)
-        if "recorder" in words and any("simulator" in other for other, *_ in self._terminals):
-            _until(lambda: has_said("ready"), words, log)
-
-    def _wait_recorded(self, words, process, log):
-        if "recorder" in words:
-            files = (self.folder / _value(words, "output")).glob
-
-            def is_large():
-                size = sum(path.stat().st_size for path in files("*.mcap"))
-                return size > RECORDED_BYTES or process.poll() is not None
-
-            _until(is_large, words, log)
-
-    def _ended(self, words, process, log):
-        try:
-            status = process.wait(LIMIT_S)
-        except subprocess.TimeoutExpired:
-            status = "no end"
-        assert status == 0, f"{shlex.join(words)}: {status}\n{log.read_text()}"
+        if terminal.words[1] == "-m":
+            terminal.wait_for(terminal.log.read_text)
+        if "recorder" in terminal.words and any("simulator" in t.words for t in self._terminals):
+            terminal.wait_for(lambda: "ready" in terminal.log.read_text())
 
 
 def _value(words, parameter):
@@ -155,13 +159,6 @@ def _value(words, parameter):
         return words[words.index(f"--{parameter}") + 1]
     (value,) = (w.partition(":=")[2] for w in words if w.startswith(f"{parameter}:="))
     return value
-
-
-def _until(condition, words, log):
-    deadline = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline, f"{shlex.join(words)}\n{log.read_text()}"
-        time.sleep(0.05)
 
 
 def _stays(words):
