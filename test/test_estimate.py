@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error estimate of simulate() where a motion is not smooth, against far finer solutions."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -12,17 +14,7 @@ from sst_ros.simulation.torque_profile import PolynomialTorque
 EXAMPLE2 = load_scene("example2_heavy")
 SINE = SineTorque(amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0.1, 0.7, 2.0))
 STEPPED = ("rk4", "dopri5", "dop853", "rodas4")
-
-
-def check(truth, **arguments):
-    """The run meets its tolerance, and its estimate holds, is not far too large, and says so."""
-    found = simulate(**arguments)
-    error = angle_between(found.quaternion[-1], truth.quaternion[-1])
-    assert found.success, found.message
-    assert error <= arguments["tolerance"]
-    assert found.error_estimate <= arguments["tolerance"]
-    assert error <= 3.0 * found.error_estimate + truth.error_estimate
-    return found, error
+HALVES = np.arange(100) / 2000
 
 
 def jumping(t):
@@ -34,57 +26,65 @@ def square(t):
     return sign, -0.5 * sign, 0.7 * sign
 
 
-@pytest.mark.parametrize("method", STEPPED)
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-9])
-def test_a_sine_that_the_actuators_clamp(method, tolerance):
-    scene = EXAMPLE2.with_values({"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"})
-    arguments = {"scene": scene, "torque": SINE, "duration": 0.4, "t_eval": [0.4]}
-    truth = simulate(method="dop853", tolerance=1e-12, **arguments)
-    check(truth, method=method, tolerance=tolerance, **arguments)
+PIECES = PolynomialTorque([[[30.0, 9.0, -20.0]], [[-4.0, 2.0, 3.0]]], [0.0, 0.2])
+SATURATED = EXAMPLE2.with_values({"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"})
+WEAK = EXAMPLE2.with_values({"actuators.torque_limit": 0.5})
+RUNS = {
+    "clamped sine": {"scene": SATURATED, "torque": SINE, "duration": 0.4},
+    "clamped polynomial": {"scene": WEAK, "torque": PIECES, "duration": 0.2},
+    "jump": {"scene": EXAMPLE2, "torque": jumping, "duration": 0.6},
+    "square wave": {"scene": EXAMPLE2, "torque": square, "duration": 0.05},
+    "friction": {"scene": "friction", "duration": 0.5},
+    "ten seconds": {"scene": "swing", "torque": lambda t: (0.0,) * 3, "duration": 10.0},
+}
+# The truth: the same torque, where it jumps as a table, in far finer steps.
+TRUTHS = {
+    "clamped polynomial": {"tolerance": 1e-13},
+    "jump": {
+        "tolerance": 1e-13,
+        "torque": TorqueTable([0.0, 0.3217], [jumping(0.0), jumping(1.0)]),
+    },
+    "square wave": {
+        "tolerance": 1e-13,
+        "torque": TorqueTable(HALVES, [square(t + 1e-4) for t in HALVES]),
+    },
+}
 
 
-def test_a_polynomial_that_the_actuators_clamp():
-    scene = EXAMPLE2.with_values({"actuators.torque_limit": 0.5})
-    torque = PolynomialTorque([[[30.0, 9.0, -20.0]], [[-4.0, 2.0, 3.0]]], [0.0, 0.2])
-    arguments = {"scene": scene, "torque": torque, "duration": 0.2, "t_eval": [0.2]}
-    truth = simulate(method="dop853", tolerance=1e-13, **arguments)
-    found, _ = check(truth, method="dop853", tolerance=1e-8, **arguments)
-    assert found.evaluations < 3000
+def run_case(name, **options):
+    return simulate(**RUNS[name] | {"t_eval": [RUNS[name]["duration"]]} | options)
 
 
-@pytest.mark.parametrize("method", STEPPED)
-def test_a_jump_that_is_not_declared(method):
-    table = TorqueTable([0.0, 0.3217], [jumping(0.0), jumping(1.0)])
-    arguments = {"scene": EXAMPLE2, "duration": 0.6, "t_eval": [0.6]}
-    truth = simulate(torque=table, method="dop853", tolerance=1e-13, **arguments)
-    check(truth, torque=jumping, method=method, tolerance=1e-8, **arguments)
+@functools.cache
+def truth_of(name):
+    return run_case(name, **{"method": "dop853", "tolerance": 1e-12} | TRUTHS.get(name, {}))
 
 
-@pytest.mark.parametrize("declared", [False, True])
-def test_a_square_wave(declared):
-    duration, halves = 0.05, np.arange(100) / 2000
-    table = TorqueTable(halves, [square(t + 1e-4) for t in halves])
-    arguments = {"scene": EXAMPLE2, "duration": duration, "t_eval": [duration]}
-    truth = simulate(torque=table, method="dop853", tolerance=1e-13, **arguments)
-    breaks = halves if declared else ()
-    _, error = check(
-        truth, torque=square, breaks=breaks, method="dop853", tolerance=1e-7, **arguments
-    )
-    assert error < 1e-12
-
-
-def test_sharp_friction():
-    arguments = {"scene": "friction", "t_eval": [0.5], "duration": 0.5}
-    truth = simulate(method="dop853", tolerance=1e-12, **arguments)
-    check(truth, method="dop853", tolerance=1e-4, **arguments)
-    check(truth, method="auto", tolerance=1e-6, **arguments)
-
-
-def test_ten_seconds():
-    """A tolerance of the local errors alone leaves 3.3e-9 rad, three times as much."""
-    arguments = {"scene": "swing", "torque": lambda t: (0.0,) * 3, "duration": 10.0}
-    truth = simulate(method="dop853", tolerance=1e-12, t_eval=[10.0], **arguments)
-    check(truth, method="dopri5", tolerance=1e-9, t_eval=[10.0], **arguments)
+@pytest.mark.parametrize(
+    ("name", "method", "options"),
+    [
+        *(("clamped sine", method, {"tolerance": 1e-5}) for method in STEPPED),
+        *(("clamped sine", method, {"tolerance": 1e-9}) for method in STEPPED),
+        ("clamped polynomial", "dop853", {"tolerance": 1e-8}),
+        *(("jump", method, {"tolerance": 1e-8}) for method in STEPPED),
+        ("square wave", "dop853", {"tolerance": 1e-7}),
+        ("square wave", "dop853", {"tolerance": 1e-7, "breaks": HALVES}),
+        ("friction", "dop853", {"tolerance": 1e-4}),
+        ("friction", "auto", {"tolerance": 1e-6}),
+        # A tolerance of the local errors alone leaves 3.3e-9 rad, three times as much.
+        ("ten seconds", "dopri5", {"tolerance": 1e-9}),
+    ],
+)
+def test_a_run_meets_its_tolerance_and_its_estimate_holds_and_is_not_far_too_large(
+    name, method, options
+):
+    found, truth = run_case(name, method=method, **options), truth_of(name)
+    error = angle_between(found.quaternion[-1], truth.quaternion[-1])
+    assert found.success, found.message
+    assert error <= (1e-12 if name == "square wave" else options["tolerance"])
+    assert found.error_estimate <= options["tolerance"]
+    assert error <= 3.0 * found.error_estimate + truth.error_estimate
+    assert name != "clamped polynomial" or found.evaluations < 3000
 
 
 def test_breakpoints_of_a_table_are_not_rounded_to_nanoseconds():

@@ -9,6 +9,7 @@ bounded.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 
 import pytest
@@ -131,6 +132,7 @@ def test_fixed_steps_over_sharp_friction_are_estimated_by_the_order_that_is_left
         truth.step(now, 10_000_000)
         for _ in range(10 // step_ms):
             fixed.step(now, step_ms * 1_000_000)
+    assert math.hypot(*fixed.state.quaternion) == pytest.approx(1.0, abs=1e-15)
     error, rate_error = apart(fixed, truth)
     assert 0.1 * error < fixed.error_estimate < 10.0 * error
     assert 0.1 * rate_error < fixed.rate_error_estimate < 10.0 * rate_error
