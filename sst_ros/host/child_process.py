@@ -40,7 +40,7 @@ def start(command: str, given: dict[str, object], **more: Any) -> Popen[str]:
 
 @contextmanager
 def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[Popen[str]]:
-    """Have a node beside a block; it is told to end, and killed if that takes 10 s."""
+    """Have a node beside a block; it gets SIGINT, and is killed if its end takes 10 s."""
     with start(command, given, **more) as process:
         try:
             yield process

@@ -2,7 +2,7 @@
 """Motions by steps with error control: any torque, control periods, limits, stiff scenes.
 
 A second solution goes through each step of a run by two of half the length, which costs twice a
-step: its distance tells the error at the end. No order is assumed, as none holds where a torque
+step: its distance is the error at the end. No order is assumed, as none holds where a torque
 jumps, a clamp or a contact bends the motion, or friction is sharp. The steps halve where the run's
 own steps are, whatever chose them. Where the method has its order, the second solution is nearly
 exact, and the distance is the error; where each step loses its order, the error halves, and the

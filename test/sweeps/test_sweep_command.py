@@ -4,7 +4,7 @@
 import pytest
 from scipy.stats import spearmanr
 
-from sst_ros.cli.main import run
+from sst_ros.cli.main import run_command
 from sst_ros.sweeps.chunk_task import correlate_early_ends, read_sweep
 
 for module in ("numba", "pandas", "pyarrow", "matplotlib"):
@@ -25,12 +25,15 @@ vary:
 def folder(tmp_path_factory, interpreted_module):
     path = tmp_path_factory.mktemp("sweep")
     (path / "study.yaml").write_text(STUDY)
-    assert run(["sweep", str(path / "study.yaml"), "--out", str(path / "out")]) == 0
+    assert run_command(["sweep", str(path / "study.yaml"), "--out", str(path / "out")]) == 0
     return path
 
 
 def test_its_summary_names_reasons_and_causes(folder, capsys):
-    assert run(["sweep", str(folder / "study.yaml"), "--out", str(folder / "out"), "--resume"]) == 0
+    assert (
+        run_command(["sweep", str(folder / "study.yaml"), "--out", str(folder / "out"), "--resume"])
+        == 0
+    )
     out = capsys.readouterr().out
     assert "240 runs of 1 s, 30 steps each" in out
     assert "gamma_1 > 1.570796 rad" in out
@@ -47,7 +50,7 @@ def test_correlations_are_spearmans(folder):
 
 
 def test_plot_draws_the_pictures(folder, tmp_path, capsys, undrawn):
-    assert run(["sweep", "plot", str(folder / "out"), "--out", str(tmp_path)]) == 0
+    assert run_command(["sweep", "plot", str(folder / "out"), "--out", str(tmp_path)]) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["distributions.png", "early_ends.png", "worst.png"]
     assert capsys.readouterr().out.count(".png") == 3
@@ -67,7 +70,7 @@ REFUSED = [
 def test_wrong_arguments_are_refused(folder, monkeypatch, capsys, words, status, message):
     monkeypatch.chdir(folder)
     try:
-        found = run(["sweep", *words])
+        found = run_command(["sweep", *words])
     except SystemExit as ended:
         found = ended.code
     assert found == status
