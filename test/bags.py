@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import itertools
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -235,14 +235,28 @@ def without(entries: list[Entry], *topics: str) -> list[Entry]:
     return [entry for entry in entries if entry.topic not in topics]
 
 
-def edited(entries: list[Entry], topic: str, sample: int, change) -> list[Entry]:
-    """Copy the messages; `change` gets the content of one of them and returns a new one."""
+def edited(entries: list[Entry], topic: str, sample: int | None, change) -> list[Entry]:
+    """Copy the messages; `change` gets the content of one, or of all of a topic, and returns it."""
     return [
         dataclasses.replace(entry, content=change(entry.content))
-        if (entry.topic, entry.sample) == (topic, sample)
+        if entry.topic == topic and sample in (None, entry.sample)
         else entry
         for entry in entries
     ]
+
+
+def with_moment(entries: list[Entry], moment: Sequence[float]) -> list[Entry]:
+    """Name a moment on the star beside the torques of every tick."""
+
+    def change(message: Any) -> Any:
+        points = [
+            dataclasses.replace(point, effort=np.append(point.effort, moment))
+            for point in message.points
+        ]
+        names = [*message.joint_names, "moment_x", "moment_y", "moment_z"]
+        return dataclasses.replace(message, joint_names=names, points=points)
+
+    return edited(entries, APPLIED, None, change)
 
 
 def same(one: Recording, other: Recording) -> None:

@@ -137,18 +137,7 @@ def test_a_bag_without_any_is_refused(written, bags, example2):
 
 def test_a_moment_over_a_tick_is_a_column(written, bags, example2):
     moment = {"moment_x_N_m": 0.5, "moment_y_N_m": 1.5, "moment_z_N_m": 2.5}
-
-    def moved(entry):
-        if entry.topic != bags.APPLIED:
-            return entry
-        held = [[*point.effort, *moment.values()] for point in entry.content.points]
-        begin = nanoseconds(entry.content.header.stamp)
-        fresh = bags.torque_entry(held, begin, entry.received_ns, entry.sample)
-        names = [*bags.NAMES[:3], "moment_x", "moment_y", "moment_z"]
-        object.__setattr__(fresh.content, "joint_names", names)
-        return fresh
-
-    table = read_signals(written([moved(entry) for entry in example2])).table("ticks")
+    table = read_signals(written(bags.with_moment(example2, [*moment.values()]))).table("ticks")
     assert {name: table[name].unique().tolist() for name in moment} == {
         name: [value] for name, value in moment.items()
     }
