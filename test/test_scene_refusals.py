@@ -31,102 +31,62 @@ LINKS = "intermediate_links:\n"
 GAMMA = "gamma: [0.7853981633974483, 0.7853981633974483, 0.7853981633974483]"
 LINK = "  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}"
 # What is changed, into what, and what the message must say after "origin: ".
-REFUSED = {
-    "unknown key": ("duration: 1 ", "durration: 1 ", r"durration = '1': unk.* mean 'duration'"),
-    "unknown inner key": ("radius: 0.4 ", "radus: 0.4 ", r"star\.radus = '0\.4': unknown key"),
-    "duplicate key": ("duration: 1 ", "name: x\nduration: 1 ", r"name = 'x': is given twice.* 2"),
-    "missing key": (ALPHA, "", r"star\.alpha_deg = None: is missing; must be 3 finite numbers > 0"),
-    "vector of two": (ALPHA, "alpha_deg: [180, 180]", r"alpha_deg = \['180', '180'\]: must be 3"),
-    "scalar for vector": (ALPHA, "alpha_deg: 120", r"alpha_deg = '120': must be 3 finite numbers"),
-    "vector for scalar": ("duration: 1 ", "duration: [1] ", r"duration = \['1'\]: must be a f"),
-    "text for number": ("duration: 1 ", "duration: soon ", r"duration = 'soon': must be a finite"),
-    "nan": ("duration: 1 ", "duration: nan ", r"duration = 'nan': must be .* > 0 \[s\]"),
-    "1e999": ("duration: 1 ", "duration: 1e999 ", r"duration = '1e999': must be a finite number"),
-    "bool": ("duration: 1 ", "duration: true ", r"duration = 'true': must be a finite number"),
-    "null": ("duration: 1 ", "duration: ~ ", r"duration = None: must be a finite number"),
-    "zero duration": ("duration: 1 ", "duration: 0 ", r"duration = '0': must be .* > 0 \[s\]"),
-    "not definite": (
-        STAR, "inertia: {xx: 1, yy: 1, zz: -1}", r"star\.inertia = \[-1\.0, .*: .* must be > 0"
-    ),
-    "not definite by a product": (
-        STAR, "inertia: {xx: 1, yy: 1, zz: 1, xy: 2}", r"star\.inertia = \[-1\.0.*positive definite"
-    ),
-    "triangle inequality": (
-        STAR, "inertia: {xx: 1, yy: 1, zz: 2.1}", r"no principal moment may exceed"
-    ),
-    "link not definite": (
-        LINK, "  - inertia: {xx: 0, yy: 1, zz: 1}", r"intermediate_links\[0\]\.inertia = .*: .*> 0"
-    ),
-    "alphas do not close": (
-        ALPHA, "alpha_deg: [120, 120, 119]", r"alpha_deg = .*: must sum to 360 deg; the sum is 359"
-    ),
-    "negative alpha": (
-        ALPHA, "alpha_deg: [240, 240, -120]", r"star\.alpha_deg = .*: must be 3 finite numbers > 0"
-    ),
-    "degenerate base": (V, "v: [[1, 0, 0], [0, 1, 0], [1, 1, 0]]", r"base\.v = .*degenerate"),
-    "left-handed base": (V, "v: [[0, 1, 0], [1, 0, 0], [0, 0, 1]]", r"base\.v = .*right-handed"),
-    "zero direction": (V, "v: [[1, 0, 0], [0, 0, 0], [0, 0, 1]]", r"base\.v = .*may be zero"),
-    "zero radius": ("radius: 0.35 ", "radius: 0 ", r"base\.radius = '0': must be .* > 0 \[m\]"),
-    "two links": (LINK, f"{LINK}\n{LINK}", r"intermediate_links = .*: must be a list of 1 or 3"),
-    "link is text": (LINK, "  - steel", r"intermediate_links\[0\] = 'steel': must be a mapping"),
-    "links are text": (LINKS + LINK, "intermediate_links: steel", r"= 'steel': must be a list"),
-    "centre of nothing": (
-        "radius: 0.4 ", "radius: 0.4\n  centre: [0, 0, 0.1] #", r"star\.centre = .*: needs mass"
-    ),
-    "centre outside": (
-        "radius: 0.4 ", "radius: 0.4\n  mass: 1\n  centre: [0, 0, 0.5] #",
-        r"star\.centre = .*: must lie within 0\.4 m of O",
-    ),
-    "centre against the inertia": (
-        "radius: 0.4 ", "radius: 0.4\n  mass: 3\n  centre: [0.3, 0, 0.25] #",
-        r"star\.centre = .*: must fit the inertia about O",
-    ),
-    "centre without an inertia": (
-        LINK, "  - {mass: 0.1, centre: [0.1, 0, 0]}",
-        r"intermediate_links\[0\]\.centre = .*: must fit the inertia about O",
-    ),
-    "one inertia too large": (
-        STAR, "inertia: {xx: 0.39, yy: 0.39, zz: 2.6e10}", "no principal moment may exceed"
-    ),
-    "inertia of another unit": (
-        STAR, "inertia: {xx: 3e9, yy: 3e9, zz: 2e9}", r"xx = .*must not exceed 1e"
-    ),
-    "unknown choice": (
-        "duration: 1 ", "stroke: {at_end: bounce}\nduration: 1 ",
-        r"stroke\.at_end = 'bounce': must be one of stop, ignore",
-    ),
-    "choice is a list": (
-        "duration: 1 ", "stroke: {at_end: [stop]}\nduration: 1 ", r"at_end = .*must be one of"
-    ),
-    "beta_max too large": (
-        "duration: 1 ", "workspace: {beta_max_deg: 181}\nduration: 1 ",
-        r"workspace\.beta_max_deg = '181': must be a finite number > 0 <= 180 \[deg\]",
-    ),
-    "beta_max zero": (
-        "duration: 1 ", "workspace: {beta_max_deg: 0}\nduration: 1 ", r"beta_max_deg = '0': .*> 0"
-    ),
-    "negative frequency": (
-        "frequency: [18, 12, 24]", "frequency: [18, -12, 24]", r"frequency = .*: must be .*>= 0"
-    ),
-    "empty name": ("name: example2_heavy", "name: ''", r"name = '': must be text"),
-    "section is text": ("duration: 1 ", "workspace: big\nduration: 1 ", r"'big': must be a map"),
-    "unknown provenance": (
-        "  duration: printed", "  speed: guessed\n  duration: printed",
-        r"provenance\.speed = 'guessed': is about a key that no scene has",
-    ),
-    "duplicate provenance": (
-        "  duration: printed", "  base: again\n  duration: printed",
-        r"provenance.base = 'again': is given twice",
-    ),
-    "provenance is no text": (
-        "  duration: printed in the paper, section 6.2", "  duration: [a]",
-        r"\.duration = .*must be text"
-    ),
-    "syntax": (ALPHA, "alpha_deg: [120, 120, 120", r"document = .*expected .*must be YAML"),
-    "tab": (f"  {ALPHA}", f"\t{ALPHA}", r"document = .*: must be YAML"),
-    "alias": (V, "v: &a [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n  w: *a", r"\*a': aliases are not"),
-    "merge key": (V, f"<<: {{radius: 1}}\n  {V}", r"base\.<< = .*: unknown key"),
-}  # fmt: skip
+REFUSED = [
+    ("duration: 1 ", "durration: 1 ", r"durration = '1': unk.* mean 'duration'"),
+    ("radius: 0.4 ", "radus: 0.4 ", r"star\.radus = '0\.4': unknown key"),
+    ("duration: 1 ", "name: x\nduration: 1 ", r"name = 'x': is given twice.* 2"),
+    (ALPHA, "", r"star\.alpha_deg = None: is missing; must be 3 finite numbers > 0"),
+    (ALPHA, "alpha_deg: [180, 180]", r"alpha_deg = \['180', '180'\]: must be 3"),
+    (ALPHA, "alpha_deg: 120", r"alpha_deg = '120': must be 3 finite numbers"),
+    ("duration: 1 ", "duration: [1] ", r"duration = \['1'\]: must be a f"),
+    ("duration: 1 ", "duration: soon ", r"duration = 'soon': must be a finite"),
+    ("duration: 1 ", "duration: nan ", r"duration = 'nan': must be .* > 0 \[s\]"),
+    ("duration: 1 ", "duration: 1e999 ", r"duration = '1e999': must be a finite number"),
+    ("duration: 1 ", "duration: true ", r"duration = 'true': must be a finite number"),
+    ("duration: 1 ", "duration: ~ ", r"duration = None: must be a finite number"),
+    ("duration: 1 ", "duration: 0 ", r"duration = '0': must be .* > 0 \[s\]"),
+    (STAR, "inertia: {xx: 1, yy: 1, zz: -1}", r"star\.inertia = \[-1\.0, .*: .* must be > 0"),
+    (STAR, "inertia: {xx: 1, yy: 1, zz: 1, xy: 2}", r"star\.inertia = \[-1\.0.*positive definite"),
+    (STAR, "inertia: {xx: 1, yy: 1, zz: 2.1}", r"no principal moment may exceed"),
+    (LINK, "  - inertia: {xx: 0, yy: 1, zz: 1}", r"intermediate_links\[0\]\.inertia = .*: .*> 0"),
+    (ALPHA, "alpha_deg: [120, 120, 119]", r"alpha_deg = .*: must sum to 360 deg; the sum is 359"),
+    (ALPHA, "alpha_deg: [240, 240, -120]", r"star\.alpha_deg = .*: must be 3 finite numbers > 0"),
+    (V, "v: [[1, 0, 0], [0, 1, 0], [1, 1, 0]]", r"base\.v = .*degenerate"),
+    (V, "v: [[0, 1, 0], [1, 0, 0], [0, 0, 1]]", r"base\.v = .*right-handed"),
+    (V, "v: [[1, 0, 0], [0, 0, 0], [0, 0, 1]]", r"base\.v = .*may be zero"),
+    ("radius: 0.35 ", "radius: 0 ", r"base\.radius = '0': must be .* > 0 \[m\]"),
+    (LINK, f"{LINK}\n{LINK}", r"intermediate_links = .*: must be a list of 1 or 3"),
+    (LINK, "  - steel", r"intermediate_links\[0\] = 'steel': must be a mapping"),
+    (LINKS + LINK, "intermediate_links: steel", r"= 'steel': must be a list"),
+    ("radius: 0.4 ", "radius: 0.4\n  centre: [0, 0, 0.1] #", r"star\.centre = .*: needs mass"),
+    ("radius: 0.4 ", "radius: 0.4\n  mass: 1\n  centre: [0, 0, 0.5] #",
+     r"star\.centre = .*: must lie within 0\.4 m of O"),
+    ("radius: 0.4 ", "radius: 0.4\n  mass: 3\n  centre: [0.3, 0, 0.25] #",
+     r"star\.centre = .*: must fit the inertia about O"),
+    (LINK, "  - {mass: 0.1, centre: [0.1, 0, 0]}",
+     r"intermediate_links\[0\]\.centre = .*: must fit the inertia about O"),
+    (STAR, "inertia: {xx: 0.39, yy: 0.39, zz: 2.6e10}", "no principal moment may exceed"),
+    (STAR, "inertia: {xx: 3e9, yy: 3e9, zz: 2e9}", r"xx = .*must not exceed 1e"),
+    ("duration: 1 ", "stroke: {at_end: bounce}\nduration: 1 ",
+     r"stroke\.at_end = 'bounce': must be one of stop, ignore"),
+    ("duration: 1 ", "stroke: {at_end: [stop]}\nduration: 1 ", r"at_end = .*must be one of"),
+    ("duration: 1 ", "workspace: {beta_max_deg: 181}\nduration: 1 ",
+     r"workspace\.beta_max_deg = '181': must be a finite number > 0 <= 180 \[deg\]"),
+    ("duration: 1 ", "workspace: {beta_max_deg: 0}\nduration: 1 ", r"beta_max_deg = '0': .*> 0"),
+    ("frequency: [18, 12, 24]", "frequency: [18, -12, 24]", r"frequency = .*: must be .*>= 0"),
+    ("name: example2_heavy", "name: ''", r"name = '': must be text"),
+    ("duration: 1 ", "workspace: big\nduration: 1 ", r"'big': must be a map"),
+    ("  duration: printed", "  speed: guessed\n  duration: printed",
+     r"provenance\.speed = 'guessed': is about a key that no scene has"),
+    ("  duration: printed", "  base: again\n  duration: printed",
+     r"provenance.base = 'again': is given twice"),
+    ("  duration: printed in the paper, section 6.2", "  duration: [a]",
+     r"\.duration = .*must be text"),
+    (ALPHA, "alpha_deg: [120, 120, 120", r"document = .*expected .*must be YAML"),
+    (f"  {ALPHA}", f"\t{ALPHA}", r"document = .*: must be YAML"),
+    (V, "v: &a [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n  w: *a", r"\*a': aliases are not"),
+    (V, f"<<: {{radius: 1}}\n  {V}", r"base\.<< = .*: unknown key"),
+]  # fmt: skip
 
 
 def line_of_change(before, after):
@@ -135,7 +95,7 @@ def line_of_change(before, after):
     return next(number for number, (a, b) in enumerate(pairs, start=1) if a != b)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(("old", "new", "message"), REFUSED)
 def test_refused(old, new, message):
     source = changed(old, new)
     with pytest.raises(InputError) as caught:
@@ -187,92 +147,54 @@ def test_a_key_that_no_line_has_is_told_with_the_line_of_the_deepest_part_of_it(
 
 
 # One more section at the end of example 2, and what must be said of it after "origin: line N: ".
-SECTIONS_REFUSED = {
-    "no field": ("gravity: {acceleration: [0, 0, 0]}", r"gravity\.acceleration .*: must not be z"),
-    "gravity on nothing": (
-        "gravity: {acceleration: [0, 0, -9.8]}", r"gravity = .*: acts on nothing: no body has a m"
-    ),
-    "gravity is a number": ("gravity: -9.8", r"gravity = '-9\.8': must be a mapping"),
-    "gravity of two": ("gravity: {acceleration: [0, 9]}", r"on = .*: must be 3 .* \[m/s\^2\]"),
-    "moment without value": ("moment: {}", r"moment = None: give either value or topic: true"),
-    "moment twice": ("moment: {value: [0, 0, 1], topic: true}", r"moment = .*: give either value"),
-    "topic is a name": ("moment: {topic: /wrench}", r"topic = '/wrench': must be true or false"),
-    "friction of nothing": ("friction: {}", r"friction = None: names no joint: give gamma, mu or"),
-    "friction of a leg": (
-        "friction: {mu: {viscous: 1}, gamma_1: {viscous: 1}}", r"friction\.gamma_1 = .*unknown key"
-    ),
-    "no coefficient": ("friction: {mu: {}}", r"friction\.mu\.viscous = 0\.0: .*leave it out"),
-    "negative viscous": (
-        "friction: {mu: {viscous: -1}}", r"viscous = '-1': must be .* >= 0 \[N m s/rad\]"
-    ),
-    "negative coulomb": ("friction: {beta: {coulomb: -1}}", r"friction\.beta\.coulomb = '-1': .*>"),
-    "sudden coulomb": (
-        "friction: {mu: {coulomb: 1, smoothing: 0}}", r"smoothing = '0': .*> 0 \[rad/s\]"
-    ),
-    "static below coulomb": (
-        "friction: {mu: {coulomb: 2, static: 1}}", r"static = 1\.0: must be >= coulomb = 2 N m"
-    ),
-    "smoothing of nothing": (
-        "friction: {mu: {viscous: 2, smoothing: 1}}", r"smoothing = 1\.0: acts on coulomb or stat"
-    ),
-    "stribeck of nothing": (
-        "friction: {mu: {coulomb: 2, stribeck: 1}}", r"stribeck = 1\.0: acts on static: give it"
-    ),
-    "spring that pushes": (
-        "springs: [{joint: mu_1, stiffness: -4, rest: 0}]",
-        r"springs\[0\]\.stiffness = '-4': must be a finite number > 0 \[N m/rad\]",
-    ),
-    "spring nowhere": (
-        "springs: [{joint: gamma_4, stiffness: 4, rest: 0}]", r"joint = 'gamma_4': must be one of"
-    ),
-    "spring without rest": (
-        "springs: [{joint: mu_1, stiffness: 4}]", r"springs\[0\]\.rest = None: is missing.*\[rad\]"
-    ),
-    "springs are a mapping": ("springs: {joint: mu_1}", r"springs = .*: must be a list of map"),
-    "spring in N/mm": (
-        "springs: [{joint: mu_1, stiffness: 4e12, rest: 0}]",
-        r"stiffness = 4000000000000\.0: must not exceed 1e\+09 in size: use m, kg, s, rad, N",
-    ),
-    "negative rotor": ("actuators: {rotor_inertia: -1}", r"rotor_inertia = '-1': .* >= 0 \[kg m"),
-    "negative gear": (
-        "actuators: {rotor_inertia: 1, gear_ratio: -50}", r"gear_ratio = '-50': .*> 0 \[1\]"
-    ),
-    "gear of nothing": ("actuators: {gear_ratio: 50}", r"gear_ratio = 50\.0: acts on rotor_"),
-    "actuators of nothing": ("actuators: {}", r"actuators = None: changes nothing: leave it out"),
-    "no torque at all": ("actuators: {torque_limit: 0}", r"torque_limit = '0': .* > 0 \[N m\]"),
-    "lag of no time": ("actuators: {time_constant: 0}", r"time_constant = '0': must be .* > 0 \[s"),
-    "elastic without stiffness": (
-        "stroke: {at_end: elastic}", r"stroke\.stiffness = None: is given with at_end: elastic, an"
-    ),
-    "soft stop": ("stroke: {stiffness: 10}", r"stroke\.stiffness = 10\.0: is given with at_end: e"),
-    "damped stop": ("stroke: {damping: 1}", r"stroke\.damping = 1\.0: is given with at_end: elast"),
-    "impact that drives": (
-        "stroke: {at_end: elastic, stiffness: 1, restitution: 1.1, impact_rate: 1}",
-        r"restitution = '1\.1': .* >= 0\.01 <= 1 \[1\]",
-    ),
-    "restitution at no rate": (
-        "stroke: {at_end: elastic, stiffness: 1, restitution: 0.5}",
-        r"impact_rate = None: is given with restitution, both or none",
-    ),
-    "restitution and damping": (
-        "stroke: {at_end: elastic, stiffness: 1, damping: 1, restitution: 0.5, impact_rate: 1}",
-        r"damping = 1\.0: give either damping or restitution",
-    ),
-    "negative damping": (
-        "stroke: {at_end: elastic, stiffness: 1, damping: -1}", r"damping = '-1': .*>= 0 \[s/rad\]"
-    ),
-    "payload without mass": ("payload: {centre: [0, 0, 0]}", r"payload\.mass = None: is missing"),
-    "weightless payload": (
-        "payload: {mass: 0, centre: [0, 0, 0]}", r"payload\.mass = '0': must be .* > 0 \[kg\]"
-    ),
-    "flat payload": (
-        "payload: {mass: 1, centre: [0, 0, 0], inertia: {xx: 1, yy: 1, zz: 3}}",
-        r"payload\.inertia = .*: no principal moment may exceed",
-    ),
-}  # fmt: skip
+SECTIONS_REFUSED = [
+    ("gravity: {acceleration: [0, 0, 0]}", r"gravity\.acceleration .*: must not be z"),
+    ("gravity: {acceleration: [0, 0, -9.8]}", r"gravity = .*: acts on nothing: no body has a m"),
+    ("gravity: -9.8", r"gravity = '-9\.8': must be a mapping"),
+    ("gravity: {acceleration: [0, 9]}", r"on = .*: must be 3 .* \[m/s\^2\]"),
+    ("moment: {}", r"moment = None: give either value or topic: true"),
+    ("moment: {value: [0, 0, 1], topic: true}", r"moment = .*: give either value"),
+    ("moment: {topic: /wrench}", r"topic = '/wrench': must be true or false"),
+    ("friction: {}", r"friction = None: names no joint: give gamma, mu or"),
+    ("friction: {mu: {viscous: 1}, gamma_1: {viscous: 1}}", r"friction\.gamma_1 = .*unknown key"),
+    ("friction: {mu: {}}", r"friction\.mu\.viscous = 0\.0: .*leave it out"),
+    ("friction: {mu: {viscous: -1}}", r"viscous = '-1': must be .* >= 0 \[N m s/rad\]"),
+    ("friction: {beta: {coulomb: -1}}", r"friction\.beta\.coulomb = '-1': .*>"),
+    ("friction: {mu: {coulomb: 1, smoothing: 0}}", r"smoothing = '0': .*> 0 \[rad/s\]"),
+    ("friction: {mu: {coulomb: 2, static: 1}}", r"static = 1\.0: must be >= coulomb = 2 N m"),
+    ("friction: {mu: {viscous: 2, smoothing: 1}}", r"smoothing = 1\.0: acts on coulomb or stat"),
+    ("friction: {mu: {coulomb: 2, stribeck: 1}}", r"stribeck = 1\.0: acts on static: give it"),
+    ("springs: [{joint: mu_1, stiffness: -4, rest: 0}]",
+     r"springs\[0\]\.stiffness = '-4': must be a finite number > 0 \[N m/rad\]"),
+    ("springs: [{joint: gamma_4, stiffness: 4, rest: 0}]", r"joint = 'gamma_4': must be one of"),
+    ("springs: [{joint: mu_1, stiffness: 4}]", r"springs\[0\]\.rest = None: is missing.*\[rad\]"),
+    ("springs: {joint: mu_1}", r"springs = .*: must be a list of map"),
+    ("springs: [{joint: mu_1, stiffness: 4e12, rest: 0}]",
+     r"stiffness = 4000000000000\.0: must not exceed 1e\+09 in size: use m, kg, s, rad, N"),
+    ("actuators: {rotor_inertia: -1}", r"rotor_inertia = '-1': .* >= 0 \[kg m"),
+    ("actuators: {rotor_inertia: 1, gear_ratio: -50}", r"gear_ratio = '-50': .*> 0 \[1\]"),
+    ("actuators: {gear_ratio: 50}", r"gear_ratio = 50\.0: acts on rotor_"),
+    ("actuators: {}", r"actuators = None: changes nothing: leave it out"),
+    ("actuators: {torque_limit: 0}", r"torque_limit = '0': .* > 0 \[N m\]"),
+    ("actuators: {time_constant: 0}", r"time_constant = '0': must be .* > 0 \[s"),
+    ("stroke: {at_end: elastic}", r"stroke\.stiffness = None: is given with at_end: elastic, an"),
+    ("stroke: {stiffness: 10}", r"stroke\.stiffness = 10\.0: is given with at_end: e"),
+    ("stroke: {damping: 1}", r"stroke\.damping = 1\.0: is given with at_end: elast"),
+    ("stroke: {at_end: elastic, stiffness: 1, restitution: 1.1, impact_rate: 1}",
+     r"restitution = '1\.1': .* >= 0\.01 <= 1 \[1\]"),
+    ("stroke: {at_end: elastic, stiffness: 1, restitution: 0.5}",
+     r"impact_rate = None: is given with restitution, both or none"),
+    ("stroke: {at_end: elastic, stiffness: 1, damping: 1, restitution: 0.5, impact_rate: 1}",
+     r"damping = 1\.0: give either damping or restitution"),
+    ("stroke: {at_end: elastic, stiffness: 1, damping: -1}", r"damping = '-1': .*>= 0 \[s/rad\]"),
+    ("payload: {centre: [0, 0, 0]}", r"payload\.mass = None: is missing"),
+    ("payload: {mass: 0, centre: [0, 0, 0]}", r"payload\.mass = '0': must be .* > 0 \[kg\]"),
+    ("payload: {mass: 1, centre: [0, 0, 0], inertia: {xx: 1, yy: 1, zz: 3}}",
+     r"payload\.inertia = .*: no principal moment may exceed"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("section", "message"), SECTIONS_REFUSED.values(), ids=SECTIONS_REFUSED)
+@pytest.mark.parametrize(("section", "message"), SECTIONS_REFUSED)
 def test_a_section_is_refused(section, message):
     with pytest.raises(InputError) as caught:
         read(Scene, BODIES + section + "\n", "origin")
