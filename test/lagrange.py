@@ -92,6 +92,14 @@ class Lagrange:
         links = [scene.star, *scene.actuated_links, *scene.intermediate_links]
         self.inertias = [exact(link.inertia.matrix) for link in links]
         self.weights = [exact(np.array(link.centre)) * link.mass for link in links]
+        if carried := scene.payload:
+            c = exact(np.array(carried.centre))
+            self.weights[0] = self.weights[0] + c * carried.mass
+            shifted = (EYE * (c @ c) - np.outer(c, c)) * carried.mass
+            self.inertias[0] = self.inertias[0] + exact(carried.inertia.matrix) + shifted
+        if drive := scene.actuators:
+            for actuated in self.inertias[1:4]:
+                actuated[2, 2] += mpf(drive.rotor_inertia) * mpf(drive.gear_ratio) ** 2
         t, s = exact(np.asarray(rotation)).T[1:]
         t = unit(t)
         s = unit(s - t * (s @ t))

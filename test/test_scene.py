@@ -17,7 +17,6 @@ from sst_ros.scene.scene import Scene, load, names
 from sst_ros.scene.yaml_document import dump, read
 
 FOLDER = Path(__file__).parents[1] / "config" / "scenes"
-SOURCE = (FOLDER / "example2_heavy.yaml").read_text(encoding="utf-8")
 every_scene = pytest.mark.parametrize("name", names())
 
 
@@ -78,20 +77,6 @@ def test_what_is_no_scene_is_refused(name, message, tmp_path, monkeypatch):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match=message):
         load(name)
-
-
-def test_one_link_stands_for_three():
-    scene = load("example2_heavy")
-    assert len(scene.actuated_links) == 3
-    assert scene.actuated_links[0] == scene.actuated_links[2]
-
-
-def test_a_copy_without_optional_parts_reads_back_equal():
-    lines = SOURCE[: SOURCE.index("torque:")]
-    scene = read(Scene, lines, "origin")
-    assert scene.torque is None
-    assert scene.duration is None
-    assert read(Scene, dump(scene), "dump") == scene
 
 
 def test_an_installation_without_scenes_is_told(monkeypatch, tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every load against a truth of its own: geometry, Lagrange with potentials, energy, frequency."""
+"""Every load against a truth of its own: geometry, Lagrange with potentials, energy."""
 
 from __future__ import annotations
 
@@ -9,36 +9,29 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lagrange import Lagrange, exact, partials
+from lagrange import Lagrange, exact
 from lagrange import friction_torque as documented_torque
 from models import FAST, inertia_of, samples, seeded_samples
 from mpmath import mpf
-from scipy.integrate import solve_ivp
-from scipy.linalg import eigh
 
 from sst_ros import Simulation, load_scene
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import friction_torque, stop_torque
 from sst_ros.dynamics.model import loads_of_leg
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import Inertia, Link, Payload
 from sst_ros.scene.loads import (
     Actuators,
     Friction,
     Gravity,
-    Initial,
     JointFriction,
     Moment,
     Spring,
     Stroke,
-    Workspace,
 )
 
 STEP = 1e-200
 REST = (0.0, 0.0, 0.0)
-FREE = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
 EXAMPLE2 = load_scene("example2_heavy")
 
 
@@ -93,8 +86,8 @@ def test_energy_changes_by_the_power_put_in(sample, number):
 
 
 def laden(sample):
-    """Weight, springs of every kind and friction everywhere: what `Lagrange.loads` knows."""
-    return replace(loaded(sample, 0.5), payload=None, moment=None, actuators=None, **FREE)
+    """What `Lagrange.loads` knows: weight, springs and friction, of payload and rotors too."""
+    return replace(loaded(sample, 0.5), moment=None, stroke=Stroke(at_end="ignore"))
 
 
 @pytest.mark.parametrize("sample", seeded_samples(71, 3), ids=range(3))
@@ -113,24 +106,6 @@ def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
     assert np.abs(found - expected).max() <= 1e-11 * np.abs(expected).max()
 
 
-def rotor(scene):
-    """A rotor and its gear are an inertia of the actuated link, of which only zz matters."""
-    heavier = [
-        Link(inertia=replace(link.inertia, xx=1.0, yy=1.0, zz=link.inertia.zz + 0.05))
-        for link in scene.actuated_links
-    ]
-    actuators = Actuators(rotor_inertia=2e-5, gear_ratio=50.0)
-    return {"actuators": actuators}, {"actuated_links": tuple(heavier)}, 1e-13
-
-
-def payload(scene):
-    """A payload is an inertia of the star, by parallel axes."""
-    own, c = Inertia(xx=0.01, yy=0.02, zz=0.025, xy=0.001), np.array([0.1, 0.2, 0.3])
-    total = own.matrix + 0.5 * (c @ c * np.eye(3) - np.outer(c, c)) + scene.star.inertia.matrix
-    carried = Payload(mass=0.5, centre=tuple(c), inertia=own)
-    return {"payload": carried}, {"star": replace(scene.star, inertia=inertia_of(total))}, 1e-13
-
-
 def springs(scene):
     """Springs at one joint are one, with the mean of their angles of rest."""
     two = [Spring(joint="mu_1", stiffness=k, rest=r) for k, r in ((2.0, 0.5), (3.0, -0.2))]
@@ -144,7 +119,7 @@ def bare(scene):
     return {"intermediate_links": (Link(),) * 3}, {"intermediate_links": (light,) * 3}, 1e-9
 
 
-@pytest.mark.parametrize("pair", [rotor, payload, springs, bare])
+@pytest.mark.parametrize("pair", [springs, bare])
 def test_two_ways_to_say_the_same_move_alike(pair):
     sample = seeded_samples(7, 1)[0]
     *terms, tolerance = pair(sample.scene)
@@ -183,52 +158,6 @@ def test_lagging_actuators_follow_the_command_with_their_time_constant():
     found = dynamics.derivative(*sample.state, *has, *asked)
     assert found[7:] == pytest.approx([18.0, -24.0, 4.0], rel=1e-14)
     assert found[:7] == Dynamics.of(sample.scene).derivative(*sample.state, *has)
-
-
-def period(scene, direction):
-    """Time between the first and the last of some zeros of the motion along a direction [s]."""
-    dynamics, state = Dynamics.of(scene), Simulation(scene).state
-
-    def crossing(_, y):
-        return float(np.dot(np.subtract(dynamics.joints(*y)[:3], scene.initial.gamma), direction))
-
-    run = solve_ivp(
-        lambda _, y: dynamics.derivative(*y, *REST),
-        (0.0, 3.0),
-        (*state.quaternion, *state.body_rate),
-        method="DOP853",
-        rtol=1e-11,
-        atol=1e-14,
-        events=crossing,
-    )
-    times = run.t_events[0]
-    times = times[times > 1e-6]
-    return 2.0 * (times[-1] - times[0]) / (len(times) - 1)
-
-
-@pytest.mark.parametrize("mode", range(3))
-def test_a_tool_that_hangs_in_springs_swings_with_the_periods_of_its_height(mode):
-    """Gravity towards E makes the centre stable; the fast mode turns E about itself."""
-    home = (np.pi / 4,) * 3
-    scene = replace(
-        load_scene("gravity_payload"),
-        gravity=Gravity(acceleration=(5.0, 5.0, 5.0)),
-        initial=Initial(gamma=home),
-        **FREE,
-    )
-    geometry = Geometry.of(scene)
-    at = virtual_work.posture(geometry, home)
-    truth = Lagrange(scene, at.rotation)
-    truth.weights[0] = truth.weights[0] + scene.payload.mass * exact(scene.payload.centre)
-    stiffness = partials(lambda gamma: partials(truth.potential, gamma), exact(home)).astype(float)
-    assert abs(stiffness[0, 1]) > 0.1
-    mass = -virtual_work.equation_of_motion(virtual_work.Mechanism.of(scene), at, np.zeros(3))[0]
-    squares, modes = eigh(stiffness, mass)
-    omega = np.sqrt(squares[mode])
-    # Small swings have the period of T1 and stiffness; errors go with the amplitude, 1e-5.
-    moving = Initial(gamma=home, gamma_dot=1e-5 * omega * modes[:, mode])
-    found = period(replace(scene, initial=moving), mass @ modes[:, mode])
-    assert found == pytest.approx(2.0 * np.pi / omega, rel=1e-6)
 
 
 def test_commands_beyond_the_torque_limit_are_clamped_to_it():
