@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
+from sst_ros.__main__ import main
+from sst_ros.cli.runs import implausible
 from sst_ros.errors import InputError
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.bodies import Inertia
@@ -83,3 +85,80 @@ def test_an_installation_without_scenes_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr("sst_ros.scene.scene.__file__", str(tmp_path / "a" / "scene.py"))
     with pytest.raises(InputError, match=r"config/scenes = .*: was not installed"):
         scenes.share_directory()
+
+
+# Other values by key.
+
+EXAMPLE2 = load("example2_heavy")
+
+
+def test_numbers_lists_sections_and_choices():
+    other = EXAMPLE2.with_values(
+        {
+            "star.inertia.zz": np.float64(0.3),
+            "base.v": np.array(EXAMPLE2.base.v) + 0.01,
+            "actuated_links.inertia.xx": 0.02,
+            "actuated_links[1].inertia.zz": 0.021,
+            "star.mass": 2.6,
+            "gravity.acceleration": (0.0, 0.0, -9.81),
+            "stroke.at_end": "ignore",
+            "torque": None,
+            "initial.gamma_dot": 0.5,
+            "initial.gamma[1]": 0.25,
+        }
+    )
+    assert other.star.inertia.zz == 0.3
+    assert other.base.v[0] == (1.01, 0.01, 0.01)
+    assert [link.inertia.xx for link in other.actuated_links] == [0.02] * 3
+    assert [link.inertia.zz for link in other.actuated_links] == [0.018375, 0.021, 0.018375]
+    assert other.gravity.acceleration == (0.0, 0.0, -9.81)
+    assert other.initial.gamma_dot == (0.5, 0.5, 0.5)
+    assert other.initial.gamma == (EXAMPLE2.initial.gamma[0], 0.25, EXAMPLE2.initial.gamma[2])
+    assert (other.stroke.at_end, other.torque) == ("ignore", None)
+    assert EXAMPLE2.star.inertia.zz == 0.26
+    assert EXAMPLE2.with_values({}) == EXAMPLE2
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"star.inertai.zz": 1.0}, "star.inertai"),
+        ({"star.inertia.zz": -1.0}, "star.inertia"),
+        ({"star.inertia.zz": "much"}, "must be a finite number"),
+        ({"springs[0].rest": 1.0}, r"springs\[0\].rest = 1.0: names nothing"),
+        ({"name.first": 1.0}, "names nothing"),
+        ({"star.inertia.zz": {1, 2}}, "star.inertia.zz"),
+        ({"star.inertia.zz": object()}, "star.inertia.zz = .*: must be a finite number"),
+    ],
+)
+def test_what_makes_no_scene_is_refused(values, said):
+    with pytest.raises(InputError, match=said):
+        EXAMPLE2.with_values(values)
+
+
+# Inertias that no body of the mass and radius given can have.
+
+
+@every_scene
+def test_a_shipped_mass_fits_its_inertia(name):
+    assert implausible(load(name)) == []
+
+
+def test_a_star_too_heavy_for_its_mass_is_warned_of(tmp_path, capsys):
+    """1.25 times thin arcs of 2.6 kg: the trace is 1.04 kg m^2, 2 m r^2 for 3.25 kg."""
+    assert implausible(EXAMPLE2) == []  # without a mass
+    assert implausible(EXAMPLE2.with_values({"star.mass": 3.25})) == []
+    path = tmp_path / "heavy.yaml"
+    path.write_text(dump(EXAMPLE2.with_values({"star.mass": 2.6})), encoding="utf-8")
+    assert main(["scene", "check", str(path)]) == 0
+    valid, warning = capsys.readouterr().out.splitlines()
+    assert valid == f"{path}: valid, with warnings"
+    assert warning == (
+        f"{path}: warning: star.inertia: its trace is 1.04 kg m^2; a body of star.mass = 2.6 kg "
+        "within star.radius = 0.4 m has at most 2 m r^2 = 0.832 kg m^2"
+    )
+
+
+def test_thin_arcs_are_at_the_bound():
+    assert implausible(load("example2").with_values({"star.mass": 2.6})) == []
+    assert implausible(load("example2").with_values({"star.mass": 2.59})) != []
