@@ -143,9 +143,10 @@ def test_auto_says_why_collocation_is_not_chosen_and_gauss_refuses(scene, torque
 
 
 @pytest.mark.parametrize(
-    ("duration", "method", "letters"), [(0.4, "gauss", 35), (3.0, "dopri5", 25)]
+    ("duration", "method", "letters", "within"),
+    [(0.4, "gauss", 35, 1e-9), (3.0, "dopri5", 25, 1e-7)],
 )
-def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, letters):
+def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, letters, within):
     found = simulate(EXAMPLE2, (5.0, 0.0, 0.0), duration)
     truth = simulate(EXAMPLE2, (5.0, 0.0, 0.0), duration, method="dop853", tolerance=1e-12)
     assert method in found.method
@@ -153,7 +154,7 @@ def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, lette
     assert "gamma_1 > 1.570796" in found.message
     assert found.message[:letters] == truth.message[:letters]  # with 12 or 9 digits of the time
     assert found.t[-1] == pytest.approx(truth.t[-1], abs=2e-9)
-    assert found.gamma[-1, 0] == pytest.approx(np.pi / 2, abs=1e-9)
+    assert found.gamma[-1, 0] == pytest.approx(np.pi / 2, abs=within)
     assert np.all(found.gamma <= np.pi / 2)
     few = simulate(EXAMPLE2, (5.0, 0.0, 0.0), duration, t_eval=[0.1, 0.2, duration])
     assert few.t == pytest.approx([0.1, 0.2, found.t[-1]], abs=1e-9)
