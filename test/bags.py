@@ -16,6 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.recording.recording import Recording
@@ -286,6 +287,20 @@ def bags():
 def example2(bags):
     """Messages of 0.3 s of Example 2."""
     return simulated(scenes.load("example2"), 0.3)
+
+
+@pytest.fixture(scope="session")
+def example2_bag(tmp_path_factory, example2):
+    """A recording of `example2`, which no test changes."""
+    return write(tmp_path_factory.mktemp("example2") / "bag", example2)
+
+
+@pytest.fixture
+def read(written):
+    """Write messages in the order of their reception, and read them as a recording."""
+    return lambda entries, **options: recording.read(
+        written(sorted(entries, key=lambda entry: entry.received_ns), **options)
+    )
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import hypothesis
 import pytest
-from bags import bags, example2, written
+from bags import bags, example2, example2_bag, read, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.integration import batch, batch_source, codegen
@@ -20,7 +20,7 @@ hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
 pytest_plugins = ["pytester", "unexpected_skips"]
-__all__ = ["bags", "browser", "example2", "written", "wrong_kernel"]
+__all__ = ["bags", "browser", "example2", "example2_bag", "read", "written", "wrong_kernel"]
 
 
 def pytest_pycollect_makemodule(module_path, parent):

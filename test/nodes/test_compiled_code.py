@@ -5,8 +5,7 @@ import contextlib
 import fcntl
 import os
 import re
-import sys
-from types import SimpleNamespace as Box
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,29 +17,6 @@ from sst_ros.nodes import simulator
 from sst_ros.nodes.simulator import CodeCompiler
 from sst_ros.runtime.settings import SimulatorParameters
 
-FAKE = """#!{python}
-import os
-with open({path!r}, "a") as file:
-    print(os.nice(0), file=file)
-"""
-
-
-class Node:
-    """Keeps timers and log lines."""
-
-    def __init__(self):
-        self.timers, self.lines = [], []
-
-    def get_logger(self):
-        return Box(info=self.lines.append)
-
-    def create_timer(self, period_s, callback, *, clock):
-        self.timers.append((period_s, callback))
-        return self.timers[-1]
-
-    def destroy_timer(self, timer):
-        self.timers.remove(timer)
-
 
 @pytest.fixture
 def node(tmp_path, monkeypatch):
@@ -48,10 +24,10 @@ def node(tmp_path, monkeypatch):
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("SST_ROS_NUMBA", raising=False)
     program = tmp_path / "python"
-    program.write_text(FAKE.format(python=sys.executable, path=str(tmp_path / "started")))
+    program.write_text(f"#!/bin/sh\nnice >> '{tmp_path}/started'\n")
     program.chmod(0o755)
     monkeypatch.setattr(simulator.sys, "executable", str(program))
-    return Node()
+    return Mock()
 
 
 @pytest.fixture
@@ -59,15 +35,19 @@ def compiling(node):
     return CodeCompiler(node, load_scene("example2"), SimulatorParameters())
 
 
+def lines(node):
+    return [call.args[0] for call in node.get_logger().info.call_args_list]
+
+
 def test_it_starts_late_once_and_of_the_lowest_priority(node, compiling, tmp_path):
-    ((delay_s, start),) = node.timers
+    delay_s, start = node.create_timer.call_args.args
     assert not compiling.available and delay_s >= 5.0 and not (tmp_path / "started").exists()
     start()
     compiling.start()  # as the end of the node does
-    assert node.timers == []
-    assert sum("compiles the scene for the next start" in line for line in node.lines) == 1
+    node.destroy_timer.assert_called_once_with(node.create_timer.return_value)
+    (pid,) = re.findall(r"process (\d+) compiles the scene for the next start", str(lines(node)))
     with contextlib.suppress(ChildProcessError):  # it has ended, and is waited for
-        os.waitpid(int(re.search(r"process (\d+) compiles", "".join(node.lines))[1]), 0)
+        os.waitpid(int(pid), 0)
     assert (tmp_path / "started").read_text() == "19\n"
 
 
@@ -75,5 +55,6 @@ def test_there_is_one_while_another_process_compiles(node, compiling, tmp_path):
     with (tmp_path / "cache" / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         compiling.start()
-    assert "another process compiles: this one does not" in node.lines
-    assert not (tmp_path / "started").exists() and node.timers == []
+    assert "another process compiles: this one does not" in lines(node)
+    assert not (tmp_path / "started").exists()
+    node.destroy_timer.assert_called_once_with(node.create_timer.return_value)

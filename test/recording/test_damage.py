@@ -135,8 +135,8 @@ def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, en
     assert file.intact and file.unverified == 0
 
 
-def test_recordings_without_checksums_are_read_and_counted(written, example2):
-    assert recording.read(written(example2)).signals.bag.unverified > 0
+def test_recordings_without_checksums_are_read_and_counted(example2_bag):
+    assert recording.read(example2_bag).signals.bag.unverified > 0
 
 
 def test_a_late_flush_makes_no_large_chunk_and_the_index_of_messages_is_not_kept(

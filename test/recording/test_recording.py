@@ -21,14 +21,8 @@ from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.loads import DesiredMotion, Recorded
 
 
-@pytest.fixture
-def reread(written):
-    """Write messages and read them."""
-    return lambda entries, **options: recording.read(written(entries, **options))
-
-
-def test_a_run_comes_back_as_it_was_written(reread, bags, example2):
-    run = reread(example2)
+def test_a_run_comes_back_as_it_was_written(read, bags, example2):
+    run = read(example2)
     assert run.scene == scene.load("example2")
     assert run.start_ns == bags.START_NS
     assert np.array_equal(run.time_ns, np.arange(151) * 2_000_000)
@@ -48,35 +42,35 @@ def test_a_run_comes_back_as_it_was_written(reread, bags, example2):
     assert np.isfinite(run.euler).all() and np.isfinite(run.quaternion).all()
 
 
-def test_joints_are_found_by_name(reread, bags, example2):
+def test_joints_are_found_by_name(read, bags, example2):
     order = [4, 8, 0, 2, 1, 3, 7, 6, 5]
 
     def shuffled(message):
         fields = {f: getattr(message, f)[order] for f in ("position", "velocity", "effort")}
         return dataclasses.replace(message, name=[message.name[i] for i in order], **fields)
 
-    bags.same(reread(bags.edited(example2, bags.JOINTS, 70, shuffled)), reread(example2))
+    bags.same(read(bags.edited(example2, bags.JOINTS, 70, shuffled)), read(example2))
 
 
-def test_topics_that_are_not_essential_may_be_missing(reread, bags, example2):
-    run = reread(bags.without(example2, bags.EULER, bags.DIAGNOSTICS, bags.COMMANDS))
+def test_topics_that_are_not_essential_may_be_missing(read, bags, example2):
+    run = read(bags.without(example2, bags.EULER, bags.DIAGNOSTICS, bags.COMMANDS))
     assert set(run.missing) == {"euler_zyz", "diagnostics", "commands"}
     assert np.isnan(run.euler).all() and run.diagnostics == {}
 
 
 @pytest.mark.parametrize("topic", ["joint_states", "orientation", "applied_torques", "scene"])
-def test_a_missing_essential_topic_is_named(reread, bags, example2, topic):
+def test_a_missing_essential_topic_is_named(read, bags, example2, topic):
     gone = [name for name in bags.KINDS if name.endswith(f"/{topic}")]
     with pytest.raises(InputError, match=f"{topic} = None: no topic of type .* ends in /{topic}"):
-        reread(bags.without(example2, *gone))
+        read(bags.without(example2, *gone))
 
 
-def test_two_matching_topics_are_refused(reread, bags, example2, monkeypatch):
+def test_two_matching_topics_are_refused(read, bags, example2, monkeypatch):
     monkeypatch.setitem(bags.KINDS, "/other/joint_states", bags.KINDS[bags.JOINTS])
     extra = [e for e in example2 if e.topic == bags.JOINTS][:5]
     extra = [dataclasses.replace(entry, topic="/other/joint_states") for entry in extra]
     with pytest.raises(InputError, match=r"/joint_states, /other/joint_states.*only one topic"):
-        reread([*example2, *extra])
+        read([*example2, *extra])
 
 
 def test_what_is_no_bag_is_refused(tmp_path):
@@ -118,13 +112,13 @@ def test_garbled_bytes_never_give_a_traceback(written, bags, example2):
     assert any(isinstance(outcome, InputError) for outcome in outcomes)
 
 
-def test_a_run_that_never_started_or_ends_at_once_says_so(reread, bags, example2):
+def test_a_run_that_never_started_or_ends_at_once_says_so(read, bags, example2):
     with pytest.raises(InputError, match=r"joint_states = 0: .*3 lie before its start"):
-        reread([entry for entry in example2 if entry.sample < 0])
+        read([entry for entry in example2 if entry.sample < 0])
     first = [entry for entry in example2 if entry.sample < 1 and entry.topic != bags.DIAGNOSTICS]
     why = bags.diagnostics_entry(bags.START_NS, phase="fault", fault="stopped: gamma_1 < 0")
     with pytest.raises(InputError, match=r"joint_states = 1: .*stopped: gamma_1 < 0"):
-        reread([*first, why])
+        read([*first, why])
 
 
 AT = 1_700_000_000_123_456_789 + 140_000_000
@@ -141,7 +135,7 @@ CONTENTS = [
 
 
 @pytest.mark.parametrize(("topic", "attribute", "value", "said"), CONTENTS)
-def test_contents_that_cannot_be_are_refused(reread, bags, example2, topic, attribute, value, said):
+def test_contents_that_cannot_be_are_refused(read, bags, example2, topic, attribute, value, said):
     def change(message):
         result, (*parents, last) = copy.deepcopy(message), attribute.split(".")
         owner = getattr(result, parents[0]) if parents else result
@@ -153,21 +147,21 @@ def test_contents_that_cannot_be_are_refused(reread, bags, example2, topic, attr
 
     sample = -1 if topic == "SCENE" else 70
     with pytest.raises(InputError, match=f"(?s){said}"):
-        reread(bags.edited(example2, getattr(bags, topic), sample, change))
+        read(bags.edited(example2, getattr(bags, topic), sample, change))
 
 
-def test_bags_of_every_kind_hold_the_same_run(reread, tmp_path, bags, example2):
+def test_bags_of_every_kind_hold_the_same_run(read, tmp_path, bags, example2):
     expected = recording.read(bags.record(tmp_path / "own", example2))
     bags.same(recording.read(tmp_path / "own" / "own.mcap"), expected)
     modes = (CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE)
     kinds = [{}, {"sqlite": True}, {"chunks": ("lz4", lz4.frame.compress)}]
     for kind in (*kinds, *({"mode": mode} for mode in modes)):
-        run = reread(example2, namespace="/cell_7", **kind)
+        run = read(example2, namespace="/cell_7", **kind)
         bags.same(run, expected)
         assert run.signals.bag.topics["joint_states"] == "/cell_7/joint_states"
 
 
-def test_idle_states_are_no_samples(reread, bags, example2):
+def test_idle_states_are_no_samples(read, bags, example2):
     """They are marked in their frame; those of older recordings have the stamp zero."""
 
     def marked(entry):
@@ -177,23 +171,23 @@ def test_idle_states_are_no_samples(reread, bags, example2):
         content = dataclasses.replace(entry.content, header=header)
         return dataclasses.replace(entry, content=content)
 
-    plain, run = reread(example2), reread([marked(entry) for entry in example2])
+    plain, run = read(example2), read([marked(entry) for entry in example2])
     bags.same(run, plain)
     assert run.idle_states == plain.idle_states == 3
 
 
-def test_a_recording_is_read_in_one_pass(reread, example2, monkeypatch):
+def test_a_recording_is_read_in_one_pass(read, example2, monkeypatch):
     """All tables, the tracking error and the figures of the report come from one reading."""
     passes, messages = [], Bag.messages
     monkeypatch.setattr(Bag, "messages", lambda bag: passes.append(bag) or messages(bag))
-    run = reread(example2)
+    run = read(example2)
     assert set(run.signals.tables) == {"samples", "ticks", "commands"} and run.ticks.period_ns
     assert len(passes) == 1
 
 
-def test_a_recording_is_a_trajectory_and_tables(tmp_path, bags, example2):
+def test_a_recording_is_a_trajectory_and_tables(example2_bag):
     pytest.importorskip("pandas")
-    run = sst_ros.read_bag(bags.write(tmp_path / "bag", example2))
+    run = sst_ros.read_bag(example2_bag)
     motion = run.trajectory
     assert isinstance(run, sst_ros.Recording) and isinstance(motion, sst_ros.Trajectory)
     assert np.array_equal(motion.gamma, run.gamma) and np.array_equal(motion.torque, run.effort)
@@ -207,19 +201,14 @@ def test_a_recording_is_a_trajectory_and_tables(tmp_path, bags, example2):
     assert np.array_equal(table["tau_1_N_m"], run.ticks.torque[:, 0]) and table.index[0] == 0
 
 
-@pytest.fixture
-def bag(written, example2):
-    return written(example2)
-
-
 def following(bag):
     motion = DesiredMotion(recorded=Recorded(bag=str(bag)))
     return dataclasses.replace(scene.load("example2"), motion=motion)
 
 
-def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag):
+def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(example2_bag):
     """Held for 1 ms they are a staircase; the smooth motion asks for what lies between."""
-    run, held = recording.read(bag), following(bag)
+    run, held = recording.read(example2_bag), following(example2_bag)
     plan = examine_motion(reference_motion(held, read_run_motion), held)
     assert plan.motion.duration == pytest.approx(run.seconds[-1], abs=1e-12)
     for row in (0, 40, len(run.gamma) - 1):
@@ -236,16 +225,16 @@ def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(bag)
     assert np.abs(expected).max() > 100.0 * half_a_step
 
 
-def test_the_command_reads_the_bag(bag, tmp_path, capsys):
+def test_the_command_reads_the_bag(example2_bag, tmp_path, capsys):
     path = tmp_path / "again.yaml"
-    path.write_text(yaml_document.dump(following(bag)), encoding="utf-8")
+    path.write_text(yaml_document.dump(following(example2_bag)), encoding="utf-8")
     assert cli.main(["plan", "check", str(path)]) == 0
     assert "At any speed: the scene has no limit" in capsys.readouterr().out
 
 
-def test_what_is_no_motion_of_the_manipulator_is_refused(bag, tmp_path):
+def test_what_is_no_motion_of_the_manipulator_is_refused(example2_bag, tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         reference_motion(following(tmp_path / "nowhere"), read_run_motion)
-    other = dataclasses.replace(scene.load("general"), motion=following(bag).motion)
+    other = dataclasses.replace(scene.load("general"), motion=following(example2_bag).motion)
     with pytest.raises(Exception, match="does not close the loops"):
         reference_motion(other, read_run_motion)

@@ -21,8 +21,8 @@ from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Mom
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, bags, example2):
-    return recording.read(bags.write(tmp_path_factory.mktemp("run") / "bag", example2))
+def run(example2_bag):
+    return recording.read(example2_bag)
 
 
 @pytest.fixture(scope="module")

@@ -29,9 +29,9 @@ class Clock:
         monkeypatch.setattr(source.time, "monotonic", lambda: self.now)
 
 
-def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
-    clock, run = Clock(monkeypatch), read(bag)
-    reel = source.Replay(bag)
+def test_it_plays_every_sample_once_and_ends(example2_bag, monkeypatch):
+    clock, run = Clock(monkeypatch), read(example2_bag)
+    reel = source.Replay(example2_bag)
     seen = list(reel.states())
     while reel.playing:
         clock.now += 1.0 / 30.0
@@ -41,9 +41,9 @@ def test_it_plays_every_sample_once_and_ends(bag, monkeypatch):
     assert np.array([sample.torque for sample in seen]) == pytest.approx(run.effort, abs=0.0)
 
 
-def test_hold_seek_and_speed(bag, monkeypatch):
+def test_hold_seek_and_speed(example2_bag, monkeypatch):
     clock = Clock(monkeypatch)
-    reel = source.Replay(bag)
+    reel = source.Replay(example2_bag)
     reel.set_speed(0.5)
     clock.now += 0.2
     assert reel.states()[-1].time == pytest.approx(0.1)
@@ -63,8 +63,8 @@ def test_hold_seek_and_speed(bag, monkeypatch):
 @pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_page_of_a_bag(bag, browser):
-    command = [sys.executable, "-m", "sst_ros", "view", str(bag), "--port", "18180"]
+def test_the_page_of_a_bag(example2_bag, browser):
+    command = [sys.executable, "-m", "sst_ros", "view", str(example2_bag), "--port", "18180"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as process:
         try:
