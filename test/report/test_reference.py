@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bags import SCENE, altered, edited, with_moment
+from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
@@ -17,7 +18,7 @@ from sst_ros.recording import recording
 from sst_ros.report import reference, states
 from sst_ros.report.run import summarise
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Moment, Spring
+from sst_ros.scene.loads import Actuators, Moment
 
 
 @pytest.fixture(scope="module")
@@ -159,25 +160,18 @@ def recorded(read, bags):
 
 
 EXAMPLE2 = scene.load("example2")
-LOADED = replace(
-    EXAMPLE2,
-    star=replace(EXAMPLE2.star, mass=2.6, centre=(0.0, 0.0, 0.2)),
-    gravity=Gravity(acceleration=(0.0, 0.0, -9.8)),
-    friction=JointFriction(mu=Friction(viscous=0.1, coulomb=0.2)),
-    springs=(Spring(joint="beta_2", stiffness=3.0, rest=0.1),),
-    moment=Moment(value=(0.1, 0.2, 0.3)),
-)
+LOADED = replace(loaded(), moment=Moment(value=(0.1, 0.2, 0.3)))
 
 
 @pytest.mark.parametrize(
     "some",
     [
         LOADED,
-        replace(EXAMPLE2, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0)),
+        replace(LOADED, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0)),
         replace(EXAMPLE2, actuators=Actuators(torque_limit=2.5)),
         replace(EXAMPLE2, actuators=Actuators(time_constant=0.02, torque_limit=2.5)),
     ],
-    ids=["loads", "rotors", "limit", "lag and limit"],
+    ids=["loads", "loads and rotors", "limit", "lag and limit"],
 )
 def test_loads_and_actuators_are_compared_as_they_are(recorded, some):
     integration, ideal, notes = judged(recorded(some))

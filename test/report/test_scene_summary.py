@@ -8,13 +8,14 @@ import re
 from dataclasses import replace
 
 import pytest
+from loaded_scenes import loaded
 
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.report.scene_summary import TERMS, WIDTH, costs, has, operations, summary, without
 from sst_ros.report.step_advice import step_advice
-from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment, Spring, Stroke
-from sst_ros.scene.scene import Scene, load, names
+from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment
+from sst_ros.scene.scene import load, names
 
 EXAMPLE2 = load("example2_heavy")
 QUICK = ("elastic_stops", "friction", "general")
@@ -22,20 +23,6 @@ every_scene = pytest.mark.parametrize(
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names()],
 )
-
-
-def everything() -> Scene:
-    rub = Friction(viscous=1.0, coulomb=1.0, static=2.0)
-    return replace(
-        load("gravity_payload"),
-        moment=Moment(topic=True),
-        friction=JointFriction(gamma=rub, mu=rub, beta=rub),
-        springs=(Spring(joint="mu_1", stiffness=1.0, rest=0.0),),
-        actuators=Actuators(
-            rotor_inertia=1e-4, gear_ratio=10.0, torque_limit=3.0, time_constant=0.1
-        ),
-        stroke=Stroke(at_end="elastic", stiffness=100.0, damping=1.0),
-    )
 
 
 @pytest.mark.parametrize(("name", "bare"), [("example2_heavy", 290), ("general", 388)])
@@ -55,18 +42,18 @@ def test_operations_are_counted_in_the_generated_source(name):
 
 
 def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
-    scene = everything()
+    scene = loaded()
     for term in TERMS:
         if term not in ("actuated links", "intermediate links"):
             assert has(scene, term), term
             scene = without(scene, term)
-    assert Dynamics.of(scene).program == Dynamics.of(load("example2_stroke")).program
+    assert Dynamics.of(scene).program == Dynamics.of(load("general")).program
 
 
 def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
     """Inertias and limits fold into constants or act outside the right-hand side."""
-    added = {cost.name: cost.adds for cost in costs(everything())}
-    folded = {"payload", "rotors", "torque limit"}
+    added = {cost.name: cost.adds for cost in costs(loaded())}
+    folded = {"actuated links", "payload", "rotors", "torque limit"}
     assert {name for name, adds in added.items() if not adds} == folded
 
 

@@ -182,17 +182,18 @@ def test_a_stop_before_the_run_forgets_the_trajectory():
 
 
 DEFAULTS = ControllerNodeParameters(motion="topic", path_tolerance=0.1, goal_tolerance=0.01)
+FREE = ControllerNodeParameters(motion="topic", stopped_velocity_tolerance=0.0)
 
 
 def tolerance(name="gamma_2", position=0.0, velocity=0.0, acceleration=0.0):
     return Message(name=name, position=position, velocity=velocity, acceleration=acceleration)
 
 
-def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0):
+def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0, multi=()):
     points = [Message(time_from_start=duration(time * 1e9)) for time in times]
     return Message(
         trajectory=Message(points=points),
-        multi_dof_trajectory=Message(joint_names=[], points=[]),
+        multi_dof_trajectory=Message(joint_names=[*multi], points=[]),
         path_tolerance=path,
         goal_tolerance=goal,
         component_path_tolerance=[],
@@ -235,16 +236,13 @@ DONE = ErrorCode.SUCCESSFUL
         (DONE, {"time": 2.001, "off": 0.0099}),
         (GOAL, {"time": 1.21, "off": 0.0101, "goal_time": 0.2}),
         (None, {"time": 1e6, "off": 0.0101, "goal_time": -1.0}),
+        # Without tolerances a goal ends with its last point.
+        (None, {"time": 0.999, "off": 9.0, "rate": 9.0, "defaults": FREE}),
+        (DONE, {"time": 1.0, "off": 9.0, "rate": 9.0, "defaults": FREE}),
     ],
 )
 def test_a_goal_goes_on_or_ends(expected, case):
     assert outcome(**case) == expected
-
-
-def test_without_tolerances_a_goal_ends_with_its_last_point():
-    free = ControllerNodeParameters(motion="topic", stopped_velocity_tolerance=0.0)
-    assert outcome(0.999, 9.0, 9.0, free) is None
-    assert outcome(1.0, 9.0, 9.0, free) is DONE
 
 
 def test_the_message_names_the_joint_and_both_numbers():
@@ -269,15 +267,9 @@ def test_the_index_is_that_of_the_point_ahead():
         ({"goal": [tolerance(), tolerance(velocity=-0.5)]}, r"goal_tolerance\[1\].velocity"),
         ({"path": [tolerance(position=np.nan)]}, r"path_tolerance\[0\].position"),
         ({"goal_time": -2.0}, "goal_time_tolerance"),
+        ({"multi": ["base"]}, r"multi_dof_trajectory\.joint_names"),
     ],
 )
-def test_bad_tolerances_are_refused(given, place):
+def test_bad_tolerances_and_joints_of_several_freedoms_are_refused(given, place):
     with pytest.raises(InputError, match=place):
         TrajectoryGoal(message(**given), DEFAULTS)
-
-
-def test_joints_of_several_freedoms_are_refused():
-    given = message()
-    given.multi_dof_trajectory.joint_names = ["base"]
-    with pytest.raises(InputError, match=r"multi_dof_trajectory\.joint_names"):
-        TrajectoryGoal(given, DEFAULTS)
