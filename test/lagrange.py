@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from mpmath import mp, mpf
+from numpy import cross
 
 DIGITS = 80
 STEP = mpf(10) ** -13
@@ -17,12 +18,6 @@ STEP = mpf(10) ** -13
 
 EYE = np.eye(3, dtype=object)
 exact = np.frompyfunc(mpf, 1, 1)
-
-
-def cross(a, b):
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
 
 
 def unit(a):

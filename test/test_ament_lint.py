@@ -22,15 +22,7 @@ PEP257_EXCEPTIONS = (
 
 LINTERS = {
     # Its exceptions: setup.cfg.
-    "ament_flake8": (
-        "--config",
-        "setup.cfg",
-        *FOLDERS,
-        "setup.py",
-        "test",
-        "benchmark",
-        "examples",
-    ),
+    "ament_flake8": ("--config", "setup.cfg", "setup.py", *PYTHON),
     "ament_pep257": (*FOLDERS, "setup.py", "--add-ignore", *PEP257_EXCEPTIONS),
     # Validates package.xml by its schema; without a network it needs XML_CATALOG_FILES.
     "ament_xmllint": ("package.xml", "config", "sst_ros"),

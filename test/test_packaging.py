@@ -75,13 +75,12 @@ def depends():
 @pytest.fixture(scope="module")
 def required():
     """Names of the Python packages that setup.py asks for, without the wheels of ROS."""
+    given = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
-        patch.setattr("setuptools.setup", lambda **_: None)
-        extras = runpy.run_path("setup.py")["EXTRAS"]
-    text = (ROOT / "setup.py").read_text(encoding="utf-8")
-    always = re.findall(r'"([\w.-]+)', text[text.index("install_requires=") :].partition("]")[0])
-    words = [*always, *extras["all"]]
+        patch.setattr("setuptools.setup", given.update)
+        runpy.run_path("setup.py")
+    words = [*given["install_requires"], *given["extras_require"]["all"]]
     names = {re.match(r"[\w-]+", word)[0] for word in words}
     return {name for name in names if not name.startswith("ros-")}
 

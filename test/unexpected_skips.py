@@ -22,16 +22,12 @@ class UnexpectedSkips:
         self.found = []
 
     def pytest_runtest_logreport(self, report):
-        self._look_at(report)
-
-    def pytest_collectreport(self, report):
-        self._look_at(report)
-
-    def _look_at(self, report):
         if report.skipped and not hasattr(report, "wasxfail"):
             reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
             if not any(allowed in str(reason) for allowed in ALLOWED):
                 self.found.append(f"{report.nodeid}: {reason}")
+
+    pytest_collectreport = pytest_runtest_logreport
 
     def pytest_sessionfinish(self, session):
         if self.found:
