@@ -191,9 +191,7 @@ def test_bad_input_is_refused(names, change, message):
         identify(read, load_scene("example2_heavy"), names, method="simulation")
 
 
-def test_options_of_the_other_method_are_refused():
+def test_a_scene_without_torques_is_refused():
     scene = manipulators.thin_arcs()
-    with pytest.raises(InputError, match="takes no cutoff"):
-        identify({}, scene, ("star.inertia.zz",), method="simulation", cutoff=3.0)
     with pytest.raises(InputError, match="must be in the scene"):
         identify({"t": [0.1], "psi": [0.0]}, scene, ("star.inertia.zz",), method="simulation")

@@ -100,17 +100,14 @@ def test_a_row_is_the_scene_with_these_numbers(manipulators, samples):
     assert found == [one.scene for one in samples]
 
 
-def alone(rows, n):
+def alone(scene, gamma, gamma_dot, torque, tick_ns, count):
     """A run by variable steps of a simulation of its own, and what ended it."""
-    initial = Initial(gamma=tuple(rows.gamma[n]), gamma_dot=tuple(rows.gamma_dot[n]))
-    scene = replace(rows.batch.scenario(n), initial=initial)
+    initial = Initial(gamma=tuple(gamma), gamma_dot=tuple(gamma_dot))
     try:
-        simulation = Simulation(scene, "dop853")
+        simulation = Simulation(replace(scene, initial=initial), "dop853")
+        simulation.steps(torque, tick_ns, count)
     except AssemblyError:
         return None, "no unique admissible assembly", 0.0
-    torque = scene.torque.at if rows.torque is None else tuple(rows.torque[n])
-    try:
-        simulation.steps(torque, round(rows.step * 1e9), 100)
     except RunStopped as stopped:
         return simulation.state, stopped.reason, stopped.time
     return simulation.state, "reached the end", None
@@ -118,7 +115,9 @@ def alone(rows, n):
 
 @pytest.mark.parametrize("n", [*range(0, FEW, 2), 7])
 def test_a_scenario_equals_a_run_of_its_own(rows, n):
-    state, reason, time = alone(rows, n)
+    torque = EXAMPLE2.torque.at if rows.torque is None else tuple(rows.torque[n])
+    tick_ns, scene = round(rows.step * 1e9), rows.batch.scenario(n)
+    state, reason, time = alone(scene, rows.gamma[n], rows.gamma_dot[n], torque, tick_ns, 100)
     result, bound = rows.result, 1e-10 if rows.torque is None else 1e-9
     assert result.message[n] == reason
     if state is not None:
@@ -267,16 +266,11 @@ def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation(interpreted)
     found = Batch(scene).run(gamma, rate, torque, step=0.06, count=2)
     ended = 0
     for n in range(0, N, 4):
-        initial = Initial(gamma=tuple(gamma[n]), gamma_dot=tuple(rate[n]))
-        simulation = Simulation(replace(scene, initial=initial), "dop853")
-        try:
-            simulation.step(tuple(torque[n]), 120_000_000)
-        except RunStopped as stopped:
+        _, reason, time = alone(scene, gamma[n], rate[n], tuple(torque[n]), 120_000_000, 1)
+        assert found.message[n] == reason
+        if time is not None:
             ended += 1
-            assert found.message[n] == stopped.reason
-            assert found.fault_time[n] == pytest.approx(stopped.time, abs=1e-6)
-        else:
-            assert found.message[n] == "reached the end"
+            assert found.fault_time[n] == pytest.approx(time, abs=1e-6)
     assert 0.2 * N < 4 * ended < 0.8 * N
 
 

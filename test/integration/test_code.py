@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import fcntl
 import os
-import subprocess
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from loaded_scenes import IGNORE, REST, start_of
+from loaded_scenes import IGNORE, start_of
+from programs import python
 
 from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import code_is_there, make_code
@@ -92,21 +93,8 @@ def test_collocation_of_another_inertia_needs_no_compilation(tmp_path, monkeypat
     assert len(made) >= 3 and files_of(tmp_path) == made
 
 
-def started(cache, **more):
-    environment = {**os.environ, "SST_ROS_CACHE": str(cache), **more}
-    return subprocess.Popen(
-        [sys.executable, "-c", SOURCE],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def ended(process):
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0, err
-    return out.strip(), err
+def run_with(cache):
+    return python(SOURCE, env={"SST_ROS_CACHE": str(cache)}).stdout.strip()
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +107,8 @@ def truth():
 def cache(tmp_path_factory, truth):
     """A cache that two processes have filled at once."""
     folder = tmp_path_factory.mktemp("cache")
-    processes = [started(folder), started(folder)]
-    for process in processes:
-        assert ended(process)[0] == f"{truth} True"
+    with ThreadPoolExecutor(2) as pool:
+        assert [*pool.map(run_with, [folder] * 2)] == [f"{truth} True"] * 2
     return folder
 
 
@@ -134,7 +121,7 @@ def test_two_processes_that_start_at_once_share_one_cache_and_a_third_compiles_n
     assert {path.suffix for path in cache.iterdir()} == {".py", ""}
     before = files_of(cache)
     assert {path.suffix for path in before} == {".py", ".nbi", ".nbc"}
-    assert ended(started(cache))[0] == f"{truth} True"
+    assert run_with(cache) == f"{truth} True"
     assert files_of(cache) == before
 
 
@@ -152,7 +139,7 @@ def cut_off(cache, pattern, left):
 def test_cut_off_files_are_repaired(left, cache, truth):
     """Source, index and machine code; at the end all can be loaded again."""
     files = [path for kind in ("sst_*.py", "*.nbi", "*.nbc") for path in cut_off(cache, kind, left)]
-    assert ended(started(cache))[0] == f"{truth} True"
+    assert run_with(cache) == f"{truth} True"
     assert all(path.stat().st_size > 40 for path in files)
 
 
@@ -162,29 +149,23 @@ def test_a_folder_that_cannot_be_written_means_compiling_anew(tmp_path, truth):
     """A file stands where the folder should be: that stops root too."""
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    assert ended(started(blocked / "cache"))[0] == f"{truth} True"
+    assert run_with(blocked / "cache") == f"{truth} True"
 
 
-def test_without_numba_plain_python_runs_and_says_so(monkeypatch, truth):
-    monkeypatch.setenv("SST_ROS_NUMBA", "0")
-    assert not code_is_there(EXAMPLE1, "rk4")
-    with pytest.warns(RuntimeWarning, match="running plain Python, slower, the same digits"):
-        simulation = Simulation(load("example1"), "rk4", compiled=True)
-    assert not simulation.compiled
-    assert str(simulation.step((1.0, 2.0, 3.0), MILLISECOND).quaternion) == truth
-
-
-def test_a_numba_that_cannot_be_imported_is_none(monkeypatch):
-    monkeypatch.setitem(sys.modules, "numba", None)
+@pytest.mark.parametrize("missing", ["switched off", "not installed"])
+def test_without_numba_plain_python_runs_and_says_so_to_who_asked(missing, monkeypatch, truth):
+    if missing == "switched off":
+        monkeypatch.setenv("SST_ROS_NUMBA", "0")
+    else:
+        monkeypatch.setitem(sys.modules, "numba", None)
     assert codegen.numba_version() is None
-    with pytest.warns(RuntimeWarning, match="no numba"):
-        assert not Simulation(load("example1"), compiled=True).compiled
-
-
-def test_who_does_not_ask_for_numba_is_not_warned(monkeypatch):
-    monkeypatch.setenv("SST_ROS_NUMBA", "0")
+    assert not code_is_there(EXAMPLE1, "rk4")
+    said = "no numba(.|\n)*running plain Python, slower, the same digits"
+    with pytest.warns(RuntimeWarning, match=said):
+        asked = Simulation(EXAMPLE1, "rk4", compiled=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        simulation = Simulation(load("example1"))
-        simulation.step(REST, MILLISECOND)
-    assert not simulation.compiled
+        unasked = Simulation(EXAMPLE1, "rk4")
+        for one in (asked, unasked):
+            assert not one.compiled
+            assert str(one.step((1.0, 2.0, 3.0), MILLISECOND).quaternion) == truth

@@ -42,13 +42,15 @@ RATE = 3.0
 MILLISECOND = 1_000_000
 
 
+START = Simulation(replace(EXAMPLE2, initial=Initial(gamma=GAMMA))).state
+AT = virtual_work.posture(
+    Geometry.of(EXAMPLE2), np.array(START.joints.gamma), rotation_matrix(START.quaternion)
+)
+
+
 def turning(scene, axis, method="dop853"):
     """Simulation whose star turns about a fixed axis in {B} at RATE."""
-    start = Simulation(replace(scene, initial=Initial(gamma=GAMMA))).state
-    rotation = rotation_matrix(start.quaternion)
-    at = virtual_work.posture(Geometry.of(scene), start.joints.gamma, rotation)
-    gamma_dot = np.linalg.solve(at.j, RATE * axis)
-    moving = Initial(gamma=GAMMA, gamma_dot=tuple(gamma_dot))
+    moving = Initial(gamma=GAMMA, gamma_dot=tuple(np.linalg.solve(AT.j, RATE * axis)))
     return Simulation(replace(scene, initial=moving), method, tolerance=1e-13)
 
 
@@ -71,10 +73,9 @@ def met(simulation, error):
 @pytest.mark.parametrize("leg", [0, 1, 2])
 def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
     """The star turns t_k straight into w_k, at a constant rate."""
-    at = virtual_work.posture(Geometry.of(EXAMPLE2), *admissible())
-    axis = np.cross(at.t[leg], at.w[leg])
+    axis = np.cross(AT.t[leg], AT.w[leg])
     size = np.linalg.norm(axis)
-    mu = math.atan2(size, at.t[leg] @ at.w[leg])
+    mu = math.atan2(size, AT.t[leg] @ AT.w[leg])
     simulation = turning(FREE_STAR, axis / size)
     stop = met(simulation, SingularityReached)
     assert stop.reason == f"serial singularity, mu_{leg + 1} = 0"
@@ -83,34 +84,27 @@ def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
 
 @pytest.mark.parametrize("leg", [0, 1, 2])
 def test_the_edge_of_the_workspace_is_met_when_e_lies_in_the_plane_of_an_arc(leg):
-    at = virtual_work.posture(Geometry.of(EXAMPLE2), *admissible())
-    s = at.rotation[:, 2]
-    axis = np.cross(s, -at.w[leg])
+    s = AT.rotation[:, 2]
+    axis = np.cross(s, -AT.w[leg])
     axis /= np.linalg.norm(axis)
     simulation = turning(replace(FREE_STAR, workspace=EXAMPLE2.workspace), axis)
     stop = met(simulation, WorkspaceLeft)
     assert stop.reason.startswith(f"beta_{leg + 1}")
-    assert abs(stop.time - first_root(axis, s, at.w[leg])) < 1e-12
+    assert abs(stop.time - first_root(axis, s, AT.w[leg])) < 1e-12
 
 
 @pytest.mark.parametrize(("upper", "method"), [(False, "dop853"), (True, "dop853"), (True, "auto")])
 def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     """gamma_k has a value where t_k is at right angles to r_k there."""
     geometry = Geometry.of(EXAMPLE2)
-    at = virtual_work.posture(geometry, *admissible())
-    axis = at.rotation[:, 2] * (1.0 if upper else -1.0)
+    axis = AT.rotation[:, 2] * (1.0 if upper else -1.0)
     simulation = turning(replace(FREE_STAR, stroke=Stroke()), axis, method)
     stop = met(simulation, StrokeExceeded)
     k = int(stop.reason.removeprefix("gamma_")[0]) - 1
     ends = kinematics.carriage_directions(geometry, geometry.arc if upper else np.zeros(3))
-    times = [first_root(axis, at.t[j], ends[j]) for j in range(3)]
+    times = [first_root(axis, AT.t[j], ends[j]) for j in range(3)]
     assert abs(stop.time - times[k]) < 1e-12
     assert times[k] == min(times)
-
-
-def admissible():
-    state = Simulation(replace(EXAMPLE2, initial=Initial(gamma=GAMMA))).state
-    return np.array(state.joints.gamma), rotation_matrix(state.quaternion)
 
 
 def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
