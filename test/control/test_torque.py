@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from models import FAST
 
 from sst_ros.errors import InputError
-from sst_ros.scene.scene import SineTorque, load
+from sst_ros.scene.scene import load
 from sst_ros.simulation.torque_profile import TorqueTable
 
 HEADER = "time,tau_1,tau_2,tau_3\n"
@@ -31,11 +31,6 @@ def test_torques_of_example_2_are_the_printed_ones(t):
     assert first == pytest.approx(4.0 * math.sin(18.0 * t), abs=1e-13)
     assert second == pytest.approx(5.0 * math.cos(12.0 * t), abs=5e-13)
     assert third == pytest.approx(3.0 * math.cos(24.0 * t), abs=5e-13)
-
-
-def test_a_sine_starts_at_its_phase():
-    torque = SineTorque(amplitude=[1, 2, 3], frequency=[0, 0, 0], phase=[0, math.pi / 2, -1])
-    assert torque.at(123.0) == (0.0, 2.0, 3.0 * math.sin(-1.0))
 
 
 def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_path):

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mechanism once more, written without sst_ros: what the tests of this folder compare with.
-
-Random manipulators and states; all assemblies as the eight complex zeros of three quadrics.
-"""
+"""Random manipulators and states; all assemblies as the eight complex zeros of three quadrics."""
 
 from itertools import combinations, combinations_with_replacement, product
 
 import numpy as np
 from lagrange import exact, solve
-from models import Sample, rigid_body, scene_of
+from models import Sample, assembly_of, rigid_body, scene_of
 from mpmath import mp
 from scipy.spatial.transform import Rotation
 
+from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry
 
 ISOTROPIC = Geometry.build(np.eye(3), np.radians([120.0, 120.0, 120.0]))
@@ -49,17 +47,10 @@ def random_pose(rng, geometry, least=0.2):
     """gamma and R well away from both kinds of singularity."""
     while True:
         rotation = random_rotation(rng)
-        t = geometry.e @ rotation.T
-        p = np.cross(t, geometry.w)
-        sine = np.linalg.norm(p, axis=1)
-        if sine.min() < least:
-            continue
-        r = p / sine[:, None]
-        if abs(np.linalg.det(np.cross(r, t))) < least:
-            continue
-        across = np.cross(geometry.w, geometry.v)
-        gamma = np.arctan2(np.sum(r * across, axis=1), np.sum(r * geometry.v, axis=1))
-        return gamma, rotation
+        gamma, mu, _ = kinematics.inverse(geometry, rotation)
+        det_j2 = assembly_of(geometry, gamma, rotation).det_j2
+        if min(np.sin(mu).min(), abs(det_j2)) >= least:
+            return gamma, rotation
 
 
 def rotation_of(q):
@@ -193,17 +184,16 @@ def census(solve, geometries, gammas, hardest):
     digits: at least `hardest` of them, and all with a gap below 1e-5. Returns how many
     configurations there were, assemblies that were missing and spurious, and the least gap.
     """
-    r = np.concatenate([_carriages(g, x) for g, x in zip(geometries, gammas, strict=True)])
-    e = np.concatenate(
-        [np.tile(g.e, (len(x), 1, 1)) for g, x in zip(geometries, gammas, strict=True)]
-    )
+    pairs = list(zip(geometries, gammas, strict=True))
+    r = np.concatenate([kinematics.carriage_directions(*pair) for pair in pairs])
+    e = np.concatenate([np.tile(g.e, (len(x), 1, 1)) for g, x in pairs])
     zeros, gap = complex_zeros(quadrics(r, e))
     imaginary = np.abs(zeros.imag).max(axis=2)
     doubtful = np.where(imaginary > 1e-10, imaginary, np.inf).min(axis=1)
     order = np.argsort(np.minimum(gap, doubtful))
     exact_rows = set(order[:hardest]) | set(np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0])
     missing = spurious = index = 0
-    for geometry, gamma in zip(geometries, gammas, strict=True):
+    for geometry, gamma in pairs:
         owner, rotations, valid = solve(geometry, gamma)
         for row in range(len(gamma)):
             mine = owner == row
@@ -216,11 +206,6 @@ def census(solve, geometries, gammas, hardest):
             assert expected_valid == int(np.sum(valid[mine])), (geometry, gamma[row])
             missing, spurious, index = missing + lost, spurious + extra, index + 1
     return index, missing, spurious, float(gap.min())
-
-
-def _carriages(geometry, gamma):
-    across = np.cross(geometry.w, geometry.v)
-    return np.cos(gamma)[..., None] * geometry.v + np.sin(gamma)[..., None] * across
 
 
 def _admissible(geometry, r, rotation):

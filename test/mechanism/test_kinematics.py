@@ -81,9 +81,8 @@ def folds(count, seed):
             return turned(x, axis, start)
 
         def volume(x, geometry=geometry, pose=pose):
-            t = geometry.e @ pose(x).T
-            p = np.cross(t, geometry.w)
-            return np.linalg.det(np.cross(p / np.linalg.norm(p, axis=1)[:, None], t))
+            gamma = kinematics.inverse(geometry, pose(x))[0]
+            return assembly_of(geometry, gamma, pose(x)).det_j2
 
         values = [volume(x) for x in np.linspace(0, 3, 20)]
         for i in range(19):
