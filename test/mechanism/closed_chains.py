@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random manipulators and states; all assemblies as the eight complex zeros of three quadrics."""
 
-from itertools import combinations, combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 from lagrange import exact, solve
@@ -69,16 +69,13 @@ _ROW = {monomial: row for row, monomial in enumerate(_FOURTH)}
 
 def _patterns():
     """Symmetric P_ij with R_ij(q) = q . P_ij q for quaternions (w, x, y, z), (3, 3, 4, 4)."""
-    p = np.zeros((3, 3, 4, 4))
-    for i, j in product(range(3), repeat=2):
-        p[i, j, 1 + i, 1 + j] += 1.0
-        p[i, j, 1 + j, 1 + i] += 1.0
-        if i == j:
-            p[i, i] += np.diag([1.0, -1.0, -1.0, -1.0])
-        else:
-            k, sign = 3 - i - j, 1.0 if (j - i) % 3 == 1 else -1.0
-            p[i, j, 0, 1 + k] = p[i, j, 1 + k, 0] = -sign
-    return p
+
+    def form(q):
+        return (q @ q) * rotation_of(q)
+
+    units = np.eye(4)
+    twice = [[form(a + b) - form(a) - form(b) for b in units] for a in units]
+    return np.round(np.moveaxis(twice, (0, 1), (2, 3)) / 2.0)  # all are 0, 1 or -1
 
 
 def quadrics(r, e):
@@ -105,9 +102,7 @@ def complex_zeros(forms, seed=7):
     linear = np.random.default_rng(seed).normal(size=(2, 4))
     times = [[_ROW[tuple(sorted((*third, i)))] for third in _THIRD] for i in range(4)]
     first, second = (sum(form[i] * null[:, times[i]] for i in range(4)) for form in linear)
-    values, vectors = np.linalg.eig(np.linalg.pinv(first) @ second)
-    del values
-    thirds = first @ vectors
+    thirds = first @ np.linalg.eig(np.linalg.pinv(first) @ second)[1]
     cubes = [_THIRD.index((i, i, i)) for i in range(4)]
     largest = np.argmax(np.abs(thirds[:, cubes]), axis=1)
     q = np.empty((n, 8, 4), dtype=complex)
