@@ -3,11 +3,8 @@
 
 import base64
 import dataclasses
-import importlib
 import json
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,6 @@ from sst_ros.report.results import render
 from sst_ros.report.run import evaluate_run, summary_table, summary_text, write_run_report
 from sst_ros.scene import scene
 
-ROOT = str(Path(__file__).parents[2])
 LATENCY_NS = 400_000
 SENT_NS = 50_000
 PROFILE = scene.load("example2").torque.at
@@ -376,17 +372,11 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
 
 
 @pytest.fixture(scope="module")
-def long_bag():
-    """Import benchmark/long_bag.py, which is not part of the package."""
+def long_run(tmp_path_factory):
     pytest.importorskip("numba")
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
-    sys.path.insert(0, ROOT)
-    yield importlib.import_module("benchmark.long_bag")
-    sys.path.remove(ROOT)
+    from benchmark import long_bag
 
-
-@pytest.fixture(scope="module")
-def long_run(long_bag, tmp_path_factory):
     return recording.read(long_bag.write(tmp_path_factory.mktemp("long") / "bag", 20.0))
 
 

@@ -103,24 +103,24 @@ def test_the_numbers_are_ten_and_a_hundred_times_those_of_the_scene():
     assert changed("friction") == "the scene has no friction"
 
 
+def measures_at_start(scene):
+    geometry = Geometry.of(scene)
+    rotation = rotation_matrix(np.array(scene.initial.orientation))
+    gamma, _, _ = kinematics.inverse(geometry, rotation)
+    return workspace.measures(geometry, gamma, rotation)
+
+
 @pytest.mark.parametrize("kind", ["stroke", "edge", "reach"])
 def test_a_run_at_a_limit_starts_there_and_goes_into_it(kind):
     scene = changed(kind)
     assert isinstance(scene, Scene)
-    geometry = Geometry.of(scene)
-    rotation = rotation_matrix(np.array(scene.initial.orientation))
-    measured = workspace.measures(geometry, np.array(scene.initial.gamma), rotation)
-    assert 0.0 <= getattr(measured, kind) < 1e-9
+    assert 0.0 <= getattr(measures_at_start(scene), kind) < 1e-9
     report = examine_stability(EXAMPLE2, [kind])
     assert report.passed and report.runs[0].result.startswith("stopped at t = 0.0000")
 
 
 def test_a_run_beside_a_singularity_starts_beside_it():
-    scene = changed("singularity")
-    geometry = Geometry.of(scene)
-    rotation = rotation_matrix(np.array(scene.initial.orientation))
-    gamma, _, _ = kinematics.inverse(geometry, rotation)
-    measured = workspace.measures(geometry, gamma, rotation)
+    measured = measures_at_start(changed("singularity"))
     assert min(abs(measured.det_j1), abs(measured.det_j2)) < 2e-3
 
 

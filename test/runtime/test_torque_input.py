@@ -91,21 +91,15 @@ def test_a_stale_command_is_let_go_of_and_a_fresh_one_held_again():
     assert bench.torque((0.0, 0.0, 1.0)) == (0.0, 0.0, 1.0) and not bench.board.stale
 
 
-def test_damping_takes_over_within_the_limit():
+def test_limits_clamp_and_count_and_hold_for_the_damping_that_takes_over():
     bench = Bench(Actuators(torque_limit=0.5, idle_damping=2.0), command_timeout=100.0)
-    bench.torque((0.1, 0.1, 0.1))
-    assert bench.board.constant(time.monotonic_ns())
+    assert bench.torque((0.1, -5.0, 0.6)) == (0.1, -0.5, 0.5)
+    assert bench.board.clamped == 1 and bench.board.constant(time.monotonic_ns())
     bench.board._since -= 10**12
     rates = bench.moving.state.joints.gamma_dot
     expected = tuple(min(max(-2.0 * rate, -0.5), 0.5) for rate in rates)
     assert any(rates) and bench.torque() == expected
     assert not bench.board.constant(time.monotonic_ns())  # it depends on the rates
-
-
-def test_limits_clamp_and_count():
-    bench = Bench(Actuators(torque_limit=2.0))
-    assert bench.torque((1.0, -5.0, 2.5)) == (1.0, -2.0, 2.0)
-    assert bench.board.clamped == 1
 
 
 def test_a_flood_is_taken_in_turns():
