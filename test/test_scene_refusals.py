@@ -26,7 +26,6 @@ def changed(old, new):
 V = "v: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"
 ALPHA = "alpha_deg: [120, 120, 120]"
 STAR = "inertia: {xx: 0.39, yy: 0.39, zz: 0.26}"
-DRIVES = "actuated_links:                          # one entry: all three alike\n"
 LINKS = "intermediate_links:\n"
 GAMMA = "gamma: [0.7853981633974483, 0.7853981633974483, 0.7853981633974483]"
 LINK = "  - inertia: {xx: 9.0e-6, yy: 0.009609, zz: 0.009609}"

@@ -27,6 +27,13 @@ def run():
     return simulate("general", duration=0.2, t_eval=np.linspace(0.0, 0.2, 41))
 
 
+@pytest.fixture(params=["parquet", "npz"])
+def path(request, tmp_path):
+    """A file of each form that keeps all."""
+    pytest.importorskip("pyarrow", reason="files need pyarrow")
+    return tmp_path / f"run.{request.param}"
+
+
 def test_angles_and_rates_are_those_of_the_states(run):
     bare = Trajectory(run.scene, run.t, run.quaternion, run.body_rate, run.torque)
     for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"):
@@ -53,10 +60,7 @@ def test_labelled_arrays(run):
     assert found["torque"].attrs["units"] == "N m"
 
 
-@pytest.mark.parametrize("suffix", ["parquet", "npz"])
-def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, tmp_path, suffix):
-    pytest.importorskip("pyarrow", reason="files need pyarrow")
-    path = tmp_path / f"run.{suffix}"
+def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, path):
     run.save(path)
     again = Trajectory.load(path)
     for name in ARRAYS:
@@ -95,10 +99,8 @@ def test_what_is_no_trajectory_is_refused(run, tmp_path):
             Trajectory.load(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", ["parquet", "npz"])
-def test_a_flipped_bit_is_refused_or_changes_nothing(run, tmp_path, suffix):
-    pytest.importorskip("pyarrow", reason="files need pyarrow")
-    path, generator, refused = tmp_path / f"run.{suffix}", random.Random(1), 0
+def test_a_flipped_bit_is_refused_or_changes_nothing(run, path):
+    generator, refused = random.Random(1), 0
     run.save(path)
     whole = path.read_bytes()
     for _ in range(600):
@@ -115,10 +117,8 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(run, tmp_path, suffix):
     assert refused > 400
 
 
-@pytest.mark.parametrize("suffix", ["parquet", "npz"])
-def test_parallel_saves_to_one_path_never_break_a_reader(run, tmp_path, suffix):
-    pytest.importorskip("pyarrow", reason="files need pyarrow")
-    path, motions = tmp_path / f"run.{suffix}", (run, run.at(run.t[::2]))
+def test_parallel_saves_to_one_path_never_break_a_reader(run, path):
+    motions = run, run.at(run.t[::2])
     run.save(path)
     writers = [
         threading.Thread(target=lambda m=m: [m.save(path, overwrite=True) for _ in range(20)])
@@ -130,7 +130,7 @@ def test_parallel_saves_to_one_path_never_break_a_reader(run, tmp_path, suffix):
     while any(writer.is_alive() for writer in writers):
         lengths.add(len(Trajectory.load(path)))
     assert lengths and lengths <= {len(one) for one in motions}
-    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
 
 
 PROFILES = {

@@ -100,6 +100,8 @@ REFUSED = [
     ({"torque": (1.0, 2.0)}, "torque = .*: must be three finite numbers"),
     ({"trajectory": {"rows": 3}}, "trajectory = .*: must be {rows: m, samples: k}"),
     ({"steps": 2.5}, "steps = 2.5: must be a whole number"),
+    ({"control": {"mode": "lqr"}}, "mode = 'lqr': must be one of feedforward"),
+    ({"control": {"gain": 3.0}}, "control.gain = 3.0: unknown key; allowed are mode"),
     ({"chunks": 5}, "chunks = 5: unknown key; .*did you mean 'chunk'"),
 ]
 
