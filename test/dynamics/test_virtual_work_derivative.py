@@ -55,13 +55,9 @@ def test_loads_that_fit_into_the_equations_are_there():
         ("elastic_stops", {}, r"stroke\.at_end = 'elastic'"),
         ("example1", {"integrator": "rodas4"}, "needs an explicit integrator"),
         ("example1", {"compiled": True}, "compiled = False"),
+        ("example1", {"equations": "lagrange"}, "must be one of quaternion, virtual_work"),
     ],
 )
-def test_what_it_does_not_have_is_refused(scene, options, message):
+def test_what_it_does_not_have_and_what_is_unknown_is_refused(scene, options, message):
     with pytest.raises(InputError, match=message):
-        Simulation(scene, equations="virtual_work", **options)
-
-
-def test_unknown_equations_are_refused():
-    with pytest.raises(InputError, match="must be one of quaternion, virtual_work"):
-        Simulation("example1", equations="lagrange")
+        Simulation(scene, **{"equations": "virtual_work"} | options)
