@@ -67,8 +67,7 @@ def test_a_recording_without_a_reference_is_refused(entries, written, tmp_path):
 
 
 def test_messages_of_other_joints_are_refused(entries, written):
-    def renamed(message):
-        return dataclasses.replace(message, name=["a", "b", "c"])
-
+    names = {"name": ["a", "b", "c"]}
+    renamed = bags.edited(entries, bags.ERROR, 3, lambda one: dataclasses.replace(one, **names))
     with pytest.raises(InputError, match="tracking_error"):
-        tracking.read_tracking(written(bags.edited(entries, bags.ERROR, 3, renamed)))
+        tracking.read_tracking(written(renamed))
