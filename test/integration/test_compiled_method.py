@@ -7,7 +7,7 @@ import copy
 import functools
 import math
 import re
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -282,17 +282,9 @@ def test_scenes_take_turns_and_threads_and_keep_their_own_numbers(start):
     machines = [machine_of(scene, DORMAND_PRINCE, compiled=True) for scene in like_loaded()[:2]]
     alone = [march(machine, start) for machine in machines]
     assert [march(machine, start) for machine in machines * 3] == alone * 3
-    found = {}
-
-    def run(k):
-        found[k] = [march(machines[k], start) for _ in range(20)]
-
-    threads = [threading.Thread(target=run, args=(k,)) for k in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(end == alone[k] for k in (0, 1) for end in found[k])
+    with ThreadPoolExecutor(2) as pool:
+        found = pool.map(lambda machine: [march(machine, start) for _ in range(20)], machines)
+        assert [*found] == [[end] * 20 for end in alone]
 
 
 @pytest.mark.parametrize("name", SCENES)
