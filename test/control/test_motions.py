@@ -175,21 +175,17 @@ def test_a_spiral_is_what_its_angles_say():
         assert math.acos(tilt[2]) == pytest.approx(phi, abs=1e-7)
 
 
-def test_a_sweep_is_a_chirp_once_it_has_grown():
-    motion, time = moving(sweep=SWEEP), 1.1
+@pytest.mark.parametrize("centre", [None, (0.8, 0.8, 0.8)])
+def test_a_sweep_is_a_chirp_about_the_start_or_its_centre_once_it_has_grown(centre):
+    motion, middle, time = moving(sweep=replace(SWEEP, centre=centre)), centre or START, 1.1
     for k in range(3):
         rise = (SWEEP.last_frequency[k] - SWEEP.frequency[k]) / SWEEP.duration
         angle = SWEEP.frequency[k] * time + 0.5 * rise * time**2
-        expected = START[k] + SWEEP.amplitude[k] * math.sin(angle)
+        expected = middle[k] + SWEEP.amplitude[k] * math.sin(angle)
         assert motion.at(time).gamma[k] == pytest.approx(expected, abs=1e-15)
-    assert motion.at(0.0).gamma == motion.at(SWEEP.duration).gamma == START
-
-
-def test_a_sweep_about_another_centre_begins_there():
-    centre = (0.8, 0.8, 0.8)
-    begin = moving(sweep=replace(SWEEP, centre=centre)).at(0.0)
-    assert begin.gamma == centre
-    expected = kinematics.admissible(GEOMETRY, centre).rotation
+    begin = motion.at(0.0)
+    assert begin.gamma == motion.at(SWEEP.duration).gamma == middle
+    expected = kinematics.admissible(GEOMETRY, middle).rotation
     assert rotation_matrix(begin.quaternion) == pytest.approx(expected, abs=1e-14)
 
 
@@ -214,8 +210,8 @@ def test_an_assembly_is_followed_and_not_the_nearest_or_the_first():
     for assembly in found:
         start = tuple(quaternion_of(assembly.rotation).tolist())
         here = kinematics.inverse(GEOMETRY, assembly.rotation)[0]
-        there = np.add(here, (0.05, -0.04, 0.03)).tolist()
-        last = through_points(GEOMETRY, start, [1.0], [there]).at(1.0)
+        rows = np.array([1.0]), np.add([here], (0.05, -0.04, 0.03)), np.zeros((1, 3))
+        last = through_points(GEOMETRY, start, *rows).at(1.0)  # lists elsewhere
         truth = continuation.follow(GEOMETRY, np.linspace(here, last.gamma, 200), assembly.rotation)
         assert rotation_matrix(last.quaternion) == pytest.approx(truth.rotation[-1], abs=1e-13)
         ends.add(tuple(np.round(truth.rotation[-1].ravel(), 6)))
@@ -315,12 +311,6 @@ def test_points_that_make_no_motion_are_refused_with_the_reason(named, arguments
 def test_sections_that_say_no_motion_are_refused(named, build):
     with pytest.raises(InputError, match=named):
         build()
-
-
-def test_arrays_and_lists_of_points_are_one():
-    rows = ([0.5, 1.0], [[0.8, 0.8, 0.7], [0.9, 0.7, 0.8]], [[0.1, 0.2, 0.1], [0.0] * 3])
-    both = [through_points(GEOMETRY, pose(), *given) for given in (rows, map(np.array, rows))]
-    assert both[0].at(0.7) == both[1].at(0.7)
 
 
 def test_a_stop_begins_with_the_motion_and_ends_at_rest_on_its_path():
