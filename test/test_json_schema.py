@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from sst_ros import __main__ as cli
-from sst_ros.scene.scene import Scene, names
+from sst_ros.scene.scene import Scene, names, text_of
 from sst_ros.scene.schema import json_schema
 
 jsonschema = pytest.importorskip("jsonschema")
@@ -21,8 +21,7 @@ VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 
 
 def tree(name="example2_heavy"):
-    path = ROOT / "config" / "scenes" / f"{name}.yaml"
-    return yaml.safe_load(path.read_text(encoding="utf-8"))
+    return yaml.safe_load(text_of(name)[0])
 
 
 def test_the_schema_is_one():

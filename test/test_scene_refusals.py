@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
 from sst_ros.cli.runs import check
 from sst_ros.errors import InputError
-from sst_ros.scene.scene import Scene, load
+from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.yaml_document import read
 
-FOLDER = Path(__file__).parents[1] / "config" / "scenes"
-SOURCE = (FOLDER / "example2_heavy.yaml").read_text(encoding="utf-8")
+SOURCE, ORIGIN = text_of("example2_heavy")
 
 
 def changed(old, new):
@@ -247,6 +245,6 @@ def test_a_scene_that_cannot_start_is_told_with_key_and_line(tmp_path, gamma, me
         check(path)
 
 
-@pytest.mark.parametrize("name", ["example2_heavy", FOLDER / "general.yaml"])
+@pytest.mark.parametrize("name", ["general", ORIGIN])
 def test_a_scene_that_can_start_is_returned(name):
     assert check(name) == load(name)
