@@ -2,7 +2,6 @@
 """Identification from noise-free runs of a digital controller, and what is refused."""
 
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from sst_ros import load_scene, reference_motion, simulate
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
-from sst_ros.scene import yaml_document
-from sst_ros.state import Joints
 
 EXACT = 1e-9
 SCENES = (
@@ -23,19 +20,12 @@ SCENES = (
 
 
 @cache
-def motion_of(name):
-    """The true scene and a run of it."""
+def identified(name):
+    """The true scene and what is identified from a run of it, from wrong values."""
     plant = getattr(manipulators, name)()
     # The mean over a period is of fourth order; general geometry has the worst condition.
     period = 4e-4 if name == "general" else manipulators.PERIOD
-    return plant, manipulators.run(plant, period=period)
-
-
-@cache
-def identified(name):
-    """The true scene and what is identified from a run of it, from wrong values."""
-    plant, motion = motion_of(name)
-    return plant, identify(motion, manipulators.wrong(plant))
+    return plant, identify(manipulators.run(plant, period=period), manipulators.wrong(plant))
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -43,24 +33,11 @@ def test_base_parameters_are_those_of_the_plant(name):
     assert_exact(*identified(name))
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_a_recording_gives_them_as_exactly(name, bags, tmp_path, monkeypatch):
-    """The bag has stamps in whole nanoseconds, and all other numbers as they were."""
-    plant, motion = motion_of(name)
-    tick = round((motion.t[1] - motion.t[0]) * 1e9)
-    monkeypatch.setattr(bags, "TICK_NS", tick)
-    begun = bags.START_NS
-    scene = bags.make("std_msgs/String", data=yaml_document.dump(plant))
-    entries = [bags.Entry(bags.SCENE, begun, scene)]
-    for i, quaternion in enumerate(motion.quaternion):
-        passive = dict.fromkeys(("mu", "beta", "mu_dot", "beta_dot"), np.zeros(3))
-        joints = Joints(gamma=motion.gamma[i], gamma_dot=motion.gamma_dot[i], **passive)
-        torque, stamp = motion.torque[i], begun + i * tick
-        state = SimpleNamespace(joints=joints, quaternion=tuple(quaternion), torque=torque)
-        if i:
-            entries.append(bags.torque_entry([torque], stamp - tick, stamp, i))
-        entries += bags.state_entries(state, stamp, stamp, i)
-    path = bags.write(tmp_path / "bag", entries)
+def test_a_recording_gives_them_as_exactly(bags, tmp_path, monkeypatch):
+    """The bag has stamps in whole nanoseconds, and the torque of every tick, two a sample."""
+    plant = load_scene("example2_heavy")
+    monkeypatch.setattr(bags, "TICK_NS", round(manipulators.PERIOD * 1e9))
+    path = bags.write(tmp_path / "bag", bags.simulated(plant, 1.0))
     assert_exact(plant, identify(path, manipulators.wrong(plant)))
 
 
