@@ -55,10 +55,12 @@ def test_torques_are_the_known_part_plus_regressor_times_parameters(name, wanted
     other = parameters.with_parameters(scene, names, values, "by chance")
     expected = manipulators.torques(other, *at)
     if wanted is FOREIGN:
-        assert len(names) == 6 and names[3:] == ("offset[0]", "offset[1]", "offset[2]")
+        friction = ("friction.gamma.viscous", "friction.gamma.coulomb")
+        offsets = ("offset[0]", "offset[1]", "offset[2]")
+        assert names == (*friction, "actuators.rotor_inertia", *offsets)
         expected += values[3:]
     apart = np.abs(known + columns @ values - expected).max()
-    assert apart < 1e-13 * np.abs(expected).max()
+    assert apart < 1e-13 * (1.0 if wanted is FOREIGN else np.abs(expected).max())
 
 
 def test_base_parameters_are_those_of_the_kernel():
