@@ -2,6 +2,7 @@
 """The controllers against the paper's equations, closed forms and what a closed loop must do."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,16 +26,9 @@ ZERO = (0.0, 0.0, 0.0)
 HEAVY = scene.load("example2_heavy")
 
 
-class Standing:
+def standing(desired):
     """The same for all times."""
-
-    duration = 0.0
-
-    def __init__(self, desired):
-        self.desired = desired
-
-    def at(self, _):
-        return self.desired
+    return SimpleNamespace(duration=0.0, at=lambda _: desired)
 
 
 def turned(model, vector=(0.1, 0.0, 0.0), duration=0.4):
@@ -48,13 +42,13 @@ def turned(model, vector=(0.1, 0.0, 0.0), duration=0.4):
 def answer(sample, desired, gamma_dot=None, **given):
     """The command for the state of a sample."""
     gamma_dot = sample.gamma_dot if gamma_dot is None else gamma_dot
-    acting = Controller(sample.scene, Standing(desired), ControllerSettings(**given), PERIOD)
+    acting = Controller(sample.scene, standing(desired), ControllerSettings(**given), PERIOD)
     return acting.command(0.0, Measurement(tuple(sample.gamma.tolist()), tuple(gamma_dot.tolist())))
 
 
 @pytest.fixture(params=enumerate(seeded_samples(1, 5)), ids=range(5))
 def near(request):
-    """A sample, another pose of its assembly in motion, and the errors of angles and rates."""
+    """A sample, another pose of its assembly in motion with its posture, and the errors of both."""
     seed, sample = request.param
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(0.1 * rng.standard_normal(3))
@@ -62,27 +56,23 @@ def near(request):
     rate, acceleration = (tuple(rng.standard_normal(3).tolist()) for _ in range(2))
     desired = ActuatorSpaceMap(sample.geometry).of_star(q, rate, acceleration)
     errors = desired.gamma - sample.gamma, desired.gamma_dot - sample.gamma_dot
-    return sample, desired, *errors
-
-
-def papers_posture(sample, desired):
     rotation = rotation_matrix(desired.quaternion)
-    return virtual_work.posture(sample.geometry, np.array(desired.gamma), rotation)
+    at = virtual_work.posture(sample.geometry, np.array(desired.gamma), rotation)
+    return sample, desired, at, *errors
 
 
 def test_feedforward_is_the_papers_inverse_dynamics(near):
-    sample, desired, *_ = near
+    sample, desired, at, *_ = near
     told = answer(sample, desired)
     assert told.torque == told.feedforward and told.feedback == ZERO
     expected = virtual_work.inverse_dynamics(
-        sample.mechanism, papers_posture(sample, desired), desired.gamma_dot, desired.gamma_ddot
+        sample.mechanism, at, desired.gamma_dot, desired.gamma_ddot
     )
     assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes(near):
-    sample, desired, error, error_rate = near
-    at = papers_posture(sample, desired)
+    sample, desired, at, error, error_rate = near
     m = -np.diag(virtual_work.equation_of_motion(sample.mechanism, at, np.zeros(3))[0])
     expected = m * (20.0**2 * error + 2.0 * 0.7 * 20.0 * error_rate)
     for mode in ("pd", "gravity_pd", "feedforward_pd"):
@@ -94,7 +84,7 @@ def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_mod
 
 
 def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(near):
-    sample, desired, error, error_rate = near
+    sample, desired, _, error, error_rate = near
     told = answer(sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6)
     found = virtual_work.direct_dynamics(
         sample.mechanism, sample.posture, sample.gamma_dot, told.torque
@@ -202,7 +192,7 @@ def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
     left = []
     for limit in (1.0, 0.0):
         settings = ControllerSettings(mode=mode, integral_rate=10.0, torque_limit=limit)
-        acting = Controller(HEAVY, Standing(begin), settings, PERIOD)
+        acting = Controller(HEAVY, standing(begin), settings, PERIOD)
         for _ in range(500):
             told = acting.command(0.0, Measurement(away, ZERO))
         assert told.saturated == (limit > 0.0)
@@ -246,7 +236,7 @@ def test_angles_that_no_assembly_has_end_the_control(mode):
         if kinematics.direct(sample.geometry, nowhere):
             continue
         begin = ActuatorSpaceMap(sample.geometry).of_star(sample.quaternion, ZERO, ZERO)
-        acting = Controller(sample.scene, Standing(begin), ControllerSettings(mode=mode), PERIOD)
+        acting = Controller(sample.scene, standing(begin), ControllerSettings(mode=mode), PERIOD)
         with pytest.raises(ControlStopped, match="parallel singularity"):
             acting.command(PERIOD, Measurement(nowhere, ZERO))
         ended += 1

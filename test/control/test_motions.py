@@ -78,11 +78,6 @@ def pose(gamma=START):
     return initial_state(replace(GENERAL, initial=Initial(gamma=gamma)), GEOMETRY)[:4]
 
 
-def grown(share):
-    """Minimum jerk."""
-    return 10.0 * share**3 - 15.0 * share**4 + 6.0 * share**5
-
-
 def slope(motion, time, part, h=0.02):
     """Derivative of a part at a time: a polynomial through 14 values within h of it."""
     nodes = chebyshev.chebpts1(14)
@@ -160,14 +155,15 @@ def test_a_turn_goes_straight_along_the_shorter_way():
     assert last == pytest.approx(end.as_quat() * np.sign(end.as_quat() @ last), abs=1e-15)
     for share in (0.2, 0.5, 0.9):
         turned = begin.inv() * Rotation.from_quat(motion.at(share * motion.duration).quaternion)
-        assert turned.as_rotvec() == pytest.approx(grown(share) * whole, abs=1e-14)
+        assert turned.as_rotvec() == pytest.approx(minimum_jerk(share)[0] * whole, abs=1e-14)
 
 
 def test_a_spiral_is_what_its_angles_say():
     spiral, begin = KINDS["spiral"], Rotation.from_quat(pose())
     motion = moving(spiral=spiral)
     for share in (0.1, 0.5, 1.0):
-        theta, phi, psi = (grown(share) * end for end in (spiral.theta, spiral.phi, spiral.psi))
+        grown = minimum_jerk(share)[0]
+        theta, phi, psi = (grown * end for end in (spiral.theta, spiral.phi, spiral.psi))
         expected = begin * Rotation.from_euler("ZYZ", [theta, phi, psi - theta])
         found = Rotation.from_quat(motion.at(share * spiral.duration).quaternion)
         assert (expected.inv() * found).magnitude() < 1e-14
@@ -279,7 +275,6 @@ NAN, INF = math.nan, math.inf
         (r"times\[0\] = .*must be finite", ([NAN], GOOD[:1])),
         (r"times\[1\] = .*must be finite", ([1.0, INF], GOOD)),
         (r"times\[1\] = 1.0: must be > 1 s", ([1.0, 1.0], GOOD)),
-        (r"times\[1\] = 0.5: must be > 1 s", ([1.0, 0.5], GOOD)),
         (r"times\[0\] = -1.0: must be >= 0 s", ([-1.0, 0.5], GOOD)),
         (r"times\[0\] = 0.0: .*single point > 0 s", ([0.0], GOOD[:1])),
         (r"velocities\[0\] = .*3 finite", ([1.0], GOOD[:1], [[NAN, 0.0, 0.0]])),

@@ -65,19 +65,6 @@ def test_the_error_of_a_bad_integrator_is_told_as_it_is(run):
     assert reference.integration(turned).error.gamma.max() < 1e-11
 
 
-def test_one_altered_sample_shows_at_its_moment(read, bags, example2, integration):
-    def moved_on(message):
-        position = message.position.copy()
-        position[1] += 1e-7
-        return replace(message, position=position)
-
-    error = reference.integration(read(bags.edited(example2, bags.JOINTS, 90, moved_on))).error
-    assert np.argmax(error.gamma) == 90
-    assert abs(error.gamma[90] - 1e-7) < 1e-12
-    others = np.arange(151) != 90
-    assert np.array_equal(error.gamma[others], integration.error.gamma[others])
-
-
 LOST = [
     ("APPLIED", {40, 41, 42, 100}, (84_000_000, 200_000_000), 147),
     ("JOINTS", {*range(40, 50)}, (), 141),
@@ -179,12 +166,6 @@ def test_loads_and_actuators_are_compared_as_they_are(recorded, some):
     assert integration.error.gamma.max() < 1e-9 and integration.error.gamma_dot.max() < 1e-8
     assert ideal.error.gamma.max() < 1e-2
     assert ("the actuators lag" in notes) == bool(some.actuators and some.actuators.time_constant)
-
-
-def test_a_lag_that_the_simulator_forgot_would_be_seen(recorded):
-    run = recorded(EXAMPLE2)
-    lagging = replace(run.scene, actuators=Actuators(time_constant=0.02))
-    assert reference.integration(altered(run, scene=lagging)).error.gamma.max() > 1e-4
 
 
 def test_a_lagging_run_begins_again_from_the_efforts_of_a_sample(recorded, bags):

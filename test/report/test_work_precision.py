@@ -62,14 +62,10 @@ def _rows(found, method, kind=FIXED):
 
 
 @pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
-def test_the_reference_is_better_than_doubles_can_be(short):
+def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short):
+    """At the same steps, so that only the arithmetic differs."""
     assert short.reference.own.orientation < 1e-16
     assert short.floor == ABOVE_REFERENCE * short.reference.own.orientation
-
-
-@pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
-def test_the_reference_is_what_mpmath_finds():
-    """At the same steps, so that only the arithmetic differs."""
     pytest.importorskip("mpmath")
     problem = InitialValueProblem(SHORT)
     ours, theirs = (ExtendedSolver(problem, kind).run_steps(2, 2) for kind in (EXTENDED, MPMATH))

@@ -8,7 +8,6 @@ import pytest
 
 from sst_ros.errors import InputError
 from sst_ros.scene import scene
-from studies import control_rate
 from studies.control_rate import (
     EXACT,
     HOLDS,
@@ -17,7 +16,6 @@ from studies.control_rate import (
     advice,
     control_study,
     figure,
-    findings,
     grid,
     page,
 )
@@ -48,14 +46,6 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
     assert "| 500 | middle | run loop, 2 methods |" in said
     assert len(grid(brief)) == len(RATES) * len(HOLDS)
     assert any("slope 2" in text.get_text() for text in figure(brief).axes[0].texts)
-
-
-def test_a_wrong_hold_is_seen(monkeypatch):
-    """The torque of the start where that of the middle is meant."""
-    monkeypatch.setattr(control_rate, "MIDDLE", "nothing")
-    wrong = control_study(BRIEF, rates=(100, 200), methods=("dop853",), compiled=False)
-    assert wrong.order(MIDDLE) == pytest.approx(1.0, abs=0.05)
-    assert any(line.startswith("WARNING") and "theory 2" in line for line in findings(wrong))
 
 
 def test_a_rate_counts_only_if_every_higher_one_does(brief):

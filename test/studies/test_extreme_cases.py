@@ -27,7 +27,6 @@ from studies.extreme_runs import (
     batch_groups,
     compare_row,
     estimate_check,
-    evaluate_case,
     run,
     run_batch,
 )
@@ -104,17 +103,6 @@ def test_forty_contacts_multiply_differences():
     assert apart(*ends) > 1e5 * 1e-10
 
 
-def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
-    case = named("time x 10")
-    good = evaluate_case(case, compiled=False)
-    assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
-    distance = extreme_runs.apart
-    for factor in (0.01, 100.0):
-        monkeypatch.setattr(extreme_runs, "apart", lambda *ends, f=factor: f * distance(*ends))
-        bad = evaluate_case(case, compiled=False)
-        assert not bad.passed and "of the true error" in bad.result
-
-
 def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
     case = named("base triangle of 0.1 rad")
     done = run(case)
@@ -140,22 +128,13 @@ def test_the_run_loop_ends_in_the_same_bits(name):
     assert str(looped.error) == str(direct.error)
 
 
-def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
-    case = named("control period of 333333 ns")
-    shorter = replace(case, steps=case.steps - 1)
-    monkeypatch.setattr(
-        extreme_runs, "run", lambda case, looped=False, **_: run(shorter if looped else case)
-    )
-    bad = evaluate_case(case, compiled=False)
-    assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
-
-
 GROUPS = batch_groups(CASES)
 
 
 def test_all_cases_can_be_a_batch_but_those_that_read_the_state_or_are_refused():
     found = {CASES[number].name for group in GROUPS for number in group}
     without = [case for case in CASES if case.name not in found]
+    assert len({case.name for case in CASES}) == len(CASES)
     assert len(found) > 60 and len(GROUPS) < 10
     assert all(case.feedback or case.refusal for case in without)
 
@@ -178,10 +157,6 @@ def test_a_batch_of_another_motion_is_seen():
     assert compare_row(batch, 0, other, 1)[1]
     later = {**case.changes, "actuators": {"time_constant": 1.1e-3}}
     assert not compare_row(batch, 0, replace(case, changes=later), 1)[1]
-
-
-def test_names_of_cases_are_distinct():
-    assert len({case.name for case in CASES}) == len(CASES)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])

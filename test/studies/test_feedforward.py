@@ -123,17 +123,7 @@ def test_the_same_bits_on_any_number_of_workers():
 
 
 @pytest.mark.slow
-def test_failures_stay_with_their_reason(small):
-    failed = small.loops[small.loops.failure != ""]
-    assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {180.0}
-    assert set(failed["mode"]) == set(MODES) - {"feedforward"} and len(failed) == 4
-    assert failed.failure.str.contains(f"{RESTLESS}|stopped").all()
-    said = page(small)
-    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}" in said
-
-
-@pytest.mark.slow
-def test_what_it_writes_can_be_read(small, tmp_path):
+def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(small, tmp_path):
     write(tmp_path, "feedforward", csv=small.loops, document=document(small), page=page(small),
           figures={"picture": draw_study(small, title(small))})  # fmt: skip
     rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
@@ -144,20 +134,15 @@ def test_what_it_writes_can_be_read(small, tmp_path):
     )
     assert {row["seed"] for row in written["loops"]} == {8}
     assert written["report"]["numpy"] == np.__version__
+    failed = small.loops[small.loops.failure != ""]
+    assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {180.0}
+    assert set(failed["mode"]) == set(MODES) - {"feedforward"} and len(failed) == 4
+    assert failed.failure.str.contains(f"{RESTLESS}|stopped").all()
     said = page(small)
+    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}" in said
     assert "seed 8" in said and f"NumPy {np.__version__}" in said and "theory 2" in said
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
-
-
-def test_errors_that_a_scene_cannot_have_are_left_out():
-    bare = dataclasses.replace(SHORT, friction=None)
-    plan = FeedforwardPlan(
-        bare, 4 * PERIOD_NS, (40.0,), errors=errors("friction unknown"), multiples=(1,), delays=()
-    )
-    found = feedforward_study(plan, workers=1)
-    assert set(found.loops.error) == {"nominal"}
-    assert "nominal" in page(found)
 
 
 def test_a_scene_without_a_motion_is_refused_without_a_traceback(capsys):

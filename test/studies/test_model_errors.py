@@ -1,36 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sampled loops: models that are wrong, encoders, noise and delays, and the theory of stability."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
 from sst_ros.control.controller import Measurement
-from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import ControlChannel
-from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Actuators, load
-from studies.control_loop import ChannelState, make_heavier, model_errors
-from studies.sampled_data import largest_stable, pole, slope, stability_limit
+from sst_ros.scene.scene import load
+from studies.control_loop import ChannelState, model_errors
+from studies.sampled_data import largest_stable, pole, stability_limit
 
 REACH, EXAMPLE2 = load("reach"), load("example2_heavy")
-BODY_RATE, ACCELERATION = (0.4, -0.7, 0.9), (3.0, 2.0, -5.0)
-
-
-def torque(scene):
-    start = initial_state(scene, Geometry.of(scene))[:4]
-    return np.array(InverseDynamics(scene).torque(tuple(start), BODY_RATE, ACCELERATION))
-
-
-def test_bodies_that_weigh_more_need_torques_as_much_larger():
-    """All torques but those of friction are linear in masses and inertias."""
-    rotors = dataclasses.replace(REACH, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0))
-    scene = dataclasses.replace(rotors, friction=None)
-    np.testing.assert_allclose(torque(make_heavier(scene, 1.2)), 1.2 * torque(scene), rtol=1e-12)
-    assert make_heavier(REACH, 1.0) == REACH
 
 
 @pytest.mark.parametrize(
@@ -129,8 +110,3 @@ def test_every_bandwidth_below_the_limit_is_stable_and_none_above(delay):
 def test_a_limit_is_found_and_nan_where_nothing_is_stable():
     assert largest_stable(lambda x: x < 3.7, 1.0, 1.3, 1e-4) == pytest.approx(3.7, rel=1e-4)
     assert np.isnan(largest_stable(lambda x: False, 1.0, 1.3))
-
-
-def test_a_slope_is_the_power():
-    periods = [1.0, 2.0, 4.0]
-    assert slope(periods, [3.0 * h**1.5 for h in periods]) == pytest.approx(1.5)
