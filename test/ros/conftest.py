@@ -64,9 +64,9 @@ def torques(*numbers):
     return Float64MultiArray(data=list(map(float, numbers)))
 
 
-def named(effort, stamp=None, names=NAMES, **given):
+def named(effort, stamp=None, names=NAMES):
     """A command by name and stamp [N m]."""
-    message = JointState(name=list(names), effort=list(map(float, effort)), **given)
+    message = JointState(name=list(names), effort=list(map(float, effort)))
     if stamp is not None:
         message.header.stamp = stamp
     return message

@@ -3,7 +3,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +13,8 @@ from sst_ros.nodes.arguments import COMMANDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 SOURCE = Path(__file__).parents[2]
+PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+"""Programs begin with `env python3`: a user starts them with his environment active."""
 
 
 @pytest.fixture(scope="module")
@@ -23,23 +24,15 @@ def prefix(tmp_path_factory):
     workspace = tmp_path_factory.mktemp("workspace")
     ignored = shutil.ignore_patterns(".*", "demo_out*", "__pycache__", "*.egg-info", "build")
     shutil.copytree(SOURCE, workspace / "src" / "sst_ros", ignore=ignored)
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    subprocess.run(
-        [sys.executable, "-m", "colcon", "build", "--event-handlers", "console_direct-"],
-        cwd=workspace,
-        env={**os.environ, "PATH": path},
-        check=True,
-        timeout=110,
-    )
+    words = ["colcon", "build", "--event-handlers", "console_direct-"]
+    python("-m", *words, cwd=workspace, env={"PATH": PATH}, timeout=110)
     return workspace / "install" / "sst_ros"
 
 
 @pytest.fixture
 def overlay(prefix):
     packages = next(prefix.glob("lib/python*/site-packages"))
-    # Their first line is `env python3`: a user starts them with his environment active.
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages), "PATH": path}
+    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages), "PATH": PATH}
 
 
 def test_all_is_installed_where_ros_looks_for_it(prefix):

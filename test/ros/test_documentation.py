@@ -18,7 +18,6 @@ from tools.reference_pages import NODES, SIMULATION_INTERFACES, policy
 
 pytestmark = pytest.mark.ros
 CONFIG = Path(__file__).parents[2] / "config"
-IDS = [node.command for node in NODES]
 RIGHTS = ("publish", "subscribe", "reply", "request")
 WITHOUT_REASON = {"/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"}
 """Topics that exist under conditions only: a parameter, or the scene."""
@@ -31,16 +30,12 @@ PUBLISHED = {
 """Types of the topics in the root namespace."""
 
 
-@pytest.mark.parametrize("node", NODES, ids=IDS)
-def test_the_policies_are_those_of_the_declarations(node):
-    path = CONFIG / "sros2" / f"{node.command}.policy.xml"
-    assert path.read_text(encoding="utf-8") == policy(node)
-
-
-@pytest.mark.parametrize("node", NODES, ids=IDS)
-def test_the_policies_have_the_form_of_sros2(node):
+@pytest.mark.parametrize("node", NODES, ids=lambda node: node.command)
+def test_the_policies_are_those_of_the_declarations_in_the_form_of_sros2(node):
     """As in sros2's policy.xsd, version 0.2.0."""
-    root = ET.fromstring(policy(node).encode())
+    data = (CONFIG / "sros2" / f"{node.command}.policy.xml").read_bytes()
+    assert data == policy(node).encode()
+    root = ET.fromstring(data)
     assert root.attrib == {"version": "0.2.0"}
     path, groups = [root], list(root)
     while groups[0].tag in ("enclaves", "enclave", "profiles", "profile"):

@@ -62,15 +62,16 @@ class Launch:
     def interrupt(self):
         self._process.send_signal(signal.SIGINT)
 
-    def ended(self, timeout=RUN_S):
-        """Wait for the end; return the status. No process that it has started is left."""
+    def ended(self, expected=0):
+        """Wait for the end with this status; no process that it has started is left."""
         try:
-            status = self._process.wait(timeout)
+            status = self._process.wait(RUN_S)
         except subprocess.TimeoutExpired:
             raise AssertionError(f"it does not end:\n{self.text}") from None
         pids = map(int, re.findall(r"process started with pid \[(\d+)\]", self.text))
         assert not [pid for pid in pids if Path("/proc", str(pid)).exists()]
-        return status
+        assert status == expected, self.text
+        return self
 
     def close(self):
         if self._process.poll() is None:
@@ -102,13 +103,12 @@ def counts(bag):
 @pytest.mark.parametrize("bag", ["sst", pytest.param("ros2", marks=needs_rosbag2)])
 def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
     words = ["play:=true", "duration:=0.5", "record:=true", f"bag:={bag}", "output:=bag"]
-    run = launch("simulate.launch.py", *words)
-    assert run.ended() == 0, run.text
+    launch("simulate.launch.py", *words).ended()
     read = recording.read(tmp_path / "bag")
     assert (read.time_ns == [2_000_000 * k for k in range(251)]).all()
     assert counts(tmp_path / "bag")["/sst_simulator/commands_stamped"] >= 250
     again = launch("simulate.launch.py", *words)  # into the same folder
-    assert again.ended() == 1
+    again.ended(1)
     assert str(tmp_path / "bag") in again.text or "'bag'" in again.text
 
 
@@ -134,8 +134,7 @@ UNPLAYED = r"(?s)(?=.*must have torque and duration).*torque_player failed with 
     ],
 )  # fmt: skip
 def test_how_a_launch_ends(launch, name, words, status, said):
-    run = launch(f"{name}.launch.py", *words.split())
-    assert run.ended() == status, run.text
+    run = launch(f"{name}.launch.py", *words.split()).ended(status)
     assert re.search(said, run.text), run.text
     refused = said.startswith(NEEDS) or "no such argument" in said
     assert ("process started" in run.text) != refused
@@ -146,19 +145,17 @@ def test_a_part_that_dies_ends_the_launch_in_an_error(launch):
     pid = int(run.until(r"\[simulator-1\]: process started with pid \[(\d+)\]")[1])
     run.until("running")
     os.kill(pid, signal.SIGKILL)
-    assert run.ended() == 1
+    run.ended(1)
     assert "simulator failed with exit status -9" in run.text
 
 
 def test_feedforward_twice_and_beside_the_first_recording(launch, tmp_path):
     words = ["mode:=computed_torque", "real_time_factor:=0.0", "hold:=0.0", "bag:=sst"]
     for _ in range(2):
-        run = launch("feedforward.launch.py", *words)
-        assert run.ended() == 0, run.text
+        launch("feedforward.launch.py", *words).ended()
     first, second = tmp_path.glob("feedforward_bag_*")
     assert counts(first)["/sst_inverse_dynamics/reference"] > 100
-    run = launch("feedforward.launch.py", *words, f"output:={first}")
-    assert run.ended() == 1
+    run = launch("feedforward.launch.py", *words, f"output:={first}").ended(1)
     assert "must be a new folder" in run.text
     assert counts(second)["/joint_states"] > 100
 
@@ -166,8 +163,7 @@ def test_feedforward_twice_and_beside_the_first_recording(launch, tmp_path):
 def test_namespace_params_file_and_log_level_reach_the_nodes(launch, tmp_path):
     (tmp_path / "given.yaml").write_text("/**: {ros__parameters: {duration: 0.2}}")
     words = ["namespace:=left", "params_file:=given.yaml", "log_level:=warn"]
-    run = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=bag")
-    assert run.ended() == 0, run.text
+    run = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=bag").ended()
     assert "[INFO] [" not in "".join(re.findall(r"\[simulator-\d\] .*", run.text))
     found = counts(tmp_path / "bag")
     assert found["/left/joint_states"] >= 101
@@ -180,10 +176,10 @@ def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):
     recorder = launch("record.launch.py", "bag:=sst", "output:=bag")
     recorder.until("ready: ")
     recorder.interrupt()
-    assert recorder.ended() == 0, recorder.text
+    recorder.ended()
     assert counts(tmp_path / "bag")["/joint_states"] > 0
     view.interrupt()
-    assert view.ended() == 0, view.text
+    view.ended()
 
 
 @pytest.mark.parametrize(
@@ -197,7 +193,7 @@ def test_ctrl_c_ends_a_run_in_order(launch, name, words):
     run = launch(name, *words)
     run.until("running")
     run.interrupt()
-    assert run.ended() == 0, run.text
+    run.ended()
     assert "process has died" not in run.text
 
 
@@ -243,7 +239,7 @@ def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch
     run.until("running")
     run.until(r"\[spawner-\d\]: process has finished cleanly")
     run.interrupt()
-    assert run.ended() == 0, run.text
+    run.ended()
 
 
 def test_no_launch_file_is_left_out():
@@ -260,8 +256,7 @@ def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
         "/**: {ros__parameters: {csv: torques.csv, wait_for_command: true, command_timeout: 0.0}}"
     )
     words = ["params_file:=given.yaml", "record:=true", "bag:=sst"]
-    first = launch("simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag")
-    assert first.ended() == 0, first.text
+    launch("simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag").ended()
     fresh = launch("simulate.launch.py", "duration:=5.0", *words, "output:=again")
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
@@ -271,7 +266,7 @@ def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
     (tmp_path / "qos.yaml").write_text(json.dumps(kept))
     options = ["--rate", "0.25", "--delay", "10", "--qos-profile-overrides-path", "qos.yaml"]
     player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *options)
-    assert player.ended() == 0, player.text
-    assert fresh.ended() == 0, fresh.text
+    player.ended()
+    fresh.ended()
     received = recording.read(tmp_path / "again").diagnostics["commands_received"]
     assert int(received) == counts(tmp_path / "bag")[topic] > 400

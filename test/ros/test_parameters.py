@@ -112,47 +112,29 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"rate": 300}, "rate = 300: must divide 1e9"),
-        ({"publish_rate": 300}, "publish_rate = 300: must divide rate = 1000"),
-        ({"rate": 0}, "rate = 0: must be a whole number from 1 to 100000 [Hz]"),
-        ({"rate": "fast"}, "rate = 'fast': must be a whole number"),
-        ({"duration": ".nan"}, "duration = nan: must be a finite number >= 0"),
-        ({"scene": "nowhere"}, "scene = 'nowhere': must be a readable .yaml file or one of"),
-        ({"scene": 3}, "scene = 3: must be text"),
-        ({"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
-        ({"real_time_factor": ".nan"}, "real_time_factor = nan: must be a finite number >= 0"),
-        ({"sync": "loose"}, "sync = 'loose': must be one of free, lockstep"),
-        ({"realtime_priority": 100}, "must be a whole number from 0 to 99"),
-        ({"publish_clock": True, "use_sim_time": True}, "cannot be its source"),
-    ],
-)
-def test_a_simulator_is_refused_at_its_start(run_here, given, said):
-    status, _, err = run_here("simulator", **given)
-    assert status == 1
-    assert said in err
-
-
-@pytest.mark.parametrize(
     ("command", "given", "said"),
     [
+        ("simulator", {"rate": 300}, "rate = 300: must divide 1e9"),
+        ("simulator", {"publish_rate": 300}, "publish_rate = 300: must divide rate = 1000"),
+        ("simulator", {"rate": "fast"}, "rate = 'fast': must be a whole number"),
+        ("simulator", {"duration": ".nan"}, "duration = nan: must be a finite number >= 0"),
+        ("simulator", {"scene": "nowhere"}, "must be a readable .yaml file or one of"),
+        ("simulator", {"scene": 3}, "scene = 3: must be text"),
+        ("simulator", {"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
+        ("simulator", {"sync": "loose"}, "sync = 'loose': must be one of free, lockstep"),
+        ("simulator", {"publish_clock": True, "use_sim_time": True}, "cannot be its source"),
         ("torque_player", {"rate": 300}, "rate = 300: must divide 1e9"),
-        ("torque_player", {"csv": "{folder}/bad.csv"}, "line 2: row"),
         ("torque_player", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"torque_limit": 0.5}, "exceeds the limit 0.5 N m"),
-        ("inverse_dynamics", {"stiffness": "[1.0, .nan, 1.0]"}, "stiff"),
-        ("recorder", {"output": "{folder}"}, "output = '{folder}': must be a new folder"),
+        ("recorder", {"output": "/"}, "must be a new folder"),
     ],
 )
-def test_a_node_ends_that_cannot_do_its_work(run_here, tmp_path, command, given, said):
+def test_a_node_ends_that_cannot_do_its_work(run_here, command, given, said):
     """See test_trajectory_following.py for more reasons of the controller."""
-    (tmp_path / "bad.csv").write_text("time,tau_1,tau_2,tau_3\n0,1,2,nan\n")
-    given = {name: str(value).format(folder=tmp_path) for name, value in given.items()}
     status, _, err = run_here(command, **given)
     assert status == 1
-    assert said.format(folder=tmp_path) in err.replace("PosixPath", "")
+    assert said in err
 
 
 def test_the_file_of_parameters_holds_the_defaults(nodes, observer):

@@ -8,7 +8,7 @@ from rclpy.action import ActionClient
 from ros.conftest import NODE, foreign_types
 
 from sst_ros import load_scene
-from sst_ros.mechanism import kinematics
+from sst_ros.mechanism import kinematics, rates
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.nodes.simulation_interfaces import FEATURES
@@ -145,7 +145,6 @@ def test_the_star_is_read_and_set_with_its_joints(client):
         lambda: np.abs(np.subtract(client.states[-1].position[:3], gamma)).max() < 1e-9,
         "the state that was set",
     )
-    # The rates of the carriages, r_k = r_k(gamma_k), close the loops: d/dt(r_k . R e_k) = 0.
     found = client.call("GetEntityState", entity="star").state
     assert found.header.frame_id == "base_link"
     read = found.pose.orientation
@@ -153,12 +152,8 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     assert (found.twist.angular.x, found.twist.angular.y, found.twist.angular.z) == pytest.approx(
         turning, abs=1e-9
     )
-    h = 1e-6
-    after, before = (
-        kinematics.inverse(geometry, _turned(sign * h, turning) @ rotation)[0] for sign in (1, -1)
-    )
-    rates = (after - before) / (2 * h)
-    assert client.states[-1].velocity[:3] == pytest.approx(rates, abs=1e-7)
+    expected = rates.of_star(geometry, rotation, turning).gamma_dot
+    assert client.states[-1].velocity[:3] == pytest.approx(expected, abs=1e-7)
     listed = client.call("GetEntitiesStates")
     assert listed.entities == ["star"] and listed.states[0].pose == found.pose
 
@@ -176,13 +171,6 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     client.to(PLAYING)
     code, words = client.set(state, set_pose=True)
     assert code == FAILED and "running" in words
-
-
-def _turned(angle, axis):
-    """Rotation by angle times axis, to second order."""
-    x, y, z = np.multiply(angle, axis)
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + across + 0.5 * across @ across
 
 
 def test_spawning_is_refused_by_name_and_the_node_quits(client, nodes_of_module):

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-from geometry_msgs.msg import QuaternionStamped
 from programs import python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros.conftest import COMMANDS, NODE
@@ -30,9 +29,6 @@ def test_help_starts_nothing(run_here, command):
     ("words", "refused", "said"),
     [
         ("--scen friction", 2, "did you mean --scene?"),
-        ("--scene nosuchscene", 1, "must be a readable .yaml file or one of"),
-        ("--ros-args -p nonexist:=1", 2, "is no parameter of the node"),
-        ("--ros-args -p nonsense", 2, "nonsense"),
         ("--ros-args --params-file {path}", 1, "did you mean scene?"),
     ],
 )
@@ -52,23 +48,6 @@ def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(node
     assert "name: fast_spin" in scene[0].data
     assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
     assert nodes.ended(process)[0] == 0
-
-
-def test_a_fault_ends_a_run_with_a_duration(nodes, observer):
-    process = nodes.run("simulator", scene="example2_heavy", duration=100.0, command_timeout=0.0)
-    observer.command(50.0, 0.0, 0.0)
-    status, _, err = nodes.ended(process)
-    assert status == 1
-    assert err.splitlines()[-1].startswith("simulator: stopped at t = ")
-
-
-def test_a_run_waits_for_subscribers(nodes, observer):
-    nodes.run("simulator", wait_for_subscribers="[joint_states, '~/orientation']")
-    observer.phase("waiting")
-    observer.until(lambda: len(observer.states) > 5, "states")
-    assert set(observer.phases) == {"waiting"}
-    observer.listen(QuaternionStamped, f"{NODE}/orientation")
-    observer.phase("running")
 
 
 @pytest.mark.parametrize(
@@ -107,20 +86,16 @@ def handles_signals(process):
     return int(caught, 16) >> (signal.SIGTERM - 1) & 1
 
 
-def slow(*delays):
-    return [pytest.param(delay, marks=pytest.mark.slow) for delay in delays]
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("delay", [0.2, *slow(0.0, 0.6, 1.2)])
-def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, delay, number):
+def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, number):
+    """See `starts` of benchmark/campaign/nodes.py for other moments of the start."""
     process = nodes.start("simulator", "--duration", "0")
     observer.until(lambda: handles_signals(process), "signal handler")
-    time.sleep(delay)  # the moment of the start is what is varied
+    time.sleep(0.2)  # it is in the middle of its start
     assert nodes.stop(process, number)[0] == 0
 
 
-@pytest.mark.parametrize("delay", [0.02, 0.1, *slow(0.005, 0.05, 0.15)])
+@pytest.mark.parametrize("delay", [0.02, 0.1])
 def test_ctrl_c_while_python_starts_a_node_of_ros2_run_ends_it(nodes, delay):
     """Its executable blocks SIGINT until the node handles it: Python would print a traceback."""
     root = Path(sst_ros.__file__).parents[1]

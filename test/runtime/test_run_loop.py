@@ -426,6 +426,9 @@ def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
     bench = Bench(wait_for_command=True)
     diagnostics = RunDiagnostics(bench.loop, bench.input, bench.pacer, 1e-3)
     before = diagnostics.values(1)
+    bench.loop.phase = Phase.RUNNING
+    unheard = diagnostics.status(diagnostics.values(1), [])
+    assert unheard == (OK, "running, no command yet: zero torque", [])
     bench.loop.phase, bench.input.timeouts, bench.input.begun = Phase.RUNNING, 1, True
     assert diagnostics.status(before, []) == (OK, "waiting", [])
     level, text, news = diagnostics.status(diagnostics.values(1), [])
