@@ -14,10 +14,11 @@ from sst_ros import TorqueTable, prepare
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.propagator import Propagator
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump, plain
-from sst_ros.simulation import simulate_steps
+from sst_ros.simulation import simulate_gauss, simulate_steps
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
@@ -82,6 +83,19 @@ def test_collocation_is_chosen_for_a_smooth_motion_under_a_profile_and_is_as_acc
     np.testing.assert_allclose(found.at(times).torque, truth.torque, rtol=0, atol=1e-13)
     sampled = simulate(EXAMPLE2, tolerance=1e-9, t_eval=times)
     np.testing.assert_allclose(sampled.gamma, found.at(times).gamma, rtol=0, atol=1e-14)
+
+
+def test_code_of_collocation_is_built_once_for_scenes_that_take_turns(monkeypatch):
+    made = []
+
+    def make(*args, **how):
+        made.append(args)
+        return Collocation(*args, **how)
+
+    monkeypatch.setattr(simulate_gauss, "Collocation", make)
+    for scene in ("example1", "example2_heavy") * 3:
+        simulate(scene, (0.0, 0.0, 0.0), 0.01, method="gauss")
+    assert len(made) <= 2
 
 
 ARRAYS = ("t", "quaternion", "body_rate", "torque", "gamma")

@@ -85,7 +85,8 @@ class GaussMotion:
         sine = torque if isinstance(torque, SineTorque) else None
         held = () if isinstance(torque, SineTorque) else torque
         self._drive = (*held, *(0.0,) * (len(self._dynamics.drive) - 3))
-        self._method = _collocation(self._dynamics, sine, self._limits, compiled)
+        parts = self._dynamics, sine, self._limits
+        self._method = _compile_collocation(*parts) if compiled else _collocation(*parts, compiled)
         self._y, self._duration, self._finest = list(y), duration, finest
         self.count, self.iterations, self.error = self._settings(tolerance)
         self.h = duration / self.count
@@ -229,9 +230,17 @@ def _collocation(
             lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
-    if compiled:  # others that run in plain Python, as there was no code, find it from now on
-        _collocation.cache_clear()
     return Collocation(ODE(dynamics, sine), limits=program, compiled=compiled)
+
+
+@lru_cache(maxsize=32)
+def _compile_collocation(
+    dynamics: Dynamics, sine: SineTorque | None, limits: tuple[Limit, ...]
+) -> Collocation:
+    found = _collocation(dynamics, sine, limits, compiled=True)
+    # Those that run in plain Python, as there was no code, find it from now on.
+    _collocation.cache_clear()
+    return found
 
 
 class CollocatedMotion:

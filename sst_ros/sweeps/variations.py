@@ -165,7 +165,7 @@ def _read(given: Any) -> tuple[str, Any, bool]:
         relative = words.pop("relative", False)
         kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
     elif isinstance(given, tuple) and given and isinstance(given[0], str):
-        kind, relative = given[0], given[-1] == "relative"
+        kind, relative = given[0], isinstance(given[-1], str) and given[-1] == "relative"
         numbers = given[1 : len(given) - relative]
     if kind not in KINDS or not isinstance(relative, bool):
         raise ValueError(allowed)
@@ -240,6 +240,8 @@ def tabulate(key: str, columns: Mapping[str, Array], targets: list[Target]) -> V
         ValueError: columns of its components are missing.
 
     """
+    if len(set(map(len, columns.values()))) > 1:
+        raise ValueError("must have columns of equal length")
     numbers = np.stack(list(columns.values()), axis=1)
     found = Variation(key, "table", numbers, tuple(targets), _scales_tensor(key, targets))
     if tuple(columns) != found.columns:
@@ -259,9 +261,12 @@ def read_table(given: Any) -> dict[str, Array]:
             pandas = require("pandas")
             read = pandas.read_parquet if given.suffix == ".parquet" else pandas.read_csv
             given = read(given)
-        return {str(name): np.asarray(given[name], dtype=float) for name in given}
-    except (OSError, ValueError, TypeError) as error:
-        allowed = f"must be a readable .csv or .parquet file of numbers ({error})"
+        columns = {str(name): np.asarray(given[name], dtype=float) for name in given}
+        if any(column.ndim != 1 for column in columns.values()):
+            raise ValueError("a column has one number for each row")
+        return columns
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        allowed = f"must be columns of numbers, or a .csv or .parquet file of them ({error})"
         raise InputError("sweep", [Problem("table", str(given), allowed)]) from None
 
 
