@@ -34,7 +34,9 @@ def cache_folder() -> Path:
     folder = configured_folder()
     if folder is None:
         return _private_folder("there is no home folder")
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for one in (*reversed(folder.parents), folder):  # `parents=True` leaves their mode to the umask
+        one.mkdir(mode=0o700, exist_ok=True)
+    folder = folder.resolve()  # a link that is turned later leads nowhere else
     status = folder.stat()
     if status.st_uid != os.geteuid():
         return _private_folder(f"{folder} belongs to another user (uid {status.st_uid})")

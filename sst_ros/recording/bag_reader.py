@@ -284,7 +284,6 @@ class McapFile:
     def messages(self) -> Iterator[RawMessage]:
         """Yield all messages that are intact, in the order of the file."""
         schemas: dict[int, str] = {}
-        written = 0
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
@@ -296,8 +295,6 @@ class McapFile:
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
                     self.channels[record.id] = record.topic, schemas.get(record.schema_id, "")
-                elif isinstance(record, Statistics):
-                    written = record.message_count
                 elif isinstance(record, Message):
                     if channel := self.channels.get(record.channel_id):
                         self.count += 1
@@ -307,7 +304,9 @@ class McapFile:
                         self.damage.append(Damage(0, reason, 1))
             if index and not self.damage:
                 self._check_data(file, data_end)
-        self.lost = max(sum(one.messages for one in self.damage), written - self.count)
+        # Only an index whose checksum is right says how many there were.
+        written = (one.message_count for one in index if isinstance(one, Statistics))
+        self.lost = max(sum(one.messages for one in self.damage), next(written, 0) - self.count)
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
         """Return the records of the index and where it begins; none where it is not intact."""

@@ -164,18 +164,25 @@ def _free_port(host: str, port: int) -> int:
     if not _PORTS[0] <= port <= _PORTS[1]:
         allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
         raise InputError("view", [Problem("port", port, allowed)])
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        socket.create_server((host, 0), family=family).close()
-    except (OSError, TypeError, ValueError) as error:  # bytes that are no name are a TypeError
+        # An empty name would be every address: getaddrinfo knows none of it.
+        addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        _listen(addresses, 0)
+    except (OSError, ValueError) as error:
         allowed = f"must be an address of this machine ({error})"
         raise InputError("view", [Problem("host", host, allowed)]) from None
     last = min(port + _TRIED - 1, _PORTS[1])
     for tried in range(port, last + 1):
         with contextlib.suppress(OSError):
-            socket.create_server((host, tried), family=family).close()
+            _listen(addresses, tried)
             return tried
     raise InputError("view", [Problem("port", port, f"no port up to {last} is free")])
+
+
+def _listen(addresses: list[Any], port: int) -> None:
+    """Listen at a port of all addresses, and end; raise an OSError where that cannot be."""
+    for family, _, _, _, address in addresses:
+        socket.create_server((address[0], port, *address[2:]), family=family).close()
 
 
 def _name(host: str) -> str:

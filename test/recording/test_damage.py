@@ -6,6 +6,7 @@ import random
 import struct
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, MessageIndex
 from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
@@ -110,6 +111,19 @@ def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, t
     assert (
         check_changes(whole, tmp_path / "bag", [(k, 1 << generator.randrange(8)) for k in at]) == 0
     )
+
+
+def test_an_index_with_a_wrong_checksum_says_nothing_of_what_is_lost(whole, tmp_path):
+    content = bytearray(content_of(whole))
+    (at,) = struct.unpack_from("<Q", content, len(content) - len(MCAP0_MAGIC) - 20)
+    content[at - 13] = 0x7F  # no end of the data: the index is read on as what comes next
+    while content[at] != Opcode.STATISTICS:
+        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
+    content[at + 9 + 7] ^= 0x40  # of the number of messages
+    (tmp_path / "changed.mcap").write_bytes(content)
+    file = McapFile(tmp_path / "changed.mcap")
+    assert list(file.messages())
+    assert file.damage and file.lost == 0
 
 
 def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_path):

@@ -109,7 +109,9 @@ def test_two_pages_take_two_ports_and_two_tokens_and_nothing_is_shared(server):
         second.stop()
 
 
-@pytest.mark.parametrize("host", ["203.0.113.1", "no.such.host.invalid", "\ud800"])
+@pytest.mark.parametrize(
+    "host", ["203.0.113.1", "no.such.host.invalid", "\ud800", "", "<broadcast>"]
+)
 def test_other_machines_addresses(host):
     with pytest.raises(InputError, match="address of this machine"):
         PageServer(host)
