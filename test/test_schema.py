@@ -17,39 +17,27 @@ from sst_ros.__main__ import main
 from sst_ros.errors import InputError
 from sst_ros.scene.bodies import Base, Inertia, Link, Star
 from sst_ros.scene.loads import Initial, Stroke, Workspace
-from sst_ros.scene.scene import Scene, load, text_of
+from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.schema import Section, flag, integer, texts
 from sst_ros.scene.yaml_document import dump, read
+from test.test_scene_refusals import SOURCE, refusal
 
-SOURCE = text_of("example2_heavy")[0]
 EXAMPLE2 = load("example2_heavy")
-FUZZ = settings(FAST, max_examples=150)
-
-
-def scene_or_refusal(source):
-    """Read, and see that a scene survives its own dump and a refusal says something."""
-    try:
-        scene = read(Scene, source, "origin")
-    except InputError as error:
-        assert error.problems
-        assert str(error).startswith("origin: ")
-    else:
-        assert read(Scene, dump(scene), "dump") == scene
-
-
-def refusal(source):
-    with pytest.raises(InputError) as caught:
-        read(Scene, source, "origin")
-    return caught.value
 
 
 SIGNS = "[]{}:,-?&*!|>'\"%@`# \n\tab01.e~<"
 
 
-@FUZZ
+@settings(FAST, max_examples=150)
 @given(st.text(max_size=200) | st.text(alphabet=SIGNS, max_size=120))
 def test_arbitrary_text_is_a_scene_or_refused(source):
-    scene_or_refusal(source)
+    """A scene survives its own dump, and a refusal says something."""
+    try:
+        scene = read(Scene, source, "origin")
+    except InputError as error:
+        assert error.problems and str(error).startswith("origin: ")
+    else:
+        assert read(Scene, dump(scene), "dump") == scene
 
 
 @FAST
@@ -64,12 +52,9 @@ def test_numbers_and_text_survive_a_dump_bit_by_bit(rates, description):
     assert read(Scene, dump(scene), "dump") == scene
 
 
-def test_sections_are_frozen():
+def test_sections_are_frozen_and_take_arrays():
     with pytest.raises(FrozenInstanceError):
         EXAMPLE2.duration = 2.0
-
-
-def test_arrays_are_taken_and_frozen():
     base = Base(v=np.eye(3), radius=np.float64(0.35))
     assert base.v == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     assert hash(base) == hash(Base(v=np.eye(3).tolist(), radius=0.35))

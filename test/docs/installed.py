@@ -4,18 +4,17 @@
 import re
 import shlex
 from functools import cache
-from itertools import pairwise
 
 import yaml
 from builtin_interfaces.msg import Duration
 from docs.blocks import ROOT
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from sst_ros.nodes.arguments import COMMANDS, ros_arguments
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
 from sst_ros.scene.schema import specs
 from tools.reference_pages import NODES
 
-STANDARD = {"use_sim_time"}
 ENDPOINTS = {
     "topic": ("echo hz pub info bw delay", PUBLISHES, SUBSCRIBES),
     "service": ("call", SERVES),
@@ -36,11 +35,6 @@ def names(*uses):
                 name = name.format(simulator="/sst_simulator")
                 found[name if name.startswith("/") else f"/{name}"] = endpoint
     return found
-
-
-def parameters(command):
-    (node,) = (node for node in NODES if node.command == command)
-    return specs(node.parameters)
 
 
 def check(line):
@@ -78,23 +72,13 @@ def _ros2(words):
 
 
 def run(words):
-    """Check an executable, its parameters, and files that they name."""
+    """Check an executable and its parameters, as plain options or as --ros-args has them."""
     command, *rest = words
-    assert command in {node.command for node in NODES} or command == "viewer", command
     assert (ROOT / "executables" / command).is_file(), command
-    pairs = [rest[i + 1].partition(":=")[::2] for i, word in enumerate(rest) if word == "-p"]
-    for name, text in pairs:
-        if name not in STANDARD:
-            assert name in parameters(command), f"{command} has no parameter {name}"
-            _value(parameters(command)[name], text)
-    plain = rest[: rest.index("--ros-args")] if "--ros-args" in rest else rest
-    for option, following in pairwise([*plain, "--"]):
-        if option.startswith("--"):
-            name, given, text = option.removeprefix("--").partition("=")
-            spec = parameters(command)[name.replace("-", "_")]
-            if spec.kind in ("flag", "integer", "number"):
-                text = text if given else "true" if following.startswith("-") else following
-                _value(spec, text + ".0" if spec.kind == "number" and text.isdigit() else text)
+    known = specs(COMMANDS[command][1])
+    for name, assigned, text in (w.partition(":=") for w in ros_arguments(command, rest)):
+        if assigned and name in known:
+            _value(known[name], text)
 
 
 def _value(spec, text):
@@ -141,11 +125,7 @@ def _pip(words):
             assert f'"{name}": ' in SETUP, f"there is no extra {name}"
 
 
-def _known(_):
-    """Pass over commands of others that name nothing of ours."""
-
-
 KINDS = {
     "ros2": _ros2, "make": _make, "pip": _pip,
-    **dict.fromkeys(("cd", "export", "for", "done"), _known),
+    **dict.fromkeys(("cd", "export", "for", "done"), lambda words: None),  # nothing of ours
 }  # fmt: skip

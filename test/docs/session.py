@@ -15,6 +15,7 @@ from docs.blocks import ROOT, commands
 
 from docs import installed
 from sst_ros.cli.commands import NODES
+from sst_ros.errors import InputError
 
 PYTHONS = (".venv/bin/python", "python", "python3")
 COMMAND = "sst-ros"
@@ -124,7 +125,7 @@ class Session:
         if words[0] in installed.KINDS:
             try:
                 installed.check(line)
-            except (AssertionError, KeyError, ValueError, OSError) as error:
+            except (AssertionError, InputError, KeyError, ValueError, OSError) as error:
                 raise AssertionError(f"{block}: {line}: {error!r}") from error
         elif words[0] in PYTHONS and _stays(words):
             self._start(line, words)

@@ -53,21 +53,9 @@ def published(name):
     return [(ROOT / "docs" / f"{name}.{kind}").read_text("utf-8") for kind in ("md", "csv")]
 
 
-PAGES = ("accuracy", "control_rate", "stability")
-
-
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", ["accuracy", "control_rate", "stability"])
 def test_a_published_page_is_that_of_this_program(name):
     assert list(stale(name, *published(name))) == []
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_a_stale_page_is_seen(name):
-    page, table = published(name)
-    lines = table.splitlines()
-    entry = lines[-1].split(",")[0].strip('"')
-    assert entry in list(stale(name, page, "\n".join(line for line in lines if entry not in line)))
-    assert "the introduction" in list(stale(name, page.replace("figures", "numbers"), table))
 
 
 def test_the_page_through_the_paper_is_what_its_generator_writes():

@@ -7,7 +7,6 @@ import re
 import sys
 from functools import cache
 
-import pytest
 from docs.blocks import ROOT
 
 TREES = ("sst_ros", "studies", "docs", "examples", "launch", "test", "tools", "benchmark")
@@ -82,18 +81,3 @@ def test_what_a_text_names_is_there():
         if gone := list(missing(said, names=names)):
             stale[str(path.relative_to(ROOT))] = gone
     assert stale == {}
-
-
-@pytest.mark.parametrize(
-    ("text", "stale"),
-    [
-        ("see mechanism/no_such_file.py", "mechanism/no_such_file.py"),
-        ("`test/docs/test_names.py::no_such_test`", "test/docs/test_names.py"),
-        ("`sst_ros.recording.no_such_module`", "sst_ros.recording.no_such_module"),
-        ("`sst_ros.scene.scene.no_such_function`", "sst_ros.scene.scene.no_such_function"),
-        ("as `no_such" + "_name` does", "no_such" + "_name"),
-    ],
-)
-def test_a_name_that_is_gone_is_seen(text, stale):
-    assert stale in missing(split(f'"""{text}."""')[0], names=True)
-    assert not list(missing("`sst_ros.scene.scene.load`", names=True))

@@ -108,9 +108,8 @@ def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, t
         position += 9 + struct.unpack_from("<Q", content, position + 1)[0]
     assert len(heads) > 40 and position == len(content) - len(MCAP0_MAGIC)
     at = [min(head + generator.randrange(24), len(content) - 1) for head in heads * 4]
-    assert (
-        check_changes(whole, tmp_path / "bag", [(k, 1 << generator.randrange(8)) for k in at]) == 0
-    )
+    flips = [(k, 1 << generator.randrange(8)) for k in at]
+    assert check_changes(whole, tmp_path / "bag", flips) == 0
 
 
 def test_an_index_with_a_wrong_checksum_says_nothing_of_what_is_lost(whole, tmp_path):
@@ -143,13 +142,13 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
     assert found.lost == CHUNK and found.damage and not found.cut
 
 
-def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(whole, entries):
+def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(
+    whole, entries, example2_bag
+):
     file = McapFile(next(whole.glob("*.mcap")))
     assert sum(1 for _ in file.messages()) == len(entries) == len(messages_of(whole))
     assert file.intact and file.unverified == 0
-
-
-def test_recordings_without_checksums_are_read_and_counted(example2_bag):
+    # Recordings without checksums are read and counted.
     assert recording.read(example2_bag).signals.bag.unverified > 0
 
 

@@ -21,11 +21,8 @@ class Bench:
     """A board of commands that are not let go of, unless that is asked for."""
 
     def __init__(self, actuators=None, commands=(), **given):
-        self.commands, self.stamped, self.moments = (
-            Arrived(map(plain, commands)),
-            Arrived(),
-            Arrived(),
-        )
+        self.commands = Arrived(map(plain, commands))
+        self.stamped, self.moments = Arrived(), Arrived()
         run = SimulatorParameters(**{"command_timeout": 0.0, **given}).run
         self.board = TorqueInput(run, actuators, self.commands, self.stamped, self.moments)
         self.moving = Simulation(load_scene("example1"))

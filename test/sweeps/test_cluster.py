@@ -19,12 +19,12 @@ from sst_ros.sweeps.chunk_task import SweepFailed
 from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
-from test.sweeps.tables import same
+from test.sweeps.test_sweep import same
 
 for module in ("numba", "distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
 
-pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]
 LIMIT_S = 60
 VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
 STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
@@ -53,7 +53,7 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory):
+def expected():
     return run_study(STUDY, None)
 
 
@@ -61,25 +61,20 @@ class Processes:
     """A scheduler and workers of a test, in folders of its own."""
 
     def __init__(self, folder):
-        self.folder, self.scheduler, self.workers = folder, None, []
+        self.folder, self.workers = folder, []
         self.environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "3"}
+        self.start_scheduler()
 
     def start(self, words):
-        log = (self.folder / f"log_{time.monotonic_ns()}").open("wb")
-        with log:
-            return subprocess.Popen(
-                [sys.executable, *words], stdout=log, stderr=log, env=self.environment,
-                cwd=self.folder,
-            )  # fmt: skip
+        given = {"env": self.environment, "cwd": self.folder}
+        return subprocess.Popen([sys.executable, *words], **given)
 
     def start_scheduler(self):
-        file = self.folder / f"scheduler_{time.monotonic_ns()}.json"
+        self.file = file = self.folder / f"scheduler_{time.monotonic_ns()}.json"
         words = ["-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1",
                  "--no-dashboard", "--scheduler-file", str(file)]  # fmt: skip
         self.scheduler = self.start(words)
         until(lambda: file.exists() and file.stat().st_size > 0)
-        self.file = file
-        return self
 
     def add_worker(self, patch=""):
         words = [
@@ -101,18 +96,29 @@ class Processes:
 
     def stop(self):
         for process in [*self.workers, self.scheduler]:
-            if process is not None:
-                process.kill()
-                process.wait(LIMIT_S)
+            process.kill()
+            process.wait(LIMIT_S)
+        self.workers.clear()
 
 
 @pytest.fixture
 def processes(tmp_path):
-    started = Processes(tmp_path).start_scheduler()
+    started = Processes(tmp_path)
+    yield started
+    started.stop()
+
+
+@contextmanager
+def meanwhile(work, *over):
+    """Let a thread work until it ends, or notices that what is done here is over."""
+    thread = threading.Thread(target=work)
+    thread.start()
     try:
-        yield started
+        yield
     finally:
-        started.stop()
+        for event in over:
+            event.set()
+        thread.join(LIMIT_S)
 
 
 def until(condition):
@@ -122,7 +128,6 @@ def until(condition):
         time.sleep(0.02)
 
 
-@pytest.mark.slow
 def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
     processes.environment |= {"SST_ROS_CACHE": str(tmp_path / "empty")}
     processes.add_worker()
@@ -135,7 +140,6 @@ def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
     assert all(path.stat().st_mtime == 0 for path in sent)
 
 
-@pytest.mark.slow
 def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
     study = dataclasses.replace(STUDY, n=2000, chunk=10)
     assert study.chunks == 200
@@ -151,21 +155,14 @@ def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
             victim.kill()
             processes.add_worker(SLOW)
 
-    killer = threading.Thread(target=kill)
-    with processes.client(2) as client:
-        killer.start()
-        try:
-            found = run_study(study, tmp_path / "out", client=client)
-        finally:
-            over.set()
-            killer.join(LIMIT_S)
+    with processes.client(2) as client, meanwhile(kill, over):
+        found = run_study(study, tmp_path / "out", client=client)
     assert sum(one.poll() is not None for one in processes.workers) >= 3
     assert found.index.tolist() == list(range(2000))
     assert len(list((tmp_path / "out").glob("part-*.parquet"))) == 200
     same(found, run_study(study, None))
 
 
-@pytest.mark.slow
 def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_engine, "NO_SCHEDULER", 3.0)
     processes.add_worker(SLOW)
@@ -175,22 +172,18 @@ def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp
         until(lambda: len(list(out.glob("part-*"))) >= 3)
         processes.scheduler.kill()
 
-    killer = threading.Thread(target=kill)
-    with processes.client(1) as client:
-        killer.start()
-        with pytest.raises(SweepFailed, match="scheduler does not answer; continue with --resume"):
-            run_study(STUDY, out, client=client)
-        killer.join(LIMIT_S)
+    failed = pytest.raises(SweepFailed, match="scheduler does not answer; continue with --resume")
+    with processes.client(1) as client, meanwhile(kill), failed:
+        run_study(STUDY, out, client=client)
     done = len(list(out.glob("part-*")))
     assert 3 <= done < 12
     processes.stop()
-    processes.workers.clear()
-    processes.start_scheduler().add_worker()
+    processes.start_scheduler()
+    processes.add_worker()
     with processes.client(1) as client:
         same(run_study(STUDY, out, client=client, resume=True), expected)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("patch", "reason"),
     [(OLD, "sst_ros 0.0.9 in place of"), (FULL, "File too large")],
@@ -209,7 +202,6 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
     assert not list((tmp_path / "out").glob(".part-*"))
 
 
-@pytest.mark.slow
 def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_engine, "NO_WORKER", 2.0)
     processes.add_worker(OLD)
@@ -217,7 +209,6 @@ def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, 
         run_study(STUDY, tmp_path / "out", client=client)
 
 
-@pytest.mark.slow
 def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
     processes, expected, tmp_path, monkeypatch
 ):
@@ -233,16 +224,8 @@ def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
             if all(one.poll() is not None for one in processes.workers):
                 processes.add_worker(POISONED)
 
-    keeper = threading.Thread(target=keep_one)
-    keeper.start()
-    try:
-        died = pytest.raises(SweepFailed, match="chunk 3: its workers died 2 times")
-        with processes.client(1) as client, died:
-            run_study(STUDY, tmp_path / "out", client=client)
-    finally:
-        live.set()
-        keeper.join(LIMIT_S)
+    died = pytest.raises(SweepFailed, match="chunk 3: its workers died 2 times")
+    with meanwhile(keep_one, live), processes.client(1) as client, died:
+        run_study(STUDY, tmp_path / "out", client=client)
     assert len(list((tmp_path / "out").glob("part-*"))) == 11
-    found = run_study(STUDY, tmp_path / "out", resume=True)
-    same(found, expected)
-    assert found.index.equals(expected.index)
+    same(run_study(STUDY, tmp_path / "out", resume=True), expected)

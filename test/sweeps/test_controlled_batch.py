@@ -47,23 +47,12 @@ def gaussian(seed, rows, counter):
         return np.asarray(names["gaussian"](seed, np.asarray(rows).astype(np.uint64), counter))
 
 
-def name_of(case):
-    return "-".join(map(str, case.values()))
-
-
 @pytest.mark.filterwarnings("ignore:overflow encountered")
-@pytest.mark.parametrize("case", CASES, ids=name_of)
-def test_each_torque_is_that_of_the_python_controller(interpreted, case):
-    check_torques(case)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=name_of)
-def test_each_compiled_torque_is_that_of_the_python_controller(case):
-    check_torques(case)
-
-
-def check_torques(case):
+@pytest.mark.parametrize("by", ["interpreted", pytest.param("numba", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case.values())))
+def test_each_torque_is_that_of_the_python_controller(request, case, by):
+    if by == "interpreted":
+        request.getfixturevalue(by)
     study = SweepStudy(
         SCENE, VARY, n=3, seed=11, steps=2 * SAMPLES, control={"period": PERIOD, **case},
         duration=SAMPLES * PERIOD,
@@ -119,10 +108,9 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
         track, limited, failure = run_loop(loop)
         assert failure == ""
         rms = np.sqrt(np.mean(track.error**2, axis=0))
-        largest = np.abs(track.error).max(axis=0)
-        for k in range(3):
-            assert found[f"error_rms_{k + 1}"][row] == pytest.approx(rms[k], abs=1e-8)
-            assert found[f"error_max_{k + 1}"][row] == pytest.approx(largest[k], abs=1e-8)
+        for name, errors in (("rms", rms), ("max", np.abs(track.error).max(axis=0))):
+            columns = [f"error_{name}_{k}" for k in (1, 2, 3)]
+            assert found.loc[row, columns].tolist() == pytest.approx(errors, abs=1e-8)
         assert found["limited_samples"][row] == limited[:-1].sum()
 
 

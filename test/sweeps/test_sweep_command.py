@@ -30,10 +30,8 @@ def folder(tmp_path_factory, interpreted_module):
 
 
 def test_its_summary_names_reasons_and_causes(folder, capsys):
-    assert (
-        run_command(["sweep", str(folder / "study.yaml"), "--out", str(folder / "out"), "--resume"])
-        == 0
-    )
+    words = ["sweep", str(folder / "study.yaml"), "--out", str(folder / "out"), "--resume"]
+    assert run_command(words) == 0
     out = capsys.readouterr().out
     assert "240 runs of 1 s, 30 steps each" in out
     assert "gamma_1 > 1.570796 rad" in out
