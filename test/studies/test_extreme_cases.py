@@ -27,6 +27,7 @@ from studies.extreme_runs import (
     batch_groups,
     compare_row,
     estimate_check,
+    evaluate_case,
     run,
     run_batch,
 )
@@ -103,6 +104,17 @@ def test_forty_contacts_multiply_differences():
     assert apart(*ends) > 1e5 * 1e-10
 
 
+def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
+    case = named("time x 10")
+    good = evaluate_case(case, compiled=False)
+    assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
+    distance = extreme_runs.apart
+    for factor in (0.01, 100.0):
+        monkeypatch.setattr(extreme_runs, "apart", lambda *ends, f=factor: f * distance(*ends))
+        bad = evaluate_case(case, compiled=False)
+        assert not bad.passed and "of the true error" in bad.result
+
+
 def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
     case = named("base triangle of 0.1 rad")
     done = run(case)
@@ -126,6 +138,16 @@ def test_the_run_loop_ends_in_the_same_bits(name):
     direct, looped = run(named(name)), run(named(name), looped=True)
     assert looped.simulation.state == direct.simulation.state
     assert str(looped.error) == str(direct.error)
+
+
+def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
+    case = named("control period of 333333 ns")
+    shorter = replace(case, steps=case.steps - 1)
+    monkeypatch.setattr(
+        extreme_runs, "run", lambda case, looped=False, **_: run(shorter if looped else case)
+    )
+    bad = evaluate_case(case, compiled=False)
+    assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
 
 
 GROUPS = batch_groups(CASES)
