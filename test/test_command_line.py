@@ -158,6 +158,11 @@ def test_output_that_is_not_taken_is_no_traceback(reader, said):
     assert done.stderr == said
 
 
+def test_a_stdout_that_was_closed_before_the_start_is_no_error():
+    closed = {"preexec_fn": lambda: os.close(1), "stdout": None, "capture_output": False}
+    assert python("-m", "sst_ros", "scene", "list", stderr=subprocess.PIPE, **closed).stderr == ""
+
+
 NEEDED = {
     "rclpy": [*NODES, "demo", "demo feedforward"],
     "rosbags": ["export bag", "export bag --format parquet", "recover bag"],

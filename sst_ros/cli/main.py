@@ -20,7 +20,7 @@ def run_command(words: list[str]) -> int:
     debug, words = _without_debug(words)
     try:
         status = _run(words)
-        sys.stdout.flush()
+        print(end="", flush=True)  # does nothing where stdout was closed before the start
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
@@ -61,7 +61,7 @@ def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
 def _abandon_stdout() -> None:
     """Keep Python from failing once more, when it ends, on a stdout that takes nothing."""
     try:
-        sys.stdout.flush()
+        print(end="", flush=True)
     except (OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 

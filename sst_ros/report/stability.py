@@ -401,9 +401,10 @@ def page(found: StabilityReport) -> str:
 def figure(found: StabilityReport) -> Figure:
     """Draw eigenvalues and stable steps along the motion, and how the runs ended."""
     steps, runs = found.steps, [run for run in found.runs if run.passed is not None]
-    figure = free_figure(11.0, 5.2 + 0.36 * len(runs))
+    rows = 0.36 * max(len(runs), 1)
+    figure = free_figure(11.0, 5.2 + rows)
     inch = 1.0 / figure.get_figheight()
-    middle = (0.36 * len(runs) + 1.6) * inch
+    middle = (rows + 1.6) * inch
     edges = {"left": 0.075, "right": 0.985, "top": 1.0 - 0.75 * inch, "bottom": middle}
     panels: Any = figure.add_gridspec(1, 2, wspace=0.2, **edges).subplots()
     left, right = panels
@@ -422,7 +423,8 @@ def figure(found: StabilityReport) -> Figure:
         axes.set_xlabel("time t [s]")
         legend(axes)
     edges = {"left": 0.11, "right": 0.985, "top": middle - 0.85 * inch, "bottom": 0.85 * inch}
-    _draw_ends(figure.add_subplot(figure.add_gridspec(1, 1, **edges)[0, 0]), runs)
+    if runs:
+        _draw_ends(figure.add_subplot(figure.add_gridspec(1, 1, **edges)[0, 0]), runs)
     figure.suptitle(f"Stability of {found.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure

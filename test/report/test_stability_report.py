@@ -152,6 +152,9 @@ def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
     assert len(document["steps"]) == 50 and document["steps"][0]["rodas4"] is None
     pixels = image.imread(tmp_path / "out" / "stability.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 1000
+    out = str(tmp_path / "nothing to draw below")
+    assert cli.main([*words[:3], "--only", "friction", "--out", out]) == 0
+    capsys.readouterr()
     assert cli.main([*words[:3], "--only", "frictio"]) == 1
     said = capsys.readouterr().err
     assert "--only = 'frictio': must be one of as-it-is" in said
