@@ -261,7 +261,7 @@ def read_table(given: Any) -> dict[str, Array]:
             pandas = require("pandas")
             read = pandas.read_parquet if given.suffix == ".parquet" else pandas.read_csv
             given = read(given)
-        columns = {str(name): np.asarray(given[name], dtype=float) for name in given}
+        columns = {str(name): np.array(given[name], dtype=float) for name in given}
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("a column has one number for each row")
         return columns

@@ -119,3 +119,10 @@ def test_bad_studies_are_refused_by_key(given, message):
     values = {"scene": SCENE, "vary": {KEY: ("uniform", 0.2, 0.3)}, "n": 4} | given
     with pytest.raises(InputError, match=f"(?s){message}"):
         SweepStudy.from_values(values)
+
+
+def test_a_study_keeps_its_table_when_the_one_given_changes():
+    column = np.array([1.0, 2.0])
+    study = SweepStudy.from_values({"scene": SCENE, "table": {"star.mass": column}, "vary": {}})
+    column[0] = 7.0
+    assert study.table["star.mass"].tolist() == [1.0, 2.0]
