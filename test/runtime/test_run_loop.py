@@ -3,6 +3,7 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -330,6 +331,16 @@ def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests(st
     bench.stamped.append(stamped(bench.output.stamps[-1]))
     assert bench.ask("step").success
     assert len(bench.output.stamps) == 2
+
+
+def test_requests_of_four_callers_at_once_are_all_answered(start):
+    bench = start("example1", clock=HandClock())
+    calls = [("pause", True), ("pause", False), ("step",), ("reset",)] * 25
+    with ThreadPoolExecutor(4) as pool:
+        replies = [*pool.map(lambda call: bench.ask(*call), calls)]
+    refused = [reply.message for reply in replies if not reply.success]
+    assert all("only a paused run can be stepped" in words for words in refused)
+    assert bench.ask("reset").success and not bench.loop.fault
 
 
 def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered(start):
