@@ -17,10 +17,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc"),
 ]
-RUNS = {
-    "kernel": ("--rounds", "1"),
-    "batch": ("--scenarios", "200", "--rounds", "1"),
-}
+RUNS = {"kernel": ("--rounds", "1"), "batch": ("--scenarios", "200", "--rounds", "1")}
 
 
 @pytest.mark.parametrize("name", RUNS)

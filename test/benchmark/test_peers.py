@@ -48,21 +48,6 @@ def test_gate_sees_a_wrong_inertia(task):
 
 
 @pytest.mark.slow
-def test_short_runs_converge_to_each_other(task):
-    """The whole path of one engine and ours: same end to the order of their steps."""
-    pytest.importorskip("numba")
-    pytest.importorskip("pinocchio")
-    ends = []
-    for module in ("ours", "pinocchio_peer"):
-        series = [s for s in peer(module).series(task, quick=True) if s.name.startswith("DOP853")]
-        setting = next(s for s in series[0].settings if s.steps >= 20)
-        engine = setting.make()
-        ends.append(engine.pose(engine.run()))
-    assert turn_between(ends[0].rotation, ends[1].rotation) < 1e-7
-    assert np.abs(ends[0].gamma - ends[1].gamma).max() < 1e-7
-
-
-@pytest.mark.slow
 def test_our_headline_is_the_public_call(task):
     """Every setting ends within its tolerance of the finest one, and no other series counts."""
     pytest.importorskip("numba")
