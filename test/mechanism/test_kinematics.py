@@ -215,8 +215,9 @@ def test_carriages_and_arcs_of_the_star_are_vectors_turned_about_axes(sample):
     for k in range(3):
         expected = turned(sample.gamma[k], geometry.w[k], geometry.v[k])
         np.testing.assert_allclose(r[k], expected, atol=1e-15, rtol=0)
+        # Sums of three angles up to 2 pi, whose last place is 8.9e-16; 1.3e-15 in 4,000 samples.
         following = turned(geometry.alpha[k], [0.0, 0.0, 1.0], geometry.e[k])
-        np.testing.assert_allclose(following, geometry.e[(k + 1) % 3], atol=1e-15, rtol=0)
+        np.testing.assert_allclose(following, geometry.e[(k + 1) % 3], atol=4e-15, rtol=0)
     ends = kinematics.carriage_directions(geometry, geometry.arc)
     np.testing.assert_allclose(ends, np.roll(geometry.v, -1, axis=0), atol=1e-15)
 
