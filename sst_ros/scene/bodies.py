@@ -165,7 +165,9 @@ class Link(Section):
         fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
 
         def contradiction() -> Problem:
-            moments = np.linalg.eigvalsh(_matrix_of(own))
+            left = _matrix_of(own)
+            finite = bool(np.isfinite(left).all())  # the square of a centre may overflow
+            moments = np.linalg.eigvalsh(left) if finite else np.diag(left)
             allowed = (
                 f"must fit the inertia about O, which leaves {moments} about this centre "
                 f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
