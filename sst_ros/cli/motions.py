@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 
 from sst_ros.cli.commands import free_out, function
-from sst_ros.control.plan import examine_motion
+from sst_ros.control.plan import examine_motion, plan_json, plan_table, time_scaling, write_torques
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.time_scaling import plan_json, plan_table, time_scaling, write_torques
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import require_free, write_into
 from sst_ros.identification.excitation import design

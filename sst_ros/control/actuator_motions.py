@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, follow_assembly
 from sst_ros.control.reference import (
     PIECES,
     Reference,
@@ -32,7 +32,7 @@ from sst_ros.control.reference import (
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.generic_math import ZERO, axpy, multiply
+from sst_ros.mechanism.generic_math import ZERO, axpy, multiply, triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import Sweep, ToAngles
 from sst_ros.state import Quaternion, Vector3
@@ -42,19 +42,12 @@ Path = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 
 STEP = 0.03
 """Distance in gamma [rad] between orientations that are kept."""
-
 LONGEST = 100.0
 """Longest path in gamma [rad] within a piece of a motion."""
-
 NEAR = 0.1
 """Largest distance of a first point at time 0 from the start [rad]."""
-
 SAMPLES_A_PIECE = 8
-
 _SAMPLES = 16
-
-Points = Sequence[Sequence[float]]
-
 OpenPoints = Sequence[Sequence[float] | None]
 
 
@@ -168,7 +161,7 @@ def sweep_path(sweep: Sweep, centre: Vector3) -> tuple[Path, tuple[float, ...]]:
             p.append(middle + amplitude * e * s)
             v.append(amplitude * (e1 * s + e * s1))
             a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
-        return (p[0], p[1], p[2]), (v[0], v[1], v[2]), (a[0], a[1], a[2])
+        return triple(p), triple(v), triple(a)
 
     fastest = max(map(abs, (*sweep.frequency, *last)))
     quarters = math.ceil(fastest * sweep.duration / (0.5 * math.pi))
@@ -189,7 +182,7 @@ def through_points(
     geometry: Geometry,
     start: Quaternion,
     times: Sequence[float],
-    positions: Points,
+    positions: Sequence[Sequence[float]],
     velocities: OpenPoints | None = None,
     accelerations: OpenPoints | None = None,
     begin: tuple[Vector3, Vector3] = (ZERO, ZERO),
@@ -275,15 +268,6 @@ def through_samples(
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
     spline = Quintic(times, gamma, velocities, free)
     return ActuatorMotion(geometry, cast("Path", spline.at), pieces, start)
-
-
-def follow_assembly(
-    geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike
-) -> Quaternion:
-    """Follow the assembly from one gamma straight to another."""
-    rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
-    x, y, z, w = quaternion_of(rotation).tolist()
-    return (x, y, z, w)
 
 
 def _rows(

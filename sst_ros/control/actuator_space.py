@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
@@ -44,19 +45,19 @@ from sst_ros.state import Quaternion, Vector3
 
 ROUNDING = 4e-16
 """Residual abs(r_k . t_k) at which Newton's method ends: rounding."""
-
 CLOSED = 1e-14
 """Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
-
 _STEPS = 20
-
 _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
-
 _POSE = (*QUATERNION, *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 
 class ActuatorSpaceMap:
-    """Map between star and actuators: traced kinematics of one geometry."""
+    """Map between star and actuators: traced kinematics of one geometry.
+
+    Each function of numbers raises an ArithmeticError in a singularity: of_star and posture in a
+    serial one (sin(mu_k) = 0), orientation in a parallel one (det J2 = 0), the others in both.
+    """
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -73,57 +74,31 @@ class ActuatorSpaceMap:
         self._newton = compile_program(trace(self.newton_step, _POSE))
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
-        """Return the reference of a state of the star; gamma is in (-pi, pi] [rad].
-
-        Raises:
-            ArithmeticError: serial singularity.
-
-        """
+        """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
         g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
         return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
 
     def posture(self, q: Quaternion) -> tuple[float, ...]:
-        """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation.
-
-        Raises:
-            ArithmeticError: serial singularity.
-
-        """
+        """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation."""
         return self._posture(*q)
 
     def of_actuators(
         self, near: Quaternion, gamma: Vector3, gamma_dot: Vector3, gamma_ddot: Vector3
     ) -> Reference:
-        """Return the reference of a state of the actuators, in the assembly mode closest to `near`.
-
-        Raises:
-            ArithmeticError: singularity.
-
-        """
+        """Return the reference of a state of the actuators, of the assembly closest to `near`."""
         q = self.orientation(near, gamma)
-        return Reference(
-            q, *self.star_motion(q, gamma_dot, gamma_ddot), gamma, gamma_dot, gamma_ddot
-        )
+        star = self.star_motion(q, gamma_dot, gamma_ddot)
+        return Reference(q, *star, gamma, gamma_dot, gamma_ddot)
 
     def star_motion(
         self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
     ) -> tuple[Vector3, Vector3]:
-        """W [rad/s] and W_dot [rad/s^2] in {E} of rates and accelerations of the actuators.
-
-        Raises:
-            ArithmeticError: singularity.
-
-        """
+        """W [rad/s] and W_dot [rad/s^2] in {E} of rates and accelerations of the actuators."""
         x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
         return (x, y, z), (ax, ay, az)
 
     def orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
-        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
-
-        Raises:
-            ArithmeticError: parallel singularity.
-
-        """
+        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`."""
         carriages = self.carriages(gamma)
         best, least, q = near, math.inf, near
         for _ in range(_STEPS):
@@ -234,6 +209,15 @@ def _solve(rows: list[Any], right: Any) -> tuple[Any, ...]:
     return tuple(part / determinant for part in total)
 
 
+def follow_assembly(
+    geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike
+) -> Quaternion:
+    """Follow the assembly from one gamma straight to another; raises as `continuation.advance`."""
+    rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
+    x, y, z, w = quaternion_of(rotation).tolist()
+    return (x, y, z, w)
+
+
 class OrientationObserver:
     """Tracks one assembly mode, however far apart successive angles are.
 
@@ -268,11 +252,8 @@ class OrientationObserver:
         """
         found = self._step(gamma)
         if found is None:
-            rotation = continuation.advance(
-                self.coordinates.geometry, rotation_matrix(self._quaternion), self._gamma, gamma
-            )
-            x, y, z, w = quaternion_of(rotation).tolist()
-            found = (x, y, z, w)
+            geometry = self.coordinates.geometry
+            found = follow_assembly(geometry, self._quaternion, self._gamma, gamma)
             self._sigma, _ = self._measures(found, gamma)
         self._quaternion, self._gamma = found, gamma
         return found

@@ -123,28 +123,25 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
+        gamma, gamma_dot = measured.gamma, measured.gamma_dot
         try:
-            return self._command(time, measured)
+            _require_finite((*gamma, *gamma_dot), "measured")
+            settings, desired = self._settings, self._motion.at(time)
+            instant = time + 0.5 * self._period_s
+            torques = feedforward_torques(settings, self._inverse, self._motion, desired, instant)
+            observed = self._observer.update(gamma) if settings.observes else ()
+            command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
+            _require_finite(command.total, "torque")
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
+        self._integral = command.integral
+        return command
 
     def __call__(self, time: float, state: State) -> Vector3:
         """Torques [N m] for the angles and rates of a state: a function for `simulate`."""
         joints = state.joints
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
-
-    def _command(self, time: float, measured: Measurement) -> Command:
-        gamma, gamma_dot = measured.gamma, measured.gamma_dot
-        _require_finite((*gamma, *gamma_dot), "measured")
-        settings, desired = self._settings, self._motion.at(time)
-        instant = time + 0.5 * self._period_s
-        torques = feedforward_torques(settings, self._inverse, self._motion, desired, instant)
-        observed = self._observer.update(gamma) if settings.observes else ()
-        command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
-        _require_finite(command.total, "torque")
-        self._integral = command.integral
-        return command
 
 
 def _require_finite(numbers: Sequence[float], what: str) -> None:

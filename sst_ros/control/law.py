@@ -26,6 +26,7 @@ on settings, never on numbers.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -49,6 +50,7 @@ from sst_ros.mechanism.generic_math import (
     relative_quaternion,
     rotation_rows,
     sqrt,
+    triple,
 )
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
@@ -56,13 +58,15 @@ from sst_ros.scene.schema import Section, choice, integer, number
 from sst_ros.state import Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
-
 SPACES = ("gamma", "so3")
-
 INSTANTS = ("start", "middle")
-
 _ROUND = 1.5 * 2.0**52
 """Added and subtracted, it rounds to whole numbers, halves to even."""
+
+
+def _joint_gain(name: str, unit: str, instead: str) -> Any:
+    doc = f"{name} of the feedback, in place of {instead}; zeros for that of bandwidth"
+    return number(doc, unit, shape=(3,), default=ZERO, least=0.0, most=1e9)
 
 
 @dataclass(frozen=True)
@@ -93,22 +97,8 @@ class ControllerSettings(Section):
     damping_ratio: float = number(
         "damping ratio of the error", "1", default=1.0, above=0.0, most=1e3
     )
-    stiffness: Vector3 = number(
-        "stiffness of the feedback, in place of bandwidth; zeros for that of bandwidth",
-        "N m/rad",
-        shape=(3,),
-        default=(0.0, 0.0, 0.0),
-        least=0.0,
-        most=1e9,
-    )
-    damping: Vector3 = number(
-        "damping of the feedback, in place of damping_ratio; zeros for that of bandwidth",
-        "N m s/rad",
-        shape=(3,),
-        default=(0.0, 0.0, 0.0),
-        least=0.0,
-        most=1e9,
-    )
+    stiffness: Vector3 = _joint_gain("stiffness", "N m/rad", "bandwidth")
+    damping: Vector3 = _joint_gain("damping", "N m s/rad", "damping_ratio")
     integral_rate: float = number(
         "integral action: stiffness times this is the torque per sum of errors; 0 for none",
         "1/s",
@@ -191,10 +181,9 @@ class ControlChannel(Section):
 
         """
         if self.counts:
-            gamma = (self.count(gamma[0]), self.count(gamma[1]), self.count(gamma[2]))
+            gamma = triple(map(self.count, gamma))
             moved = axpy(1.0, gamma, -1.0, before)
-            gamma_dot = (moved[0] / self.period, moved[1] / self.period, moved[2] / self.period)
-            before = gamma
+            gamma_dot, before = triple(part / self.period for part in moved), gamma
         if noise:
             gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
         return gamma, gamma_dot, before
@@ -319,7 +308,7 @@ class ControlLaw(NamedTuple):
         between = relative_quaternion(observed, desired.quaternion)
         turn = rotation_rows(between)
         rate, forward = (
-            (dot3(turn[0], vector), dot3(turn[1], vector), dot3(turn[2], vector))
+            triple(dot3(row, vector) for row in turn)
             for vector in (desired.body_rate, desired.body_acceleration)
         )
         moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
@@ -333,7 +322,7 @@ class ControlLaw(NamedTuple):
 
 
 def _by_joint(factors: Triple, values: Triple) -> Triple:
-    return factors[0] * values[0], factors[1] * values[1], factors[2] * values[2]
+    return triple(map(operator.mul, factors, values))
 
 
 def feedback_gains(
@@ -389,10 +378,7 @@ def bound(values: Triple, limit: Scalar) -> Triple:
     """Clamp three numbers to the interval from -limit to limit."""
     if isinstance(limit, float):
         return clamp(values, limit)
-    first, second, third = (
-        value - positive(value - limit) + positive(-limit - value) for value in values
-    )
-    return first, second, third
+    return triple(value - positive(value - limit) + positive(-limit - value) for value in values)
 
 
 def is_above(value: Scalar) -> Scalar:

@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference of a controller, and reference motions: a reference for every time."""
+"""The reference of a controller, reference motions, and extremes of what they ask for."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+from scipy.optimize import minimize_scalar
+
 from sst_ros.mechanism.generic_math import ZERO, axpy, multiply
-from sst_ros.state import Quaternion, Vector3
+from sst_ros.state import Array, Quaternion, Vector3
 
 PIECES = 8
 """Pieces of a minimum-jerk motion, and of a quarter of a turn."""
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -121,3 +127,50 @@ def minimum_jerk_over(time: float, duration: float) -> tuple[float, float, float
     """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
     s, rate, acceleration = minimum_jerk(time / duration)
     return s, rate / duration, acceleration / (duration * duration)
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A value and the time at which it is taken [s]."""
+
+    value: float
+    time: float
+
+
+def maximum(
+    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+) -> Peak:
+    """Return the maximum of a function of which samples are known.
+
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
+    if the function could exceed the best sample there: extrapolated by its change to the lower
+    neighbour.
+
+    Args:
+        function: of time.
+        times: of the samples, rising [s], shape (n,).
+        values: the function there, shape (n,).
+        floor: maxima that are certainly below it are not refined.
+
+    """
+    top = int(np.argmax(values))
+    best = Peak(float(values[top]), float(times[top]))
+    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
+    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
+    summits = (values >= left) & (values >= right) & high
+    for index in np.flatnonzero(summits):
+        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
+        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
+        found = minimize_scalar(
+            lambda time: -function(time), bounds=bounds, method="bounded", options=options
+        )
+        if -found.fun > best.value + _ROUNDING * abs(best.value):
+            best = Peak(float(-found.fun), float(found.x))
+    return best
+
+
+def minimum(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the minimum; see `maximum`."""
+    found = maximum(lambda time: -function(time), times, -values)
+    return Peak(-found.value, found.time)

@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.control.actuator_motions import (
     ActuatorMotion,
-    follow_assembly,
     straight_path,
     sweep_path,
     through_points,
     through_samples,
 )
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, follow_assembly
 from sst_ros.control.reference import (
     PIECES,
     Reference,
