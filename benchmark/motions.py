@@ -22,7 +22,7 @@ from sst_ros import Batch, Simulation, load_scene, read_bag, simulate, sweep
 from sst_ros.errors import SstError
 
 SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
-METHODS = ("auto", "gauss", "dopri5", "dop853", "rk4", "rodas4")
+METHODS = ("auto", "gauss", "dopri5", "dop853", "rk4", "rodas5p")
 DURATION = 0.25
 STEPS = 50
 MEASURED = (

@@ -32,7 +32,7 @@ settings = {
     "rk4": [(1.0, steps) for steps in (2, 4, 8, 16, 32, 64, 128)],
     "dopri5": [(10.0**-k, 1) for k in range(2, 12)],
     "dop853": [(10.0**-k, 1) for k in range(2, 12)],
-    "rodas4": [(10.0**-k, 1) for k in range(2, 8)],
+    "rodas5p": [(10.0**-k, 1) for k in range(2, 8)],
 }
 figure, axes = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
 for (method, values), marker in zip(settings.items(), "o^sD", strict=True):

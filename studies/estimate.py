@@ -28,7 +28,7 @@ from studies import DOCS, run, run_jobs
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-METHODS = ("dopri5", "dop853", "rk4", "rodas4", "auto")
+METHODS = ("dopri5", "dop853", "rk4", "rodas5p", "auto")
 TIGHTER = 1e-3
 FINEST, ROUNDING = 1e-13, 2e-14
 """Least tolerance of a reference, and error below which rounding decides [rad]."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod, Method
-from sst_ros.integration.methods import METHODS, RODAS4
+from sst_ros.integration.methods import METHODS, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot import style
 from sst_ros.plot.style import INK, MARKERS, free_figure, note, styled
@@ -51,12 +51,13 @@ _STEPS, _GROWTH = 400, 10.0
 def limits_of_theory() -> Iterator[str]:
     """Yield where each method is stable on the axes, from its stability function."""
     for name, method in METHODS.items():
-        if method is RODAS4:
+        if isinstance(method, Rosenbrock):
             on_axis = _growth(method, 1j * np.geomspace(1e-3, 1e9, 100_000)).max()
             far = _growth(method, np.array([FAR]))[0]
             yield (
                 f"{name}: A-stable and L-stable; abs(R) is at most {on_axis:.15g} on the imaginary "
-                f"axis, all poles lie at z = 4, and abs(R({FAR:g})) = {far:.0e}"
+                f"axis, all poles lie at z = {1.0 / method.gamma:.4g}, and abs(R({FAR:g})) = "
+                f"{far:.0e}"
             )
             continue
         line = np.linspace(0.0, 10.0, 100_001)

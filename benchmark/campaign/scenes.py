@@ -93,7 +93,7 @@ def bits(ledger: Ledger) -> None:
     for number in ledger.numbers(200):
         name = f"scene {number} (seed {ledger.seed + 1})"
         # Compiling takes seconds, for `auto` that of three methods.
-        method = rng.choice(("rk4", "dopri5", "dop853", "rodas4")) if number % 10 else "auto"
+        method = rng.choice(("rk4", "dopri5", "dop853", "rodas5p")) if number % 10 else "auto"
         with ledger.case(f"{name} {method}", bound=120.0), warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = random_scene(rng)

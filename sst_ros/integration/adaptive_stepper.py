@@ -19,7 +19,7 @@ from sst_ros.integration.compiled_method import (
     Point,
     Vector,
 )
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4, Rosenbrock
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 
 GROW = 5.0
@@ -51,7 +51,7 @@ def better_method(
     radius, decay = abs(steps).max(), -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
     if not implicit and decay > _STIFF and decay > 0.5 * radius:
-        return RODAS4, f"stiff: step times fastest decay is {decay:.2g}"
+        return RODAS5P, f"stiff: step times fastest decay is {decay:.2g}"
     if only_stiff:
         return method, ""
     if implicit and radius < _EASY:
@@ -185,7 +185,7 @@ class AdaptiveStepper:
         """Have the code of all methods that a run may turn to loaded; nothing else changes."""
         if self._derivative is not None:
             return  # plain Python, and an explicit method to the end
-        methods = (DORMAND_PRINCE, DOP853, RODAS4) if self._auto else (self.method,)
+        methods = (DORMAND_PRINCE, DOP853, RODAS5P) if self._auto else (self.method,)
         for method in methods:
             loaded = self._method_of(method)
             loaded.step_pair(0.0, h, at.y, at.z, d)

@@ -22,7 +22,14 @@ from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, ode_with_work
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import codegen, step_loops
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Rosenbrock, Tableau
+from sst_ros.integration.methods import (
+    DOP853,
+    DORMAND_PRINCE,
+    METHODS,
+    RODAS5P,
+    Rosenbrock,
+    Tableau,
+)
 from sst_ros.scene.scene import Scene
 
 Method = Tableau | Rosenbrock
@@ -297,13 +304,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
         texts.append(codegen.explicit_step(method, size, len(d), *p))
         texts.append(f"def attempt(t, h, y, near, d, p, new_y, error):\n{step}")
     else:
-        # numba wants rows of one length.
-        padded = [
-            tuple((*row, *(0.0,) * (5 - len(row))) for row in table)
-            for table in (method.a, method.c)
-        ]
-        constants |= {"RODAS_A": padded[0], "RODAS_C": padded[1]}
-        constants |= {"RODAS_ALPHA": method.alpha, "RODAS_D": method.d}
+        constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]
         texts.append(_linearise(system, slots))
         evaluate = _assign(slope, f"rhs({inputs})")
@@ -385,4 +386,4 @@ def make_code(scene: Scene, integrator: str) -> Iterator[str]:
 
 
 def _methods(integrator: str) -> tuple[Method, ...]:
-    return (METHODS[integrator],) if integrator in METHODS else (DORMAND_PRINCE, DOP853, RODAS4)
+    return (METHODS[integrator],) if integrator in METHODS else (DORMAND_PRINCE, DOP853, RODAS5P)

@@ -3,13 +3,14 @@
 
 Sources: RK4, Kutta 1901. Dormand-Prince 5(4), J. Comput. Appl. Math. 6 (1980) 19-26. DOP853,
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 2nd ed., section II.10.
-RODAS4, Hairer & Wanner, Solving Ordinary Differential Equations II, 2nd ed., section VI.4.
+Rodas5P, Steinebach, BIT Numer. Math. 63 (2023) 27.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -113,49 +114,80 @@ DOP853 = Tableau(
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """A linearly implicit method in the form without matrix products; gamma is 1/4."""
+    """A linearly implicit method in the form without matrix products.
+
+    Its last stage is its error estimate, and the argument of that stage the embedded solution.
+    """
 
     name: str
     order: int  # of the solution that goes on
     error_order: int  # of the error estimate
-    a: tuple[tuple[float, ...], ...]  # of the stages in the arguments; the last two rows end in 1
+    gamma: float  # of the matrix 1 / (gamma h) - J, which all stages share
+    a: tuple[tuple[float, ...], ...]  # of the stages in the arguments
     c: tuple[tuple[float, ...], ...]  # of the stages in the right-hand sides, over h
     alpha: tuple[float, ...]  # nodes
     d: tuple[float, ...]  # of the derivative by time
 
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Constants of `step_loops.attempt_linearly_implicit`; numba wants rows of one length."""
+        stages = len(self.alpha)
+        a, c = (
+            tuple((*row, *(0.0,) * (stages - len(row))) for row in table)
+            for table in (self.a, self.c)
+        )
+        names = ("STAGES", "GAMMA", "STAGE_A", "STAGE_C", "STAGE_ALPHA", "STAGE_D")
+        return dict(zip(names, (stages, self.gamma, a, c, self.alpha, self.d), strict=True))
 
-_RODAS_LAST = (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950)
 
-RODAS4 = Rosenbrock(
-    name="rodas4",
-    order=4,
-    error_order=3,
+_RODAS5P_LAST = _row(
+    "-7.502846399306121 2.561846144803919 -11.627539656261098 -0.18268767659942256 "
+    "0.030198172008377946"
+)
+
+RODAS5P = Rosenbrock(
+    name="rodas5p",
+    order=5,
+    error_order=4,
+    gamma=0.21193756319429014,
     a=(
         (),
-        (1.544,),
-        (0.9466785280815826, 0.2557011698983284),
-        (3.314825187068521, 2.896124015972201, 0.9986419139977817),
-        _RODAS_LAST,
-        (*_RODAS_LAST, 1.0),
+        _row("3"),
+        _row("2.849394379747939 0.45842242204463923"),
+        _row("-6.954028509809101 2.489845061869568 -10.358996098473584"),
+        _row("2.8029986275628964 0.5072464736228206 -0.3988312541770524 -0.04721187230404641"),
+        _RODAS5P_LAST,
+        (*_RODAS5P_LAST, 1.0),
+        (*_RODAS5P_LAST, 1.0, 1.0),
     ),
     c=(
         (),
-        (-5.6688,),
-        (-2.430093356833875, -0.2063599157091915),
-        (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
-        (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
-        (
-            8.083246795921522,
-            -7.981132988064893,
-            -31.52159432874371,
-            16.31930543123136,
-            -6.058818238834054,
+        _row("-14.155112264123755"),
+        _row("-17.97296035885952 -2.859693295451294"),
+        _row("147.12150275711716 -1.41221402718213 71.68940251302358"),
+        _row("165.43517024871676 -0.4592823456491126 42.90938336958603 -5.961986721573306"),
+        _row(
+            "24.854864614690072 -3.0009227002832186 47.4931110020768 5.5814197821558125 "
+            "-0.6610691825249471"
+        ),
+        _row(
+            "30.91273214028599 -3.1208243349937974 77.79954646070892 34.28646028294783 "
+            "-19.097331116725623 -28.087943162872662"
+        ),
+        _row(
+            "37.80277123390563 -3.2571969029072276 112.26918849496327 66.9347231244047 "
+            "-40.06618937091002 -54.66780262877968 -9.48861652309627"
         ),
     ),
-    alpha=(0.0, 0.386, 0.21, 0.63, 1.0, 1.0),
-    d=(0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0),
+    alpha=_row(
+        "0 0.6358126895828704 0.4095798393397535 0.9769306725060716 0.4288403609558664 1 1 1"
+    ),
+    d=_row(
+        "0.21193756319429014 -0.42387512638858027 -0.3384627126235924 1.8046452872882734 "
+        "2.325825639765069 0 0 0"
+    ),
 )
 
 METHODS: dict[str, Tableau | Rosenbrock] = {
-    method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS4)
+    method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS5P)
 }

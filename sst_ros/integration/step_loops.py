@@ -138,10 +138,10 @@ def all_far(ranges, begin, end, h):
 
 
 def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
-    """One step of RODAS4 (Hairer & Wanner, Solving ODEs II, section VI.4), exact Jacobian.
+    """One step of a Rosenbrock method (Hairer & Wanner, Solving ODEs II, section IV.7).
 
-    Order 4, L-stable, stiffly accurate; the error estimate is of order 3. The Jacobian is that at
-    `near`: y itself, or for the coarse solution the fine one, which is near. Beside a kink of a
+    The last stage is what the solution adds to the embedded one. The Jacobian is exact, and that
+    at `near`: y itself, or for the coarse solution the fine one, which is near. Beside a kink of a
     force the two may lie on different sides; the Jacobian is that of the fine one.
     """
     matrix = square(SIZE)
@@ -152,28 +152,28 @@ def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
     for i in range(SIZE):
         for j in range(SIZE):
             matrix[i][j] = -matrix[i][j]
-        matrix[i][i] += 1.0 / (0.25 * h)
+        matrix[i][i] += 1.0 / (GAMMA * h)
     factorise(matrix, pivot)
-    u = rows(6, SIZE)
+    u = rows(STAGES, SIZE)
     at = vector(SIZE)
     right = vector(SIZE)
-    for stage in range(6):
+    for stage in range(STAGES):
         for i in range(SIZE):
             at[i] = y[i]
         for j in range(stage):
             for i in range(SIZE):
-                at[i] += RODAS_A[stage][j] * u[j][i]
-        evaluate(t + RODAS_ALPHA[stage] * h, at, d, p, slope)
+                at[i] += STAGE_A[stage][j] * u[j][i]
+        evaluate(t + STAGE_ALPHA[stage] * h, at, d, p, slope)
         for i in range(SIZE):
-            right[i] = slope[i] + h * RODAS_D[stage] * by_time[i]
+            right[i] = slope[i] + h * STAGE_D[stage] * by_time[i]
             for j in range(stage):
-                right[i] += RODAS_C[stage][j] / h * u[j][i]
+                right[i] += STAGE_C[stage][j] / h * u[j][i]
         substitute(matrix, pivot, right)
         for i in range(SIZE):
             u[stage][i] = right[i]
     for i in range(SIZE):
-        new_y[i] = at[i] + u[5][i]
-        error[i] = u[5][i]
+        new_y[i] = at[i] + u[STAGES - 1][i]
+        error[i] = u[STAGES - 1][i]
 
 
 def factorise(a, pivot):

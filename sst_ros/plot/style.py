@@ -32,7 +32,7 @@ MARKERS = {
     "rk4": (BLUE, "o"),
     "dopri5": (VERMILION, "s"),
     "dop853": (GREEN, "^"),
-    "rodas4": (PURPLE, "D"),
+    "rodas5p": (PURPLE, "D"),
     "gauss": (ORANGE, "v"),
 }
 """Colour and marker of each method of integration."""

@@ -115,7 +115,7 @@ def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.
     if isinstance(method, Rosenbrock):
         for a, c in zip(method.a, method.c, strict=True):
             at = one + _combine(a, stages)
-            stages.append((z * at + _combine(c, stages)) / (4.0 - z))
+            stages.append((z * at + _combine(c, stages)) / (1.0 / method.gamma - z))
         return np.asarray(at + stages[-1])
     for row in method.a:
         stages.append(one + z * _combine(row, stages))

@@ -69,7 +69,7 @@ def simulate(
             are rounded). By default the ends of the steps of Gauss collocation, the control
             periods, or 200 even intervals. The steps do not depend on them.
         method: "gauss" (Gauss collocation), "dopri5", "dop853", "rk4" (explicit Runge-Kutta of
-            order 5, 8, 4), "rodas4" (Rosenbrock, order 4, for stiff scenes) or "auto".
+            order 5, 8, 4), "rodas5p" (Rosenbrock, order 5, for stiff scenes) or "auto".
         tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
             `error_estimate` exceeds it is run again by smaller steps, up to three times; if it
             still does, `status` is 2. With `control_period` it runs once.

@@ -53,7 +53,7 @@ def test_loads_that_fit_into_the_equations_are_there():
         ("friction", {}, r"friction = .*use equations = quaternion"),
         ("stiff", {}, "springs = "),
         ("elastic_stops", {}, r"stroke\.at_end = 'elastic'"),
-        ("example1", {"integrator": "rodas4"}, "needs an explicit integrator"),
+        ("example1", {"integrator": "rodas5p"}, "needs an explicit integrator"),
         ("example1", {"compiled": True}, "compiled = False"),
         ("example1", {"equations": "lagrange"}, "must be one of quaternion, virtual_work"),
     ],

@@ -22,7 +22,7 @@ from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, ode_with_work
 from sst_ros.integration import codegen, gauss
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS4
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section
@@ -43,8 +43,8 @@ SINE = (replace(EXAMPLE2, **IGNORE), 0.4, EXAMPLE2.torque)
 SPIN = (replace(load("fast_spin"), **IGNORE), 0.01, None)
 ORDERS = [
     *((SINE, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 64), (DOP853, 16))),
-    (SINE, RODAS4, 128),
-    *((SPIN, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 96), (RODAS4, 256))),
+    (SINE, RODAS5P, 128),
+    *((SPIN, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 96), (RODAS5P, 96))),
 ]
 
 
@@ -65,7 +65,7 @@ def truth_of(scene, span, torque):
     ids=[f"{'sine' if case[2] else 'spin'}-{method.name}" for case, method, _ in ORDERS],
 )
 def test_measured_order_is_that_of_the_theory(case, method, steps):
-    """Errors stay well above rounding. Under sine torques the d/dt of RODAS4 is at work."""
+    """Errors stay well above rounding. Under sine torques the d/dt of Rodas5P is at work."""
     system, y, drive, truth = truth_of(*case)
     machine = CompiledMethod(system, method, compiled=False)
     errors = []
@@ -79,7 +79,7 @@ def test_measured_order_is_that_of_the_theory(case, method, steps):
 
 def linearised(scene, torque, t, y, drive):
     system = system_of(scene, torque, work=True)
-    machine, size = CompiledMethod(system, RODAS4, compiled=False), len(system.state)
+    machine, size = CompiledMethod(system, RODAS5P, compiled=False), len(system.state)
     slope, by_time, matrix = np.zeros(size), np.zeros(size), np.zeros((size, size))
     machine._module.linearise(t, y, drive, (), slope, by_time, matrix)
     return slope, by_time, matrix
@@ -137,7 +137,7 @@ def test_a_step_without_a_finite_result_has_an_infinite_error():
 
 def test_a_slope_of_its_own_needs_an_explicit_method():
     with pytest.raises(ValueError, match="needs plain Python"):
-        CompiledMethod(system_of(viscous(1.0)), RODAS4, compiled=False, derivative=lambda *x: x)
+        CompiledMethod(system_of(viscous(1.0)), RODAS5P, compiled=False, derivative=lambda *x: x)
 
 
 # Compiled code belongs to a structure: scenes that differ in numbers alone share it.

@@ -3,8 +3,8 @@
 
 Explicit coefficients are rounded in their last digit and sums of DOP853 pass through numbers up to
 1e2, so a condition may be missed by some 1e-14; a wrong digit anywhere misses one by far more than
-1e-13. RODAS4's are printed to 16 digits and go up to 34; the code works with u = Gamma k (Hairer &
-Wanner II, section IV.7), here they are turned back into alpha and gamma.
+1e-13. Those of Rodas5P are printed to 16 digits and go up to 165; the code works with u = Gamma k
+(Hairer & Wanner II, section IV.7), here they are turned back into alpha and gamma.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from loaded_scenes import start_of
 
 from sst_ros.dynamics import kernel
 from sst_ros.integration import codegen, step_loops
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS4, Tableau
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Tableau
 from sst_ros.scene.scene import load
 
 CONDITION, ROSENBROCK_CONDITION = 1e-13, 1e-12
 EXPLICIT = [method for method in METHODS.values() if isinstance(method, Tableau)]
 every_method = pytest.mark.parametrize("tableau", EXPLICIT, ids=lambda t: t.name)
-GAMMA = 0.25
+STAGES = len(RODAS5P.alpha)
 
 
 def trees(order):
@@ -170,31 +170,31 @@ def test_estimates_shrink_by_their_order_and_bound_the_true_error(tableau, many,
         assert 0.0 < np.linalg.norm(np.subtract(moved, truth)) < estimate < 1e-4
 
 
-# RODAS4: L-stable, stiffly accurate, of order 4 for any system.
+# Rodas5P: L-stable, stiffly accurate, of order 5 for any system.
 
 
 def matrices():
     """alpha_ij and gamma_ij (with the diagonal), and the weights b."""
-    u_of_k = np.linalg.inv(np.eye(6) / GAMMA - square(RODAS4.c, 6))
-    weights = np.array([*RODAS4.a[5], 1.0])
-    return square(RODAS4.a, 6) @ u_of_k, u_of_k, weights @ u_of_k
+    u_of_k = np.linalg.inv(np.eye(STAGES) / RODAS5P.gamma - square(RODAS5P.c, STAGES))
+    weights = np.array([*RODAS5P.a[-1], 1.0])
+    return square(RODAS5P.a, STAGES) @ u_of_k, u_of_k, weights @ u_of_k
 
 
-def test_nodes_of_rodas4_are_the_sums_of_their_rows():
+def test_nodes_of_rodas5p_are_the_sums_of_their_rows():
     alpha, gamma, _ = matrices()
     for found, expected in (
-        (alpha.sum(axis=1), RODAS4.alpha),
-        (gamma.sum(axis=1), RODAS4.d),
-        (np.diag(gamma), GAMMA),
+        (alpha.sum(axis=1), RODAS5P.alpha),
+        (gamma.sum(axis=1), RODAS5P.d),
+        (np.diag(gamma), RODAS5P.gamma),
     ):
         np.testing.assert_allclose(found, expected, atol=ROSENBROCK_CONDITION)
 
 
-@pytest.mark.parametrize("order", [3, 4], ids=["embedded", "solution"])
-def test_rodas4_is_of_order_four_and_its_embedded_solution_of_order_three(order):
+@pytest.mark.parametrize("order", [4, 5], ids=["embedded", "solution"])
+def test_rodas5p_is_of_order_five_and_its_embedded_solution_of_order_four(order):
     """The embedded one is the argument of the last stage, so that the estimate is the last u."""
     alpha, gamma, b = matrices()
-    weights = b if order == 4 else alpha[5]
+    weights = b if order == 5 else alpha[-1]
     for lower in range(1, order + 1):
         assert max(misses(lower, weights, alpha, alpha + gamma)) < ROSENBROCK_CONDITION
     assert max(misses(order + 1, weights, alpha, alpha + gamma)) > 1e-6
@@ -204,8 +204,8 @@ def stability(z):
     """R(z) = 1 + z b (I - z B)^-1 1, in 50 digits."""
     alpha, gamma, b = matrices()
     beta = mpmath.matrix((alpha + gamma).tolist())
-    solved = mpmath.lu_solve(mpmath.eye(6) - z * beta, mpmath.ones(6, 1))
-    return 1 + z * sum(mpmath.mpf(float(b[i])) * solved[i] for i in range(6))
+    solved = mpmath.lu_solve(mpmath.eye(STAGES) - z * beta, mpmath.ones(STAGES, 1))
+    return 1 + z * sum(mpmath.mpf(float(b[i])) * solved[i] for i in range(STAGES))
 
 
 def test_it_is_a_stable_and_its_stability_function_vanishes_at_infinity():
@@ -227,14 +227,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
         slope[0] = slope_of(t, y[0])
 
     parts = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
-    a, c = ([(*row, *(0.0,) * 5) for row in table] for table in (RODAS4.a, RODAS4.c))
-    known = {
-        "SIZE": 1,
-        "RODAS_A": a,
-        "RODAS_C": c,
-        "RODAS_ALPHA": RODAS4.alpha,
-        "RODAS_D": RODAS4.d,
-    }
+    known = {"SIZE": 1, **RODAS5P.constants}
     module = codegen.load([inspect.getsource(part) for part in parts], known, numba=False)
     vars(module).update(linearise=linearise, evaluate=evaluate)
     y, new, error = [y0], [0.0], [0.0]

@@ -125,11 +125,11 @@ def test_a_run_beside_a_singularity_starts_beside_it():
 
 def test_the_steps_are_those_of_the_eigenvalues(found):
     assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
-    assert (found.steps.rodas4 == math.inf).all()
+    assert (found.steps.rodas5p == math.inf).all()
     stiff = examine_stability(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
     for name, reach in (("rk4", 2.785), ("dopri5", 3.307)):
         assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(reach, rel=3e-3)
-    assert "rodas4: every step is stable." in page(stiff)
+    assert "rodas5p: every step is stable." in page(stiff)
 
 
 def test_the_figure_and_the_page_show_every_method_and_run(found):
@@ -137,7 +137,7 @@ def test_the_figure_and_the_page_show_every_method_and_run(found):
     assert all(f"- {name}: " in said for name in METHODS) and "\n- gauss: every step" in said
     assert all(f"| {name} | {ROWS[name][0]} | yes |" in said for name in FEW)
     lines = {line.get_label() for axes in figure(found).axes for line in axes.lines}
-    assert {"rk4", "dopri5", "dop853", "rodas4: every step", "decay"} <= lines
+    assert {"rk4", "dopri5", "dop853", "rodas5p: every step", "decay"} <= lines
 
 
 def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
@@ -149,7 +149,7 @@ def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
     assert made == {f"stability.{kind}" for kind in ("csv", "json", "md", "png")}
     document = json.loads((tmp_path / "out" / "stability.json").read_text())
     assert [run["passed"] for run in document["runs"]] == [True, None]
-    assert len(document["steps"]) == 50 and document["steps"][0]["rodas4"] is None
+    assert len(document["steps"]) == 50 and document["steps"][0]["rodas5p"] is None
     pixels = image.imread(tmp_path / "out" / "stability.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 1000
     out = str(tmp_path / "nothing to draw below")

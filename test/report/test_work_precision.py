@@ -73,7 +73,7 @@ def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short
 
 
 def test_methods_show_their_order(short):
-    for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas4", 4)):
+    for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas5p", 5)):
         rows = [row for row in _rows(short, method) if 1e-12 < row.final_orientation_rad < 1e-4]
         assert len(rows) > 1 or method == "dop853"
         slopes = [
@@ -193,7 +193,7 @@ def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
 def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
     found = work_precision(stiff, compiled=False, longest_s=0.005)
-    assert not any(row.failure for row in _rows(found, "rodas4"))
+    assert not any(row.failure for row in _rows(found, "rodas5p"))
     failed = found.rows[found.rows.failure != ""]
     assert len(failed) and failed[ERROR].isna().all()
     assert text(found).count("FAILED") == len(failed)

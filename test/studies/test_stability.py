@@ -45,7 +45,7 @@ def test_the_largest_step_is_that_of_the_theory(family, method, coefficient, rea
 
 
 def test_the_implicit_method_is_stable_everywhere():
-    assert largest_step("decay", METHODS["rodas4"], 1e5).step == LONGEST_S
+    assert largest_step("decay", METHODS["rodas5p"], 1e5).step == LONGEST_S
 
 
 def test_right_and_wrong_results_are_distinguished():
@@ -67,7 +67,7 @@ def test_right_and_wrong_results_are_distinguished():
     assert "2 cases, 1 failed" in text and "**FAILED**" in text and "20 (2.00)" in text
     off = dataclasses.replace(good, same_bits=False)
     assert "**differ**" in page([off], steps) and not off.passed
-    assert "rodas4: A-stable and L-stable" in "\n".join(limits_of_theory())
+    assert "rodas5p: A-stable and L-stable" in "\n".join(limits_of_theory())
 
 
 def test_the_figure_shows_every_method(tmp_path):
