@@ -31,7 +31,7 @@ from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, free_figure
 from sst_ros.recording import recording
 from sst_ros.report import reference_solution as truth
 from sst_ros.report.reference_solution import InitialValueProblem, ReferenceSolution
-from sst_ros.report.results import data_frame, markdown, provenance, records, write
+from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.report.states import of_samples
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -172,8 +172,7 @@ def control_study(
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
     problem = InitialValueProblem(scene)
-    fast = compiled and numba_version() is not None
-    reference = truth.solve_reference(problem, compiled=fast)
+    reference = truth.solve_reference(problem)
     whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
     points = list(itertools.product(whole, methods, HOLDS))
     run = partial(run_controlled, scene, seconds=problem.seconds, compiled=compiled)
@@ -254,7 +253,7 @@ def report(options: argparse.Namespace) -> bool:
         studies.append(control_study(scenes.load(name), recorded=recorded, shown=True))
         print(section(studies[-1]), flush=True)
         whole = data_frame(row for study in studies for row in records(study.rows))
-        write(
+        publish(
             options.out, "control_rate", csv=whole,
             document={"rows": records(whole), "advice": {s.scene: advice(s) for s in studies}},
             page=page(studies), figures={f"control_rate_{s.scene}": figure(s) for s in studies},

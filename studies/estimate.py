@@ -21,7 +21,7 @@ from sst_ros import SineTorque, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot.style import free_figure
-from sst_ros.report.results import data_frame, markdown, provenance, write
+from sst_ros.report.results import data_frame, markdown, provenance, publish
 from sst_ros.scene.scene import Scene
 from studies import DOCS, run, run_jobs
 
@@ -201,7 +201,7 @@ def report(options: argparse.Namespace) -> bool:
     axes.legend(fontsize=8)
     texts = {"methods": ", ".join(METHODS), "table": markdown(summarise(rows))}
     page = PAGE.format(**vars(options), **texts, provenance=provenance())
-    write(options.out, "estimate", csv=rows, document={}, page=page, figures={"estimate": figure})
+    publish(options.out, "estimate", csv=rows, document={}, page=page, figures={"estimate": figure})
     return True
 
 

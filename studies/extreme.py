@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from sst_ros.integration.codegen import numba_version
-from sst_ros.report.results import data_frame, markdown, provenance, records, write
+from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from studies import DOCS, run, run_jobs
 from studies import extreme_runs as runs
 from studies import stability_limits as limits
@@ -55,7 +55,7 @@ def report(out: Path, *, long: bool = False) -> bool:
     table = data_frame(asdict(case) | {"passed": case.passed} for case in cases)
     found = records(data_frame(step._asdict() for step in steps))
     regions = limits.draw_regions(limits.scene_points(), provenance())
-    write(
+    publish(
         out, "stability", csv=table, page=page(cases, steps),
         document={"cases": records(table), "largest_stable_steps": found},
         figures={"stability_regions": regions},

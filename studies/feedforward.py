@@ -30,7 +30,7 @@ from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking
-from sst_ros.report.results import data_frame, markdown, provenance, records, write
+from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.state import NANOSECONDS, Vector3
@@ -254,8 +254,8 @@ def report(options: argparse.Namespace) -> bool:
     """Run a study; print it, and write feedforward.csv, .json, .md and .png."""
     study = feedforward_study(FeedforwardPlan(load(options.scene)), shown=True)
     print(page(study), flush=True)
-    write(options.out, "feedforward", csv=study.loops, document=document(study), page=page(study),
-          figures={"feedforward": draw_study(study, title(study))})  # fmt: skip
+    publish(options.out, "feedforward", csv=study.loops, document=document(study),
+            page=page(study), figures={"feedforward": draw_study(study, title(study))})  # fmt: skip
     return True
 
 

@@ -19,7 +19,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
-from sst_ros.plot.style import BLUE, VERMILION, legend, positive, save_figure, stack, styled
+from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, legend, save_figure, stack, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
 from sst_ros.scene.scene import Scene, load
@@ -96,7 +96,7 @@ def compare(out: Path, identified: str) -> str:
         found, label = followed.metrics, f"with the {kind} model"
         rms.append(float(np.sqrt(np.mean(found.rms**2))))
         lines.append(f"{label:32}{rms[-1]:12.3e}{found.largest.max():12.3e}")
-        error = positive(np.abs(followed.track.error).max(axis=1))
+        error = hide_zeros(np.abs(followed.track.error).max(axis=1))
         axes.semilogy(followed.track.time, error, color=colour, linewidth=1.6, label=label)
     text = "\n".join([*lines, f"{'ratio':32}{rms[0] / rms[1]:12.1f}"])
     (out / "identification.txt").write_text(f"{identified}\n{text}\n", encoding="utf-8")

@@ -24,7 +24,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
 from sst_ros.plot.motion import path as path_of_e
 from sst_ros.plot.pictures import PICTURES, save
-from sst_ros.plot.style import BLUE, VERMILION, positive, stack, styled
+from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, stack, styled
 from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
@@ -194,7 +194,7 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     above.plot(times, torque[:, 0], "--", color=VERMILION, linewidth=1.8,
                label="inverse dynamics of the simulated motion, actuator 1")  # fmt: skip
     above.legend(fontsize=9)
-    below.plot(times, positive(apart), color=VERMILION)
+    below.plot(times, hide_zeros(apart), color=VERMILION)
     below.set_yscale("log")
     title = f"Inverse dynamics of Example 1, the check in the paper's text\n{ASSUMPTION}"
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]

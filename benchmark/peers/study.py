@@ -113,7 +113,7 @@ def solve_task(task: Task) -> Reference:
     problem = InitialValueProblem(task.scene)
     if problem.seconds != DURATION:
         raise RuntimeError("the reference is known at another time")
-    found = solve_reference(problem, compiled=True)
+    found = solve_reference(problem)
     end = task.pose_of(found.states[-1, :7].astype(float).tolist())
     return Reference(end, found.own.orientation, found.how)
 

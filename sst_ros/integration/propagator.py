@@ -136,6 +136,7 @@ class Propagator:
         self._observe = observe
         self._constant = self._stepper = self._new_stepper(self.ode, derivative=derivative)
         self._others: dict[SineTorque | None, AdaptiveStepper] = {}
+        self._fresh: list[tuple[AdaptiveStepper, StepperCheckpoint]] = []
         self.accepted_steps = 0
         # Fixed steps may step over a sign change of sharp friction.
         self._coulomb = tuple(coulomb_joints(scene)) if integrator == RK4.name else ()
@@ -214,7 +215,8 @@ class Propagator:
     def reset(self) -> None:
         """Forget what has happened."""
         self._restore(self._first)
-        self._others.clear()
+        for stepper, fresh in self._fresh:  # their code stays loaded
+            stepper.restore(fresh)
         self._before = self._first
 
     def load(self, at: Point, h: float, moment: tuple[float, ...]) -> None:
@@ -270,6 +272,7 @@ class Propagator:
             else:
                 new = self._new_stepper(ode_under(self.dynamics, sine, self.torque.limit_of(sine)))
             self._others[sine] = new
+            self._fresh.append((new, new.checkpoint()))
         return self._others[sine]
 
     def _step_many(

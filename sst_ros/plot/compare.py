@@ -19,7 +19,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot import workspace
 from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
-from sst_ros.plot.style import LINES, legend, positive, stack, styled
+from sst_ros.plot.style import LINES, hide_zeros, legend, stack, styled
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -59,7 +59,7 @@ def _difference(runs: Drawn) -> Figure:
             here, there = _common(first, run)
             apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
             largest = apart.max(axis=1, initial=0.0)
-            axes.plot(run.seconds()[there], positive(largest), label=label, **style)
+            axes.plot(run.seconds()[there], hide_zeros(largest), label=label, **style)
             some |= bool((apart > 0.0).any())
         if some:
             axes.set_yscale("log")

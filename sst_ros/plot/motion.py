@@ -25,11 +25,11 @@ from sst_ros.plot.style import (
     GREY,
     LINES,
     Looks,
+    hide_zeros,
     leg_names,
     legend,
     lines,
     mark_ends,
-    positive,
     sides,
     span,
     stack,
@@ -128,7 +128,7 @@ def _over_time(
         apart = np.abs(columns[there] - values[0][here]).max(axis=1)
         common = np.isfinite(apart).any()
         largest = f"{np.nanmax(apart):.1e} {unit}" if common else "no common times"
-        below.plot(at, positive(apart), label=f"{solution.name}: {largest}", **style)
+        below.plot(at, hide_zeros(apart), label=f"{solution.name}: {largest}", **style)
     widen(above, values[0], least_span)
     beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
     for letter, column in zip(letters, values[0].T, strict=True):

@@ -175,7 +175,7 @@ def span(panels: Sequence[Axes], seconds: Array) -> None:
 def note(figure: Figure, text: str, width: int) -> None:
     """Write a note of `width` letters a line at the foot of a figure."""
     lines = [part for line in text.splitlines() for part in textwrap.wrap(line, width)]
-    figure.text(0.01, 0.01, "\n".join(lines), fontsize=6.5, color="#555555", va="bottom")
+    figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=6.5, color="#555555")
 
 
 def scale_down(values: Array) -> tuple[Array, str]:
@@ -187,7 +187,7 @@ def scale_down(values: Array) -> tuple[Array, str]:
     return values / 10.0**exponent, f"1e{exponent} "
 
 
-def positive(values: Array) -> Array:
+def hide_zeros(values: Array) -> Array:
     """Return values for a logarithmic axis: nan for what lies below SMALLEST_SHOWN."""
     return np.asarray(np.where(values > SMALLEST_SHOWN, values, np.nan))
 

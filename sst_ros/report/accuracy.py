@@ -14,9 +14,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sst_ros.plot.style import INK, MARKERS, Looks, free_figure, legend, note, styled
+from sst_ros.integration.codegen import numba_version
+from sst_ros.plot.style import INK, MARKERS, Looks, legend, note, styled
 from sst_ros.report.reference_solution import EXTENDED
-from sst_ros.report.results import data_frame, markdown, provenance, records, render, write
+from sst_ros.report.results import (
+    data_frame,
+    markdown,
+    provenance,
+    publish,
+    records,
+    render,
+)
 from sst_ros.report.scene_summary import cost_table
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
@@ -36,11 +44,11 @@ TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
 
 
 def write_accuracy_report(
-    names: Sequence[str], out: Path, *, kind: str = EXTENDED, compiled: bool = True
+    names: Sequence[str], out: Path, *, kind: str = EXTENDED
 ) -> list[WorkPrecision]:
     """Study scenes one after another; print each, and write all finished results into `out`.
 
-    Files: accuracy.csv, .json, .md, .png, accuracy_SCENE.png, and accuracy_terms.csv.
+    Files: accuracy.csv, .json, .md, .png, and accuracy_SCENE.png.
 
     Raises:
         SstError: a scene is refused or cannot start, or `out` cannot be written.
@@ -49,16 +57,18 @@ def write_accuracy_report(
     studies: list[WorkPrecision] = []
     terms: list[dict[str, Any]] = []
     for each in [scene.load(name) for name in names]:
-        study = work_precision(each, kind=kind, compiled=compiled, shown=True)
+        study = work_precision(each, kind=kind, shown=True)
         studies.append(study)
-        terms += cost_table(each, compiled=compiled)
-        print(text(study), flush=True)
-        figures = {} if study.rests else {f"accuracy_{each.name}": figure(study)}
+        terms += cost_table(each)
+        print(accuracy_text(study), flush=True)
+        figures = {} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)}
         if len(studies) == len(names):
-            figures["accuracy"] = draw_summary(summary(studies), provenance(compiled=compiled))
+            figures["accuracy"] = draw_fastest(list_fastest(studies), provenance())
         document = {"studies": [*documents(studies)], "terms": terms}
-        whole, said = join_grids(studies), page(studies, terms)
-        write(out, "accuracy", csv=whole, document=document, page=said, figures=figures)
+        said = accuracy_page(studies, terms)
+        publish(
+            out, "accuracy", csv=join_grids(studies), document=document, page=said, figures=figures
+        )
     return studies
 
 
@@ -74,7 +84,7 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
             "scene": study.scene,
             "seconds": study.seconds,
             "ends": study.ends,
-            "compiled": study.compiled,
+            "compiled": numba_version() is not None,
             "reference": study.reference.how,
             "reference_own_error": study.reference.own._asdict(),
             "formulation_difference_relative": study.formulation,
@@ -86,7 +96,7 @@ def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
         }
 
 
-def summary(studies: Sequence[WorkPrecision]) -> DataFrame:
+def list_fastest(studies: Sequence[WorkPrecision]) -> DataFrame:
     """Return the fastest setting of each scene for each target: method, setting, time."""
     rows = [
         {
@@ -146,22 +156,18 @@ HEADS = {
 """Columns of the grid that the terminal shows, and their heads there."""
 
 
-def text(study: WorkPrecision) -> str:
+def accuracy_text(study: WorkPrecision) -> str:
     """Format a study for the terminal."""
     shown = study.rows.assign(setting=[setting(row) for _, row in study.rows.iterrows()])
     shown = shown[["setting", "evaluations", *HEADS]].rename(columns=HEADS)
     below = [row is True for row in study.rows.below_floor]
     shown[""] = ["*" if row else "" for row in below]
     shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
+    grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
     return render(
-        "accuracy.txt",
-        study=study,
-        facts=facts(study),
-        grid=shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}"),
-        below=sum(below),
-        fastest=fastest(study),
-        provenance=provenance(compiled=study.compiled),
-    )
+        "accuracy.txt", study=study, facts=facts(study), grid=grid, below=sum(below),
+        fastest=fastest(study), provenance=provenance(),
+    )  # fmt: skip
 
 
 def facts(study: WorkPrecision) -> Iterator[str]:
@@ -180,7 +186,7 @@ def facts(study: WorkPrecision) -> Iterator[str]:
     yield f"Advice: {study.advice.text}.{measured}"
 
 
-def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
+def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
     """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
     rows = []
     for each in studies:
@@ -196,39 +202,51 @@ def page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ())
         terms=markdown(costs) if terms else "",
         fastest=fastest,
         facts=facts,
-        provenance=provenance,
+        provenance=provenance(),
     )
 
 
 @styled
-def figure(study: WorkPrecision) -> Figure:
+def draw_accuracy(study: WorkPrecision) -> Figure:
     """Draw the largest errors of orientation and actuator rates over wall time, side by side.
 
     The fastest setting for each of TARGETS is marked.
     """
     rows, floor = study.rows, study.floor
-    figure = free_figure(11.0, 6.4)
-    panels = figure.subplots(1, 2, sharex=True)
-    figure.subplots_adjust(left=0.075, right=0.985, top=0.875, bottom=0.205, wspace=0.2)
+    figure = Figure(figsize=(11.0, 6.4))
+    body: Any = figure.subfigures()
+    panels = body.subplots(1, 2, sharex=True)
     rate = ABOVE_REFERENCE * study.reference.own.gamma_dot
     for axes, quantity, least, label in (
         (panels[0], ERROR, floor, "largest error of the orientation [rad]"),
         (panels[1], "largest_gamma_dot_rad_per_s", rate, "largest error of γ̇ [rad/s]"),
     ):
         _draw_grid(axes, rows, quantity, least)
-        axes.set_ylabel(label)
-        axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
+        axes.set(xlabel=f"wall time for {study.seconds:g} s of motion [ms]", ylabel=label)
     best = _choose(study)
-    ring = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
     for target, row in best.items():
         panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
-        place = 1e3 * row.wall_min_s, max(row[ERROR], floor)
-        panels[0].plot(*place, "o", markeredgecolor=INK, **ring)
-    below: Looks = {"loc": "center", "bbox_to_anchor": (0.5, 0.095), "ncol": 9}
-    figure.legend(handles=[*_handles(rows, [*best])], fontsize=8, frameon=False, **below)
+        panels[0].plot(1e3 * row.wall_min_s, max(row[ERROR], floor), "o", color=INK, **_RING)
+    marks: list[tuple[str, str, str, Looks]] = [
+        (name, marker, colour, {"linewidth": 1.5})
+        for name, (colour, marker) in MARKERS.items()
+        if name in set(rows.method)
+    ]
+    marks.append(("fixed steps (full)", "o", INK, {}))
+    marks.append(("tolerance (hollow)", "o", INK, {"markerfacecolor": "white", "linestyle": "--"}))
+    if (rows.failure != "").any():
+        marks.append(("failed", "x", INK, {"linestyle": "none"}))
+    if best:
+        name = f"fastest for {', '.join(f'{target:.0e}' for target in best)} rad"
+        marks.append((name, "o", INK, _RING | {"linestyle": ":"}))
+    handles = [_entry(*mark, **looks) for *mark, looks in marks]
+    body.legend(handles=handles, fontsize=8, frameon=False, loc="outside lower center", ncol=9)
     figure.suptitle(f"{study.scene}: error against wall time\n{fastest(study)}", fontsize=12)
-    note(figure, f"Reference: {study.reference.how}. {provenance(compiled=study.compiled)}", 185)
+    note(figure, f"Reference: {study.reference.how}. {provenance()}", 185)
     return figure
+
+
+_RING: Looks = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
 
 
 def _entry(label: str, marker: str, color: str = INK, **looks: Any) -> Line2D:
@@ -236,22 +254,8 @@ def _entry(label: str, marker: str, color: str = INK, **looks: Any) -> Line2D:
     return Line2D([], [], label=label, marker=marker, color=color, **looks)
 
 
-def _handles(rows: DataFrame, targets: Sequence[float]) -> Iterator[Line2D]:
-    for name, (colour, marker) in MARKERS.items():
-        if name in set(rows.method):
-            yield _entry(name, marker, colour, linewidth=1.5)
-    yield _entry("fixed steps (full)", "o")
-    yield _entry("tolerance (hollow)", "o", markerfacecolor="white", linestyle="--")
-    if (rows.failure != "").any():
-        yield _entry("failed", "x", linestyle="none")
-    if targets:
-        name = f"fastest for {', '.join(f'{target:.0e}' for target in targets)} rad"
-        yield _entry(name, "o", linestyle=":", markersize=11, markerfacecolor="none")
-
-
 def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
@@ -272,8 +276,7 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
         for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
             colour, marker = MARKERS[name]
             x = wall if wall > 0.0 else np.nan
-            hollow: Looks = {"markerfacecolor": "none", "markersize": 6.5}
-            axes.plot(x, middle, marker, color=colour, zorder=3, **hollow)
+            axes.plot(x, middle, marker, color=colour, markerfacecolor="none", zorder=3)
             axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
     if floor > low:
         axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
@@ -285,19 +288,17 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
 
 
 @styled
-def draw_summary(rows: DataFrame, footnote: str) -> Figure:
+def draw_fastest(rows: DataFrame, said: str) -> Figure:
     """Draw the time of the fastest setting for each error, a line of markers for each scene.
 
     Args:
-        rows: scene, target [rad], method, share (wall time per time of the motion).
-        footnote: small print.
+        rows: of `list_fastest`.
+        said: footnote.
 
     """
     names = list(dict.fromkeys(rows.scene))
-    figure = free_figure(9.0, 1.7 + 0.36 * len(names))
+    figure = Figure(figsize=(9.0, 1.7 + 0.36 * len(names)))
     axes = figure.subplots()
-    inch = 1.0 / figure.get_figheight()
-    figure.subplots_adjust(left=0.17, right=0.98, top=1.0 - 0.45 * inch, bottom=1.05 * inch)
     sizes = {t: 5.5 + 3.0 * k for k, t in enumerate(sorted(set(rows.target), reverse=True))}
     hollow: Looks = {"markerfacecolor": "none", "linestyle": "none"}
     for row in rows.itertuples():
@@ -306,10 +307,9 @@ def draw_summary(rows: DataFrame, footnote: str) -> Figure:
         looks: Looks = {"color": colour, "markersize": sizes[row.target], "markeredgewidth": 1.5}
         axes.plot(*place, marker, **looks, **hollow)
     axes.axvline(100.0, color=INK, linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
+    axes.set(xscale="log", xlabel="wall time of the integration per time of the motion [%]")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlabel("wall time of the integration per time of the motion [%]")
     title = "Fastest setting for an error of the orientation"
     figure.suptitle(title, fontsize=11, x=0.02, ha="left")
     used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
@@ -317,5 +317,5 @@ def draw_summary(rows: DataFrame, footnote: str) -> Figure:
     for target, size in sizes.items():
         handles.append(_entry(f"{target:.0e} rad", "o", markersize=size, **hollow))
     legend(axes, handles=handles, ncol=5)
-    note(figure, footnote, 150)
+    note(figure, said, 150)
     return figure

@@ -22,7 +22,7 @@ from sst_ros.plot.style import (
     VERMILION,
     Looks,
     few,
-    positive,
+    hide_zeros,
     scale_down,
     span,
     stack,
@@ -66,7 +66,7 @@ def _draw_comparison(
     names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
     curves = (error.gamma, error.gamma_dot, error.orientation)
     for values, name, style in zip(curves, names, LINES, strict=False):
-        axes.plot(*few(seconds, positive(values)), label=name, **style)
+        axes.plot(*few(seconds, hide_zeros(values)), label=name, **style)
     axes.set_yscale("log")
     axes.set_ylim(bottom=SMALLEST_SHOWN)
     axes.set_ylabel("largest difference")
@@ -106,7 +106,7 @@ def _draw_used(axes: Axes, estimates: Mapping[str, tuple[Array, Array]], reports
     axes.set_ylabel("error of the orientation [rad]")
     for (name, (used, values)), style in zip(estimates.items(), LINES, strict=False):
         marker = "o" if len(used) == reports else ""
-        axes.plot(1e3 * used, positive(values), label=name, marker=marker, markersize=4, **style)
+        axes.plot(1e3 * used, hide_zeros(values), label=name, marker=marker, markersize=4, **style)
     axes.set_yscale("log")
     axes.legend(fontsize=8, loc="best")
 
@@ -194,7 +194,7 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Iterator
     at_samples = np.interp(seconds, [0.0, *at], [0.0, *used]) if len(at) else unknown
     found = np.fmax.accumulate(integration.error.orientation)
     errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
-    drawn = any((np.isfinite(positive(y)) & np.isfinite(x)).any() for x, y in errors)
+    drawn = any((np.isfinite(hide_zeros(y)) & np.isfinite(x)).any() for x, y in errors)
     dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
 
     def curve(title: str, label: str, x: Array, y: Array, reason: str = "", **looks: Any) -> Panel:

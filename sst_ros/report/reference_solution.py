@@ -25,6 +25,7 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration import codegen
+from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
@@ -35,7 +36,7 @@ from sst_ros.report.step_advice import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
-from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
+from sst_ros.state import NANOSECONDS
 
 LongArray: TypeAlias = NDArray[np.longdouble]
 EXTENDED, MPMATH = "long double", "mpmath"
@@ -73,12 +74,9 @@ class StateError(NamedTuple):
 class InitialValueProblem:
     """A scene as an initial value problem.
 
-    Args:
-        scene: the scene.
-
     Attributes:
-        system: right-hand side, torques and work included.
-        drive: its constant inputs, all zero.
+        torque: the sine of the scene, or three zeros [N m].
+        system: right-hand side, torques and work included; `drive` are its inputs, all zero.
         start: state at time zero, shape (n,).
         interval_ns, interval: time between the instants of comparison [ns], [s].
         count: number of intervals.
@@ -95,13 +93,11 @@ class InitialValueProblem:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self.geometry = Geometry.of(scene)
-        self.dynamics = Dynamics.of(scene)
+        self.scene, self.dynamics = scene, Dynamics.of(scene)
+        self.torque = scene.torque or (0.0, 0.0, 0.0)
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*states.initial(scene), 0.0)
-        self.torque: Vector3 | TorqueFunction = scene.torque.at if scene.torque else (0.0, 0.0, 0.0)
         limit = scene.torque_limit
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
@@ -127,44 +123,42 @@ class InitialValueProblem:
 
     def residuals(self, y: Array) -> tuple[float, float]:
         """Energy residual [J] and the largest abs(r_k . t_k) at a final state, shape (n,)."""
-        size, zero = len(self.dynamics.state), (0.0,) * len(self.dynamics.drive)
-        before, after = (
-            sum(self.dynamics.energies(*state[:size], *zero)[:2])
-            for state in (self.start, y.tolist())
-        )
-        r = kinematics.carriage_directions(self.geometry, self.joints(y[None])[0, :3])
-        t = self.geometry.e @ rotation_matrix(y[:4]).T
-        closure = float(np.abs(np.sum(r * t, axis=1)).max())
-        return float(after - before - y[-1]), closure
+        before, after = map(self.dynamics.total_energy, (self.start, y.tolist()))
+        gamma, geometry = self.joints(y[None])[0, :3], Geometry.of(self.scene)
+        closure = kinematics.closure(geometry, gamma, rotation_matrix(y[:4]))
+        return float(after - before - y[-1]), float(np.abs(closure).max())
 
     def run_steps(self, machine: CompiledMethod, steps: int) -> Array:
         """States at the instants with `steps` steps an interval; nan after the last finite one."""
         result = np.full((self.count + 1, len(self.start)), np.nan)
-        y = list(self.start)
-        result[0] = y
+        result[0] = y = list(self.start)
         h = self.interval / steps
         with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
             for k in range(self.count):
-                y = machine.step_fixed(k * self.interval, h, steps, y, self.drive)
-                result[k + 1] = y
+                result[k + 1] = y = machine.step_fixed(k * self.interval, h, steps, y, self.drive)
         return result
 
-    def run_simulation(self, method: str, tolerance: float) -> Array:
-        """States at the instants from `Simulation`.
+    def simulation(self, method: str, tolerance: float) -> Simulation:
+        """Return a simulation, compiled where the torques can be."""
+        compiled = numba_version() is not None and not self.clamped
+        return Simulation(
+            self.scene, method, tolerance=tolerance, compiled=compiled,
+            step_budget=WHOLE_MOTION_BUDGET,
+        )  # fmt: skip
+
+    def run_simulation(self, simulation: Simulation) -> Array:
+        """States at the instants from a simulation, begun again.
 
         Raises:
             RunStopped: a limit is met.
 
         """
-        simulation = Simulation(
-            self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
-        )
-        result = np.full((self.count + 1, len(self.start)), np.nan)
-        result[0] = self.start
-        for row in result[1:]:
-            state = simulation.step(self.torque, self.interval_ns)
-            row[:7] = *state.quaternion, *state.body_rate
-        return result
+        simulation.reset()
+        rows = [self.start]
+        for _ in range(self.count):
+            simulation.steps(self.torque, self.interval_ns, 1)
+            rows.append(tuple(simulation.sample[0]))
+        return np.array(rows)
 
     def _horizon(self) -> tuple[int, int, str]:
         """Return interval [ns], count of intervals, and why the span ends early."""
@@ -188,15 +182,12 @@ class ReferenceSolution(NamedTuple):
     how: str
 
 
-def solve_reference(
-    problem: InitialValueProblem, kind: str = EXTENDED, *, compiled: bool
-) -> ReferenceSolution:
+def solve_reference(problem: InitialValueProblem, kind: str = EXTENDED) -> ReferenceSolution:
     """Solve a problem as accurately as possible.
 
     Args:
         problem: what is solved.
         kind: EXTENDED or MPMATH.
-        compiled: search for the step size under numba.
 
     Raises:
         InputError: there is no finite motion, or mpmath is asked for and not installed.
@@ -204,12 +195,12 @@ def solve_reference(
     """
     if problem.kinked:
         rough, fine = (
-            problem.run_simulation("dop853", tolerance).astype(np.longdouble)
+            problem.run_simulation(problem.simulation("dop853", tolerance)).astype(np.longdouble)
             for tolerance in (1e-13, 1e-14)
         )
         how = "Simulation, dop853, tolerance 1e-14"
         return ReferenceSolution(fine, _own(problem, rough, fine), how)
-    machine = CompiledMethod(problem.system, DOP853, compiled=compiled)
+    machine = CompiledMethod(problem.system, DOP853, compiled=numba_version() is not None)
     best, solution = _finest(problem, machine)
     solver = ExtendedSolver(problem, kind)
     began = time.perf_counter()
@@ -258,14 +249,7 @@ def _own(problem: InitialValueProblem, rough: LongArray, fine: LongArray) -> Sta
 
 
 class ExtendedSolver:
-    """DOP853 with fixed steps on long doubles or mpmath's numbers.
-
-    Args:
-        problem: what is solved.
-        kind: EXTENDED or MPMATH.
-
-    Attributes:
-        numbers: which numbers it calculates with, for reports.
+    """DOP853 with fixed steps on long doubles or mpmath's numbers; `numbers` says which.
 
     Raises:
         MissingDependency: mpmath is asked for and not installed.

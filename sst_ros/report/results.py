@@ -44,8 +44,8 @@ def data_frame(
     listed, names = list(rows), columns and list(columns)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
-        values = [row.get(name) for row in listed]
-        if None in values and all(type(value) is int for value in values if value is not None):
+        known = [row[name] for row in listed if row.get(name) is not None]
+        if 0 < len(known) < len(listed) and all(type(value) is int for value in known):
             frame[name] = frame[name].astype("Int64")
     return frame
 
@@ -69,7 +69,7 @@ def render(template: str, **values: Any) -> str:
     return "\n".join(line.rstrip() for line in lines.splitlines()) + "\n"
 
 
-def write(
+def publish(
     out: Path,
     name: str,
     *,

@@ -16,6 +16,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
+from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism.geometry import Geometry
@@ -198,13 +199,13 @@ def costs(scene: Scene) -> list[Cost]:
     return [Cost(term, total - count, count) for term, count in bare.items()]
 
 
-def cost_table(scene: Scene, *, compiled: bool = True) -> list[dict[str, Any]]:
+def cost_table(scene: Scene) -> list[dict[str, Any]]:
     """Return operations and times [ns] of an evaluation: the whole, then each term present."""
     found, runs = costs(scene), []
     for one in (scene, *(without(scene, cost.name) for cost in found)):
         ode, start = ODE(Dynamics.of(one)), [*initial_state(one, Geometry.of(one))]
         start += [0.0] * (len(ode.state) - len(start))
-        method = CompiledMethod(ode, RK4, compiled=compiled)
+        method = CompiledMethod(ode, RK4, compiled=numba_version() is not None)
         method.step_fixed(0.0, 1e-7, 1, start, (0.0,) * len(ode.drive))  # compiles
         runs.append((method, start, (0.0,) * len(ode.drive)))
     count, rounds = (TIMED_STEPS, ROUNDS) if runs[0][0].compiled else (TIMED_STEPS // 100, 3)

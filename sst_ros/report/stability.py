@@ -31,18 +31,8 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.plot.style import (
-    BLUE,
-    GREEN,
-    INK,
-    MARKERS,
-    VERMILION,
-    free_figure,
-    legend,
-    note,
-    styled,
-)
-from sst_ros.report.results import data_frame, provenance, records, render, write
+from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
+from sst_ros.report.results import data_frame, provenance, publish, records, render
 from sst_ros.report.step_advice import (
     LONGEST_S,
     TOLERANCE,
@@ -85,32 +75,6 @@ Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 """Makes another scene of one and its motion, or gives the reason why there is none."""
 
 
-class StressRun(NamedTuple):
-    """How a run ended.
-
-    Attributes:
-        name: of the row.
-        change: what is other than in the scene.
-        passed: it ended with a value within its estimate, or with a named reason; None where the
-            scene has nothing to change.
-        result: in words.
-        method: what `auto` took.
-        error: distance of the orientation at the end from a finer run [rad], nan if unknown.
-        estimate: what the run estimated [rad].
-        wall_s: computing time of both runs [s].
-
-    """
-
-    name: str
-    change: str
-    passed: bool | None
-    result: str
-    method: str = ""
-    error: float = math.nan
-    estimate: float = math.nan
-    wall_s: float = 0.0
-
-
 class StabilityReport(NamedTuple):
     """Steps along the motion, and the runs.
 
@@ -119,19 +83,23 @@ class StabilityReport(NamedTuple):
         steps: a row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the
             eigenvalues [1/s], and the longest stable step of each method [s], inf for every one.
         advice: that of `step_advice`.
-        runs: a row each.
+        runs: a row each. name, change: of the row, and what is other than in the scene. passed: it
+            ended with a value within its estimate, or with a named reason; None where the scene has
+            nothing to change. result: in words. method: what `auto` took. error, estimate: distance
+            of the orientation at the end from a finer run, and what the run estimated [rad], nan
+            if unknown. wall_s: computing time of both runs [s].
 
     """
 
     scene: str
     steps: DataFrame
     advice: str
-    runs: list[StressRun]
+    runs: DataFrame
 
     @property
     def passed(self) -> bool:
         """Whether no run failed."""
-        return all(run.passed is not False for run in self.runs)
+        return False not in self.runs.passed.tolist()
 
 
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
@@ -151,12 +119,12 @@ def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) ->
 
     """
     found = examine_stability(scene, only, shown=True)
-    said, runs = page(found), data_frame(run._asdict() for run in found.runs)
+    said = stability_page(found)
     print(said)
-    steps = records(found.steps.replace(math.inf, None))
-    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": records(runs)}
-    figures = {"stability": figure(found)}
-    write(out, "stability", csv=runs, document=document, page=said, figures=figures)
+    steps, runs = records(found.steps.replace(math.inf, None)), records(found.runs)
+    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs}
+    figures = {"stability": draw_stability(found)}
+    publish(out, "stability", csv=found.runs, document=document, page=said, figures=figures)
     return found.passed
 
 
@@ -179,11 +147,13 @@ def examine_stability(
     if shown:
         about = max(1.0, 2.0 * took) * len(chosen)
         print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
-    runs = []
+    rows = []
     for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
         name = chosen[part.start]
         what, change = ROWS[name]
-        runs.append(_run(name, what, change(scene, motion), seconds))
+        rows.append({"name": name, "change": what} | _run(change(scene, motion), seconds))
+    columns = ("name", "change", "passed", "result", "method", "error", "estimate", "wall_s")
+    runs = data_frame(rows, columns)
     return StabilityReport(scene.name, _steps(scene, motion), step_advice(scene).text, runs)
 
 
@@ -208,10 +178,11 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
     return data_frame(rows)
 
 
-def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRun:
-    """Run a scene at two tolerances, and say how it ended."""
+def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
+    """Run a scene at two tolerances, and say how it ended: the last columns of a row."""
+    row = {"method": "", "error": math.nan, "estimate": math.nan, "wall_s": 0.0}
     if isinstance(changed, str):
-        return StressRun(name, what, None, changed)
+        return row | {"passed": None, "result": changed}
     began = time.perf_counter()
     try:
         with np.errstate(all="ignore"):
@@ -221,16 +192,20 @@ def _run(name: str, what: str, changed: Scene | str, seconds: float) -> StressRu
             )
     except SstError as fault:
         reason = f"{type(fault).__name__}: {str(fault).splitlines()[0]}"
-        return StressRun(name, what, True, reason, wall_s=time.perf_counter() - began)
+        return row | {"passed": True, "result": reason, "wall_s": time.perf_counter() - began}
     wall = time.perf_counter() - began
     at = min(float(run.t[-1]), float(fine.t[-1]))
-    ends = [motion.at(at).quaternion[0] for motion in (run, fine)]
-    error = float(angle_between(*ends))
+    error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
     # A run that ends where it starts has no estimate.
     holds = error <= np.fmax(FACTOR * run.error_estimate, ROUNDING)
-    passed = run.status == fine.status and (run.status < 0 or bool(holds))
-    result = run.message if run.status == fine.status else f"{run.message}; finer: {fine.message}"
-    return StressRun(name, what, passed, result, run.method, error, run.error_estimate, wall)
+    return {
+        "passed": run.status == fine.status and (run.status < 0 or bool(holds)),
+        "result": run.message + (f"; finer: {fine.message}" if run.status != fine.status else ""),
+        "method": run.method,
+        "error": error,
+        "estimate": run.error_estimate,
+        "wall_s": wall,
+    }
 
 
 Part = TypeVar("Part", bound=Section)
@@ -391,50 +366,45 @@ def step_lines(found: StabilityReport) -> Iterator[str]:
     yield f"Advice: {found.advice}"
 
 
-def page(found: StabilityReport) -> str:
+def stability_page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
     given = {"factor": FACTOR, "rounding": ROUNDING, "provenance": provenance()}
     return render("stability.md", found=found, lines=step_lines(found), **given)
 
 
 @styled
-def figure(found: StabilityReport) -> Figure:
+def draw_stability(found: StabilityReport) -> Figure:
     """Draw eigenvalues and stable steps along the motion, and how the runs ended."""
-    steps, runs = found.steps, [run for run in found.runs if run.passed is not None]
-    rows = 0.36 * max(len(runs), 1)
-    figure = free_figure(11.0, 5.2 + rows)
-    inch = 1.0 / figure.get_figheight()
-    middle = (rows + 1.6) * inch
-    edges = {"left": 0.075, "right": 0.985, "top": 1.0 - 0.75 * inch, "bottom": middle}
-    panels: Any = figure.add_gridspec(1, 2, wspace=0.2, **edges).subplots()
-    left, right = panels
+    steps = found.steps
+    runs = found.runs[[passed is not None for passed in found.runs.passed]]
+    below = 0.36 * max(len(runs), 1) + 0.6
+    figure = Figure(figsize=(11.0, 4.6 + below))
+    parts: Any = figure.subfigures(2, 1, height_ratios=[4.6, below])
+    above, place = parts
+    left, right = above.subplots(1, 2)
     for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
-        values = np.where(steps[name] > 0.0, steps[name], np.nan)
+        values = steps[name].where(steps[name] > 0.0)
         left.plot(steps.t_s, values, line, color=colour, linewidth=1.8, label=name)
-    left.set_ylabel("fastest rate of the eigenvalues [1/s]")
-    free = [name for name in METHODS if not np.isfinite(steps[name]).any()]
-    for name in (name for name in METHODS if name not in free):
-        values = np.where(np.isfinite(steps[name]), steps[name], np.nan)
-        right.plot(steps.t_s, values, color=MARKERS[name][0], linewidth=1.8, label=name)
+    finite = steps[list(METHODS)].where(np.isfinite(steps[list(METHODS)])).dropna(axis=1, how="all")
+    for name in finite:
+        right.plot(steps.t_s, finite[name], color=MARKERS[name][0], linewidth=1.8, label=name)
+    free = [name for name in METHODS if name not in finite]
     right.plot([], [], " ", label=f"{', '.join(free)}: every step")
-    right.set_ylabel("longest stable step [s]")
-    for axes in (left, right):
-        axes.set_yscale("log")
-        axes.set_xlabel("time t [s]")
+    labels = "fastest rate of the eigenvalues [1/s]", "longest stable step [s]"
+    for axes, label in zip((left, right), labels, strict=True):
+        axes.set(yscale="log", xlabel="time t [s]", ylabel=label)
         legend(axes)
-    edges = {"left": 0.11, "right": 0.985, "top": middle - 0.85 * inch, "bottom": 0.85 * inch}
-    if runs:
-        _draw_ends(figure.add_subplot(figure.add_gridspec(1, 1, **edges)[0, 0]), runs)
+    if len(runs):
+        _draw_ends(place.subplots(), runs)
     figure.suptitle(f"Stability of {found.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure
 
 
-def _draw_ends(axes: Axes, runs: Sequence[StressRun]) -> None:
+def _draw_ends(axes: Axes, runs: DataFrame) -> None:
     """Draw error and estimate of each run, with how it ended beside them."""
-    axes.set_xscale("log")
-    axes.set_xlim(1e-17, 1e3)
-    for place, run in enumerate(runs):
+    axes.set(xscale="log", xlim=(1e-17, 1e3), ylim=(len(runs) - 0.5, -0.5))
+    for place, run in enumerate(runs.itertuples()):
         colour = GREEN if run.passed else VERMILION
         error, estimate = (max(value, 2e-17) for value in (run.error, run.estimate))
         axes.plot([error, estimate], [place, place], color=colour, linewidth=1.0)
@@ -443,8 +413,7 @@ def _draw_ends(axes: Axes, runs: Sequence[StressRun]) -> None:
         text = run.result if len(run.result) < 68 else f"{run.result[:66]} ..."
         words = text if run.passed else f"FAILED: {text}"
         axes.text(3e-7, place, words, va="center", fontsize=8, color=INK)
-    axes.set_yticks(range(len(runs)), [run.name for run in runs])
-    axes.set_ylim(len(runs) - 0.5, -0.5)
+    axes.set_yticks(range(len(runs)), runs.name)
     axes.set_xticks([1e-16, 1e-14, 1e-12, 1e-10, 1e-8])
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("error of the orientation (dot), its estimate (bar) [rad]", loc="left")

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work-precision study: error and computing time of every method and setting on a scene.
 
-Each method has settings from coarse to fine. Fixed steps use no error estimate. Tolerances go to
-the adaptive stepper that `Simulation` steps with; the coarse solution of its global error estimate
-is counted and timed with it. Where the right-hand side has kinks they go to `Simulation` itself,
-under torques that are functions of time.
+Each method has settings from coarse to fine. Fixed steps use no error estimate; those of Gauss
+collocation are of a motion that was prepared. Tolerances go to `Simulation`, whose estimate of the
+global error is counted and timed with it, and for collocation to `prepare`.
 """
 
 from __future__ import annotations
@@ -22,10 +21,9 @@ import numpy as np
 
 from sst_ros.errors import SstError
 from sst_ros.host.output import slices
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod, Method, Point
-from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report import states
 from sst_ros.report.reference_solution import (
@@ -37,8 +35,8 @@ from sst_ros.report.reference_solution import (
 from sst_ros.report.results import data_frame
 from sst_ros.report.step_advice import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulate_gauss import GAUSS, GaussMotion, NotSmooth
+from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
+from sst_ros.simulation.simulate_gauss import GAUSS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -65,7 +63,7 @@ LEAST_SETTINGS = 3
 run, but must not empty the grid."""
 
 SLOWER = 5.0
-"""`Simulation` under torques that are functions is plain Python and may take so much longer."""
+"""`Simulation` under torques that are clamped is plain Python and may take so much longer."""
 
 _REPEAT_S, _REPEATS = 0.15, 15
 
@@ -95,7 +93,6 @@ class WorkPrecision:
         scene: its name.
         seconds: time span of the comparison [s].
         ends: why the span ends before the scene's duration; empty where it does not.
-        compiled: by numba.
         reference: the reference solution.
         rows: the solver grid, columns as in COLUMNS; settings of a method from coarse to fine.
         advice: what `step_advice` recommends, as `scene show` prints it.
@@ -110,7 +107,6 @@ class WorkPrecision:
     scene: str
     seconds: float
     ends: str
-    compiled: bool
     reference: ReferenceSolution
     rows: DataFrame
     advice: StepAdvice
@@ -154,19 +150,13 @@ class WorkPrecision:
 
 
 def work_precision(
-    scene: Scene,
-    *,
-    kind: str = EXTENDED,
-    compiled: bool = True,
-    shown: bool = False,
-    longest_s: float = LONGEST_RUN_S,
+    scene: Scene, *, kind: str = EXTENDED, shown: bool = False, longest_s: float = LONGEST_RUN_S
 ) -> WorkPrecision:
     """Solve a scene with every method and setting and compare with the reference.
 
     Args:
         scene: what is solved.
         kind: arithmetic of the reference, reference_solution.EXTENDED or MPMATH.
-        compiled: by numba, where it is installed.
         shown: draw a progress bar on the terminal.
         longest_s: no finer settings are tried after a run that took longer than this [s].
 
@@ -175,10 +165,9 @@ def work_precision(
         InputError: the scene cannot start, or mpmath is asked for and not installed.
 
     """
-    compiled = compiled and numba_version() is not None
     problem = InitialValueProblem(scene)
-    grid = solver_grid(problem, compiled)
-    truth = solve_reference(problem, kind, compiled=compiled)
+    grid = solver_grid(problem)
+    truth = solve_reference(problem, kind)
     rows: list[dict[str, Any]] = []
     ends: list[Array] = []
     for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
@@ -193,7 +182,6 @@ def work_precision(
         scene=scene.name,
         seconds=problem.seconds,
         ends=problem.ends,
-        compiled=compiled,
         reference=truth,
         rows=data_frame(rows, COLUMNS),
         advice=step_advice(scene),
@@ -245,14 +233,11 @@ def _warnings(
 
 
 class SolverSetting(NamedTuple):
-    """One point of the grid.
+    """One point of the grid: name of the method, FIXED or TOLERANCE, step [s] or tolerance.
 
     Attributes:
-        method: name of the method.
-        kind: FIXED or TOLERANCE.
-        setting: length of the steps [s], or the tolerance.
-        solve: returns the states at the instants, and the evaluations of the right-hand side,
-            None where they are not counted. Raises SstError, ArithmeticError or ValueError.
+        solve: returns the states at the instants, and the evaluations of the right-hand side.
+            Raises SstError, ArithmeticError or ValueError.
         timed: does the same work with the least overhead.
 
     """
@@ -260,25 +245,22 @@ class SolverSetting(NamedTuple):
     method: str
     kind: str
     setting: float
-    solve: Callable[[], tuple[Array, int | None]]
+    solve: Callable[[], tuple[Array, int]]
     timed: Callable[[], object]
 
 
-def solver_grid(problem: InitialValueProblem, compiled: bool) -> list[Iterator[SolverSetting]]:
+def solver_grid(problem: InitialValueProblem) -> list[Iterator[SolverSetting]]:
     """Return the settings by method and kind, each from coarse to fine."""
     found: list[Iterator[SolverSetting]] = []
     for method in METHODS.values():
         if not problem.clamped:  # fixed steps know no limit of torque
+            compiled = numba_version() is not None
             machine = CompiledMethod(problem.system, method, compiled=compiled)
             found.append(map(partial(_fix_steps, problem, machine), _STEPS_PER_INTERVAL))
-        if not method.error_order:
-            continue
-        if not problem.kinked:
-            found.append(map(partial(_adapt_steps, problem, method, compiled), _TOLERANCES))
-        elif not isinstance(method, Rosenbrock):  # which takes no torques that are functions
-            found.append(map(partial(_step_simulation, problem, method), _TOLERANCES))
+        if method.error_order:
+            found.append(map(partial(_adapt_steps, problem, method.name), _TOLERANCES))
     if not problem.kinked:
-        found += [_list_collocation(problem, compiled, kind) for kind in (FIXED, TOLERANCE)]
+        found += [_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE)]
     return found
 
 
@@ -292,64 +274,46 @@ def _fix_steps(problem: InitialValueProblem, machine: CompiledMethod, steps: int
     return SolverSetting(machine.method.name, FIXED, h, solve, timed)
 
 
-def _adapt_steps(
-    problem: InitialValueProblem, method: Method, compiled: bool, tolerance: float
-) -> SolverSetting:
-    stepper = AdaptiveStepper(problem.system, method.name, tolerance, compiled=compiled)
-    fresh, start = stepper.checkpoint(), list(problem.start)
-
-    def run() -> Array:
-        stepper.restore(fresh)
-        rows, at = [start], Point(start, start, (), method.order)
-        for k in range(problem.count):
-            begin, end = k * problem.interval, (k + 1) * problem.interval
-            for step in stepper.accepted_steps(begin, end, at, problem.drive):
-                at = step.end
-            rows.append(at.y)
-        return np.array(rows)
+def _adapt_steps(problem: InitialValueProblem, method: str, tolerance: float) -> SolverSetting:
+    simulation = problem.simulation(method, tolerance)
+    run = partial(problem.run_simulation, simulation)
 
     def solve() -> tuple[Array, int]:
-        before = stepper.budget.spent
-        return run(), stepper.budget.spent - before
+        before = simulation.evaluations
+        return run(), simulation.evaluations - before
 
-    return SolverSetting(method.name, TOLERANCE, tolerance, solve, run)
-
-
-def _step_simulation(
-    problem: InitialValueProblem, method: Method, tolerance: float
-) -> SolverSetting:
-    run = partial(problem.run_simulation, method.name, tolerance)
-    return SolverSetting(method.name, TOLERANCE, tolerance, lambda: (run(), None), run)
+    return SolverSetting(method, TOLERANCE, tolerance, solve, run)
 
 
-def _list_collocation(
-    problem: InitialValueProblem, compiled: bool, kind: str
-) -> Iterator[SolverSetting]:
+def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[SolverSetting]:
     """Yield settings of Gauss collocation, with the steps that each tolerance chooses.
 
     A run of fixed steps is one of a motion that has been prepared. One for a tolerance searches
     for its steps, which solves the motion several times.
     """
-    torque = problem.scene.torque or (0.0, 0.0, 0.0)
-    given = problem.scene, torque, problem.start[:-1], problem.seconds
     longest = math.inf
     for tolerance in (1e-2, 1e-3, *_TOLERANCES):
-        prepare = partial(GaussMotion, *given, tolerance, compiled=compiled)
+        make = partial(
+            prepare, problem.scene, duration=problem.seconds, method=GAUSS, tolerance=tolerance
+        )
 
-        def solve(prepare: Callable[[], GaussMotion] = prepare) -> tuple[Array, int]:
-            motion = prepare()
-            states = np.full((problem.count + 1, len(problem.start)), np.nan)
-            states[:, :-1] = motion.at(problem.times)
-            return states, motion.evaluations
+        def solve(make: Callable[[], PreparedRun] = make) -> tuple[Array, int]:
+            motion = make().run()
+            dense = motion.at(problem.times)
+            torque = [dense.torque] if problem.scene.lags else []
+            unknown = np.full((len(dense), 1), np.nan)  # the work
+            found = np.hstack([dense.quaternion, dense.body_rate, *torque, unknown])
+            return found, motion.evaluations
 
         if kind == TOLERANCE:
-            yield SolverSetting(GAUSS, kind, tolerance, solve, prepare)
+            yield SolverSetting(GAUSS, kind, tolerance, solve, make)
             continue
-        with contextlib.suppress(NotSmooth):
-            motion = prepare()
-            if motion.h < longest:
-                longest = motion.h
-                yield SolverSetting(GAUSS, kind, motion.h, solve, motion.run)
+        with contextlib.suppress(SstError):
+            ready = make()
+            step = ready.run().step
+            if step < longest:
+                longest = step
+                yield SolverSetting(GAUSS, kind, step, solve, ready.run)
 
 
 def refine(
@@ -365,7 +329,7 @@ def refine(
         yield row, end
         error = row.get(ERROR, math.inf)
         below += error < max(floor, ROUNDING)
-        slower = SLOWER if problem.kinked and setting.kind == TOLERANCE else 1.0
+        slower = SLOWER if problem.clamped and setting.kind == TOLERANCE else 1.0
         if (row["wall_min_s"] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
             return
 

@@ -31,7 +31,7 @@ def stale(name, page, table):
             yield "an error estimate that is neither checked nor explained"
     elif name == "accuracy":
         term = {"scene": "", "term": "", "operations": 0, "ns": 0.0}
-        introduction, _, terms = accuracy.page([], [term]).split("\n## ")
+        introduction, _, terms = accuracy.accuracy_page([], [term]).split("\n## ")
         wanted, found = set(scenes.names()), {row["scene"] for row in rows}
         if terms.partition("\n| ")[0] not in page:
             yield "the introduction of the costs of terms"

@@ -15,7 +15,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report import stability
-from sst_ros.report.stability import ROWS, examine_stability, figure, page
+from sst_ros.report.stability import ROWS, draw_stability, examine_stability, stability_page
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 
@@ -33,8 +33,8 @@ def changed(name, scene=EXAMPLE2):
 
 
 def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
-    assert [run.name for run in found.runs] == list(FEW) and found.passed
-    whole, stroke, singular = found.runs
+    assert found.runs.name.tolist() == list(FEW) and found.passed
+    whole, stroke, singular = found.runs.itertuples()
     assert whole.result == "reached the end" and 0.0 < whole.error <= 10.0 * whole.estimate
     assert stroke.result.startswith("stopped at t = 0.0000")
     assert singular.passed and "initial.gamma" in singular.result  # which lies beyond the stroke
@@ -78,9 +78,9 @@ def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, 
 
     monkeypatch.setattr(stability, "simulate", simulate)
     report = examine_stability(dataclasses.replace(load("example2_stroke"), duration=0.5), [only])
-    assert report.runs[0].passed is report.passed is passes
-    assert ("| **FAILED** |" in page(report)) is not passes
-    assert f"1 runs, {0 if passes else 1} failed" in page(report)
+    assert report.runs.passed.tolist() == [report.passed] == [passes]
+    assert ("| **FAILED** |" in stability_page(report)) is not passes
+    assert f"1 runs, {0 if passes else 1} failed" in stability_page(report)
 
 
 def test_the_numbers_are_ten_and_a_hundred_times_those_of_the_scene():
@@ -115,7 +115,7 @@ def test_a_run_at_a_limit_starts_there_and_goes_into_it(kind):
     assert isinstance(scene, Scene)
     assert 0.0 <= getattr(measures_at_start(scene), kind) < 1e-9
     report = examine_stability(EXAMPLE2, [kind])
-    assert report.passed and report.runs[0].result.startswith("stopped at t = 0.0000")
+    assert report.passed and report.runs.result[0].startswith("stopped at t = 0.0000")
 
 
 def test_a_run_beside_a_singularity_starts_beside_it():
@@ -129,14 +129,14 @@ def test_the_steps_are_those_of_the_eigenvalues(found):
     stiff = examine_stability(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
     for name, reach in (("rk4", 2.785), ("dopri5", 3.307)):
         assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(reach, rel=3e-3)
-    assert "rodas5p: every step is stable." in page(stiff)
+    assert "rodas5p: every step is stable." in stability_page(stiff)
 
 
 def test_the_figure_and_the_page_show_every_method_and_run(found):
-    said = page(found)
+    said = stability_page(found)
     assert all(f"- {name}: " in said for name in METHODS) and "\n- gauss: every step" in said
     assert all(f"| {name} | {ROWS[name][0]} | yes |" in said for name in FEW)
-    lines = {line.get_label() for axes in figure(found).axes for line in axes.lines}
+    lines = {line.get_label() for axes in draw_stability(found).axes for line in axes.lines}
     assert {"rk4", "dopri5", "dop853", "rodas5p: every step", "decay"} <= lines
 
 

@@ -12,7 +12,7 @@ from models import seeded_samples
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.report import work_precision
-from sst_ros.report.accuracy import documents, facts, page
+from sst_ros.report.accuracy import accuracy_page, documents, facts
 from sst_ros.report.scene_summary import summary
 from sst_ros.report.step_advice import (
     eigenvalues,
@@ -57,10 +57,10 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     assert (advice.method, advice.step) == (motion.method, motion.step)
     assert f"  {advice.text}" in summary(scene).replace("\n  ", " ").replace("advice ", "  ")
     monkeypatch.setattr(work_precision, "solver_grid", lambda *_: [])
-    study = work_precision.work_precision(scene, compiled=False)
+    study = work_precision.work_precision(scene)
     assert study.advice == advice and study.measured[0] < 1e-8
     assert next(documents([study]))["advice"]["text"] == advice.text
-    assert f"Advice: {advice.text}. Measured: {study.measured[0]:.1e} rad" in page([study])
+    assert f"Advice: {advice.text}. Measured: {study.measured[0]:.1e} rad" in accuracy_page([study])
     assert any(advice.text in fact for fact in facts(study))
 
 

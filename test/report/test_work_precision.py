@@ -15,15 +15,15 @@ from sst_ros.errors import InputError
 from sst_ros.plot.style import save_figure
 from sst_ros.report import work_precision as study
 from sst_ros.report.accuracy import (
+    accuracy_page,
+    accuracy_text,
     documents,
-    draw_summary,
+    draw_accuracy,
+    draw_fastest,
     fastest,
-    figure,
     join_grids,
-    page,
-    text,
+    list_fastest,
 )
-from sst_ros.report.accuracy import summary as summary_of
 from sst_ros.report.reference_solution import (
     EXTENDED,
     MPMATH,
@@ -31,7 +31,7 @@ from sst_ros.report.reference_solution import (
     InitialValueProblem,
     solve_reference,
 )
-from sst_ros.report.results import data_frame, write
+from sst_ros.report.results import data_frame, publish
 from sst_ros.report.scene_summary import cost_table, operations
 from sst_ros.report.work_precision import (
     ABOVE_REFERENCE,
@@ -50,10 +50,17 @@ BRIEF = dataclasses.replace(SHORT, duration=0.1)
 EXACT = np.finfo(np.longdouble).eps < 1e-18
 
 
+@pytest.fixture(scope="module", autouse=True)
+def plain_python():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SST_ROS_NUMBA", "0")
+        yield
+
+
 @pytest.fixture(scope="module")
-def short():
-    """Study of 0.2 s of Example 2 in plain Python."""
-    return work_precision(SHORT, compiled=False, longest_s=0.02)
+def short(plain_python):
+    """Study of 0.2 s of Example 2."""
+    return work_precision(SHORT, longest_s=0.02)
 
 
 def _rows(found, method, kind=FIXED):
@@ -98,12 +105,12 @@ def test_every_row_is_whole(short):
 
 
 def test_what_it_writes_can_be_read(short, tmp_path):
-    said = text(short)
+    said = accuracy_text(short)
     assert fastest(short) in said and fastest(short).startswith("1e-09 rad over 0.2 s: ")
     assert all(len(line) < 200 for line in said.splitlines())
-    given = {"page": page([short]), "figures": {"picture": figure(short)}}
+    given = {"page": accuracy_page([short]), "figures": {"picture": draw_accuracy(short)}}
     document = {"studies": [*documents([short])]}
-    write(tmp_path, "accuracy", csv=join_grids([short]), document=document, **given)
+    publish(tmp_path, "accuracy", csv=join_grids([short]), document=document, **given)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
     assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
@@ -116,26 +123,26 @@ def test_what_it_writes_can_be_read(short, tmp_path):
 
 @pytest.mark.slow
 def test_the_summary_and_the_costs_of_terms_are_on_the_page(short, tmp_path):
-    found = summary_of([short])
+    found = list_fastest([short])
     assert found.target.tolist() == [1e-3, 1e-6, 1e-9, 1e-12]
-    save_figure(draw_summary(found, "made today"), tmp_path / "summary.png")
-    terms = cost_table(SHORT, compiled=False)
+    save_figure(draw_fastest(found, "made today"), tmp_path / "summary.png")
+    terms = cost_table(SHORT)
     assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51]
     assert terms[0]["ns"] > terms[2]["ns"]
-    assert "| example2_heavy | intermediate links | 51 |" in page([short], terms)
+    assert "| example2_heavy | intermediate links | 51 |" in accuracy_page([short], terms)
 
 
 @pytest.mark.slow
 def test_a_scene_that_rests_has_no_fastest_setting_and_is_drawn(tmp_path):
     """A controller drives it; no method errs, and a logarithm of that does not exist."""
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
-    found = work_precision(resting, compiled=False, longest_s=0.002)
+    found = work_precision(resting, longest_s=0.002)
     assert found.rests and found.best(1e-6) is None and "rests" in fastest(found)
-    said = page([found])
+    said = accuracy_page([found])
     assert "| point_to_point | at rest |" in said and "accuracy_point_to_point.png" not in said
     assert found.reference.own.gamma_dot == 0.0
     assert (found.rows.largest_gamma_dot_rad_per_s == 0.0).any()
-    save_figure(figure(found), tmp_path / "picture.png")
+    save_figure(draw_accuracy(found), tmp_path / "picture.png")
 
 
 def graded(study, *errors):
@@ -172,19 +179,19 @@ def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     monkeypatch.setattr(
         study,
         "solve_reference",
-        lambda _, kind, compiled: solve_reference(target, kind, compiled=False),
+        lambda _, kind: solve_reference(target, kind),
     )
-    found = work_precision(BRIEF, compiled=False, longest_s=0.005)
+    found = work_precision(BRIEF, longest_s=0.005)
     least = found.rows[ERROR].min()
     assert 1e-10 < least < 1e-6
     assert any("do not solve what the reference solves" in words for words in found.warnings)
-    assert "WARNING" in text(found)
+    assert "WARNING" in accuracy_text(found)
 
 
 def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
     """Where reference and runs share the fault, the paper's equations do not."""
     wrong_kernel(lambda right: (*right[:6], right[6] * (1.0 + 1e-7)))
-    found = work_precision(BRIEF, compiled=False, longest_s=0.001)
+    found = work_precision(BRIEF, longest_s=0.001)
     assert 1e-9 < found.formulation < 1e-6
     assert any("paper's equations" in words for words in found.warnings)
 
@@ -192,13 +199,13 @@ def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
 @pytest.mark.slow
 def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
-    found = work_precision(stiff, compiled=False, longest_s=0.005)
+    found = work_precision(stiff, longest_s=0.005)
     assert not any(row.failure for row in _rows(found, "rodas5p"))
     failed = found.rows[found.rows.failure != ""]
     assert len(failed) and failed[ERROR].isna().all()
-    assert text(found).count("FAILED") == len(failed)
+    assert accuracy_text(found).count("FAILED") == len(failed)
     assert join_grids([found]).failure.str.contains("not finite|off by").sum() >= len(failed)
-    save_figure(figure(found), tmp_path / "picture.png")
+    save_figure(draw_accuracy(found), tmp_path / "picture.png")
 
 
 def test_a_run_that_stops_is_compared_up_to_its_end():

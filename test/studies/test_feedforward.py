@@ -12,7 +12,7 @@ from matplotlib import image
 
 from sst_ros.control.law import MODES
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.report.results import write
+from sst_ros.report.results import publish
 from sst_ros.scene.scene import load
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies import feedforward
@@ -124,8 +124,8 @@ def test_the_same_bits_on_any_number_of_workers():
 
 @pytest.mark.slow
 def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(small, tmp_path):
-    write(tmp_path, "feedforward", csv=small.loops, document=document(small), page=page(small),
-          figures={"picture": draw_study(small, title(small))})  # fmt: skip
+    publish(tmp_path, "feedforward", csv=small.loops, document=document(small),
+            page=page(small), figures={"picture": draw_study(small, title(small))})  # fmt: skip
     rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
     assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
     written = json.loads((tmp_path / "feedforward.json").read_text())
