@@ -17,7 +17,7 @@ def main(arguments: list[str] | None = None) -> int:
     if given and given[0] in NODES:
         signals.handle()
     try:
-        from sst_ros.cli.main import run_command
+        from sst_ros.cli.commands import run_command
     except KeyboardInterrupt:
         return 130
     return run_command(given)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of commands: what each is for, what runs it, and its arguments.
+"""The command `sst-ros`: its table of commands, and how one runs; errors become an exit status.
 
 A function is named, not imported: its module, with the rooms and libraries that it uses, is
 imported when its command runs, so that `sst-ros --help` imports none of them.
@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
+import sys
+import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros.errors import InputError, Problem, printable, suggestion
+from sst_ros.errors import InputError, Problem, SstError, printable, suggestion
+from sst_ros.extras import explanation, require
 from sst_ros.host.output import require_free
 from sst_ros.version import VERSION
 
@@ -57,6 +62,11 @@ def _path(name: str, what: str | None = None, **options: Any) -> Arg:
     return Arg(name, what, type=Path, **options)
 
 
+def _number(name: str, what: str, default: float | None = None) -> Arg:
+    """Describe an option that is a number."""
+    return Arg(name, what, type=float, default=default)
+
+
 def _scene(
     name: str, what: str = "name of a scene, or path of a .yaml file", **options: Any
 ) -> Arg:
@@ -74,14 +84,10 @@ def integer_from(least: int, most: int) -> Any:
     """Return a type of arguments: a whole number in a range."""
 
     def convert(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if not least <= value <= most:
+        if not (text.isdecimal() and least <= int(text) <= most):
             allowed = f"must be a whole number from {least} to {most}, not {text!r}"
             raise argparse.ArgumentTypeError(allowed)
-        return value
+        return int(text)
 
     return convert
 
@@ -93,9 +99,9 @@ COMMANDS: dict[str, Subcommand | str] = {
         "simulate a scene under its own torques",
         "cli.runs:run_simulation",
         SCENE,
-        Arg("--duration", "length [s]; default: that of the scene", type=float),
+        _number("--duration", "length [s]; default: that of the scene"),
         Arg("--method", "integrator; default: auto", default="auto"),
-        Arg("--tolerance", "allowed error [rad]; default: 1e-9", type=float, default=1e-9),
+        _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
         Arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
@@ -128,7 +134,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _flag("--json", "print JSON instead of a table"),
         _path("--csv", "write the torques to play", metavar="OUT"),
         _flag("--force", "overwrite the file of --csv"),
-        Arg("--period", "length of a row of --csv [s]; default 0.001", type=float, default=1e-3),
+        _number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
     ),
     "describe": Subcommand(
         "write a scene as URDF",
@@ -168,12 +174,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
         Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        Arg(
-            "--port",
-            "port; the next free one is taken",
-            type=integer_from(1024, 65535),
-            default=8080,
-        ),
+        Arg("--port", "port, or the next free one", type=integer_from(1024, 65535), default=8080),
         _flag("--open", "open it, where there is a desktop"),
         needs=("viser",),
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
@@ -253,11 +254,7 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="?",
             metavar="SCENE",
         ),
-        _scene(
-            "--scene",
-            "what is known, and the values to start from; default: the recorded scene",
-            metavar="S",
-        ),
+        _scene("--scene", "known numbers, and where to start; default: as recorded", metavar="S"),
         Arg(
             "--parameters",
             "unknowns by the beginning of their names, as in: star friction.gamma offset; "
@@ -267,19 +264,9 @@ COMMANDS: dict[str, Subcommand | str] = {
             metavar="P",
         ),
         Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
-        Arg(
-            "--cutoff",
-            "of the zero-phase filter of measured angles; default: none, rates as recorded",
-            type=float,
-            metavar="HZ",
-        ),
-        Arg(
-            "--delay",
-            "by which measured torques come late; default: 0",
-            type=float,
-            metavar="SECONDS",
-        ),
-        Arg("--duration", "of a designed motion [s]; default: 6", type=float),
+        _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
+        _number("--delay", "by which measured torques come late [s]; default: 0"),
+        _number("--duration", "of a designed motion [s]; default: 6"),
         Arg("--harmonics", "of a designed motion; default: 5", type=int),
         Arg("--seed", "of a designed motion; default: 0", type=int),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
@@ -365,3 +352,90 @@ def free_out(options: argparse.Namespace, default: str | Path) -> Path:
 def refuse(options: argparse.Namespace, option: str, value: object, allowed: str) -> NoReturn:
     """Raise the error that refuses the value of an option."""
     raise InputError(options.command, [Problem(option, value, allowed)])
+
+
+def refuse_unknown(
+    options: argparse.Namespace, option: str, word: str, known: Sequence[str]
+) -> None:
+    """Refuse a word that is none of those known, and name the nearest."""
+    if word not in known:
+        allowed = f"must be one of {', '.join(known)}{suggestion(word, known)}"
+        refuse(options, option, word, allowed)
+
+
+FAILED, BUG, INTERRUPTED = 1, 3, 130
+
+
+def run_command(words: list[str]) -> int:
+    """Run a command or a node; return the exit status. Errors are one line on stderr."""
+    debug, words = _without_debug(words)
+    try:
+        status = _run(words)
+        print(end="", flush=True)  # does nothing where stdout was closed before the start
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exc()
+        status, message = failure(error)
+        if isinstance(error, OSError):
+            _abandon_stdout()
+        for line in message.splitlines():
+            print(f"{PROGRAM}: {printable(line)}", file=sys.stderr)
+    return status
+
+
+def _run(words: list[str]) -> int:
+    if "_ARGCOMPLETE" in os.environ:
+        importlib.import_module("argcomplete").autocomplete(parser())
+    if words and words[0] in NODES:
+        status: int = function("nodes.process:run")(words)
+        return status
+    commands = parser()
+    options, unknown = commands.parse_known_args(words)
+    if unknown:
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    if options.command is None:
+        commands.print_help()
+        return 0
+    for module in options.entry.needs:
+        require(module)
+    done: int | None = function(options.entry.run)(options)
+    return done or 0
+
+
+def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
+    """Take --debug out of the words, wherever it is before those of ROS."""
+    end = words.index("--ros-args") if "--ros-args" in words else len(words)
+    kept = [word for word in words[:end] if word != "--debug"]
+    return len(kept) < end, [*kept, *words[end:]]
+
+
+def _abandon_stdout() -> None:
+    """Keep Python from failing once more, when it ends, on a stdout that takes nothing."""
+    try:
+        print(end="", flush=True)
+    except (OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def failure(error: BaseException) -> tuple[int, str]:
+    """Return the exit status and the message, "" for none."""
+    text = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, "interrupted"
+    if isinstance(error, BrokenPipeError):
+        return FAILED, ""
+    if isinstance(error, SstError):
+        return FAILED, str(error)
+    if isinstance(error, ModuleNotFoundError) and (said := explanation(error)):
+        return FAILED, said
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return FAILED, f"{where}{error.strerror or error}"
+    if isinstance(error, UnicodeError):
+        return FAILED, f"text cannot be encoded or decoded: {error}"
+    if isinstance(error, MemoryError):
+        return FAILED, "not enough memory"
+    if type(error).__module__.partition(".")[0] in ("rclpy", "rosbags"):
+        return FAILED, text
+    report = "internal error, please report it with the output of --debug"
+    return BUG, f"{report}: {type(error).__name__}: {text}"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 
 from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import examine_motion, plan_json, plan_table, time_scaling, write_torques
@@ -14,7 +15,6 @@ from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
-from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.sweeps.chunk_task import read_sweep, summarize
 from sst_ros.sweeps.cluster_engine import connect
 from sst_ros.sweeps.sweep import run_study
@@ -31,8 +31,10 @@ def check_plan(options: argparse.Namespace) -> int:
         raise InputError("plan check", [problem])
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
-    scene = load(options.scene)
-    plan = examine_motion(reference_motion(scene, _read_motion), scene)
+    scene, read_motion = load(options.scene), "recording.recording:read_run_motion"
+    # Only a recorded motion needs rosbags.
+    motion = reference_motion(scene, lambda bag: function(read_motion)(bag))
+    plan = examine_motion(motion, scene)
     write = plan_json if options.json else plan_table
     print(write(plan, time_scaling(plan)).rstrip())
     if options.csv is not None:
@@ -40,16 +42,14 @@ def check_plan(options: argparse.Namespace) -> int:
     return 1 if plan.problems else 0
 
 
-def _read_motion(bag: str) -> Trajectory:
-    """Read a recorded motion, which needs rosbags; others do not."""
-    found: Trajectory = function("recording.recording:read_run_motion")(bag)
-    return found
-
-
 def run_sweep(options: argparse.Namespace) -> None:
     """Run a study of many runs, or draw the results of one."""
     if str(options.study) == PLOT:
-        _draw_sweep(options)
+        if options.folder is None or options.scheduler or options.workers or options.resume:
+            options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
+        draw = function("sweeps.sweep_pictures:draw_pictures")  # a sweep needs no Matplotlib
+        for path in draw(read_sweep(options.folder), options.out or options.folder):
+            print(path)
         return
     if options.folder is not None:
         options.parser.error("DIR is an argument of `sweep plot`; give --out DIR")
@@ -59,24 +59,14 @@ def run_sweep(options: argparse.Namespace) -> None:
     if not options.resume:
         free_out(options, out)
     study = SweepStudy.read(options.study)
-    client = connect(options.scheduler) if options.scheduler else None
-    try:
-        found = run_study(
-            study, out, client=client, workers=options.workers or 0, resume=options.resume
-        )
-    finally:
+    workers, resume = options.workers or 0, options.resume
+    with contextlib.ExitStack() as end:
+        client = connect(options.scheduler) if options.scheduler else None
         if client is not None:
-            client.close(timeout=5)
+            end.callback(client.close, timeout=5)
+        found = run_study(study, out, client=client, workers=workers, resume=resume)
     print(summarize(found))
     print(f"Results in {out}; `sst-ros sweep plot {out}` draws them.")
-
-
-def _draw_sweep(options: argparse.Namespace) -> None:
-    if options.folder is None or options.scheduler or options.workers or options.resume:
-        options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
-    draw = function("sweeps.sweep_pictures:draw_pictures")  # a sweep needs no Matplotlib
-    for path in draw(read_sweep(options.folder), options.out or options.folder):
-        print(path)
 
 
 def run_identification(options: argparse.Namespace) -> None:

@@ -6,9 +6,9 @@ from __future__ import annotations
 import argparse
 
 from sst_ros import demo
-from sst_ros.cli.commands import free_out, refuse
+from sst_ros.cli.commands import free_out, refuse_unknown
 from sst_ros.control.law import MODES
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
@@ -73,8 +73,6 @@ def run_demo(options: argparse.Namespace) -> int:
             raise InputError("demo", wrong)
         return demo.demo(free_out(options, "demo_out"))
     for mode in options.mode or ():
-        if mode not in MODES:
-            allowed = f"must be one of {', '.join(MODES)}{suggestion(mode, MODES)}"
-            refuse(options, "--mode", mode, allowed)
+        refuse_unknown(options, "--mode", mode, MODES)
     out = free_out(options, "demo_out/feedforward")
     return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.cli.commands import free_out, function, refuse
-from sst_ros.errors import InputError, Problem, SstError, suggestion
+from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
+from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
 from sst_ros.host import child_process
 from sst_ros.host.cache_folder import cache_folder, configured_folder
@@ -48,10 +48,10 @@ def check_files(options: argparse.Namespace) -> int:
     failed = 0
     for path in options.files:
         try:
-            warnings = implausible(check(path))
-            print(f"{path}: valid" + (", with warnings" if warnings else ""))
-            for text in warnings:
-                print(f"{path}: warning: {text}")
+            warning = implausible(check(path))
+            print(f"{path}: valid" + (", with warnings" if warning else ""))
+            if warning:
+                print(f"{path}: warning: {warning}")
         except SstError as error:
             failed = 1
             print(error)
@@ -67,40 +67,35 @@ def check(name_or_path: str | Path) -> Scene:
     """
     source, origin = text_of(name_or_path)
     scene = read(Scene, source, origin)
-    problems: list[Problem]
     try:
         Simulation(scene)
+        return scene
     except InputError as error:
         problems = list(error.problems)
     except SstError as error:
         problems = [Problem("initial.gamma", scene.initial.gamma, f"cannot start here: {error}")]
-    else:
-        return scene
     placed = [dataclasses.replace(p, line=line_of(source, p.key)) for p in problems]
     raise InputError(origin, placed)
 
 
-def implausible(scene: Scene) -> list[str]:
-    """Describe numbers that no body can have though each alone is allowed.
+def implausible(scene: Scene) -> str:
+    """Describe numbers of the star that no body can have though each is allowed; "" for none.
 
     A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O, whatever its shape.
     """
     star = scene.star
     trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
     if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
-        return []
-    return [
+        return ""
+    return (
         f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass = {star.mass:g} kg "
         f"within star.radius = {star.radius:g} m has at most 2 m r^2 = {most:g} kg m^2"
-    ]
+    )
 
 
 def compile_code(options: argparse.Namespace) -> None:
     """Compile the code of a scene into the cache."""
-    if options.integrator not in INTEGRATORS:
-        allowed = f"must be one of {', '.join(INTEGRATORS)}"
-        allowed += suggestion(options.integrator, INTEGRATORS)
-        refuse(options, "--integrator", options.integrator, allowed)
+    refuse_unknown(options, "--integrator", options.integrator, INTEGRATORS)
     if codegen.numba_version() is None:
         require("numba")
         raise SstError("numba is switched off by SST_ROS_NUMBA=0")

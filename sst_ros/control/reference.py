@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from sst_ros.mechanism.generic_math import ZERO, axpy, multiply
 from sst_ros.state import Array, Quaternion, Vector3
@@ -153,6 +152,8 @@ def maximum(
         floor: maxima that are certainly below it are not refined.
 
     """
+    from scipy.optimize import minimize_scalar  # a node that plans no motion starts without SciPy
+
     top = int(np.argmax(values))
     best = Peak(float(values[top]), float(times[top]))
     left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)

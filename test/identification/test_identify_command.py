@@ -7,7 +7,7 @@ import pytest
 from bags import simulated
 
 from sst_ros import load_scene
-from sst_ros.cli.main import run_command
+from sst_ros.cli.commands import run_command
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.yaml_document import dump
 

@@ -4,7 +4,7 @@
 import pytest
 from scipy.stats import spearmanr
 
-from sst_ros.cli.main import run_command
+from sst_ros.cli.commands import run_command
 from sst_ros.sweeps.chunk_task import correlate_early_ends, read_sweep
 
 for module in ("numba", "pandas", "pyarrow", "matplotlib"):
