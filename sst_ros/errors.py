@@ -6,11 +6,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sst_ros.state import Assembly, State
 
 SHOWN_PROBLEMS = 20
 """Problems of one input that are printed; `InputError.problems` has all of them."""
@@ -63,7 +62,7 @@ class NoAdmissibleAssembly(AssemblyError):
 
 
 class AmbiguousAssembly(AssemblyError):
-    """More than one assembly is admissible; `candidates` are all of them.
+    """More than one assembly is admissible; `candidates` are all of them, each a `state.Assembly`.
 
     `quaternions` (x, y, z, w) are their orientations, shape (n, 4).
     """
@@ -71,7 +70,7 @@ class AmbiguousAssembly(AssemblyError):
     def __init__(
         self,
         gamma: NDArray[np.float64],
-        candidates: Sequence[Assembly],
+        candidates: Sequence[Any],
         quaternions: NDArray[np.float64],
     ) -> None:
         self.candidates = tuple(candidates)
@@ -91,9 +90,9 @@ class SingularConfiguration(SstError):
 
 
 class RunStopped(SstError):
-    """The motion cannot continue; `state` is the last valid one, `time` [s] is when it ended."""
+    """The motion cannot continue; `state`, a `State`, is the last valid one, `time` [s] its end."""
 
-    def __init__(self, reason: str, time: float, state: State) -> None:
+    def __init__(self, reason: str, time: float, state: Any) -> None:
         self.reason = reason
         self.time = time
         self.state = state

@@ -5,39 +5,36 @@ from __future__ import annotations
 
 import argparse
 
-from sst_ros import demo
-from sst_ros.cli.commands import free_out, refuse_unknown
+from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
 from sst_ros.control.law import MODES
-from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
-from sst_ros.report import accuracy, stability
 from sst_ros.report.reference_solution import EXTENDED, MPMATH
-from sst_ros.report.run import summary_table, summary_text, write_run_report
 from sst_ros.scene.scene import load, names
 
 
 def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
     out = free_out(options, results_folder(options.bag, "report"))
-    summary = write_run_report(options.bag, out, damaged=options.damaged)
+    summary = function("report.run:write_run_report")(options.bag, out, damaged=options.damaged)
     if options.verbose:
-        print(summary_table(summary))
-    print(summary_text(summary, str(out)), end="")
+        print(function("report.run:summary_table")(summary))
+    print(function("report.run:summary_text")(summary, str(out)), end="")
 
 
 def report_accuracy(options: argparse.Namespace) -> None:
     """Measure the error and the run time of every method."""
     out = free_out(options, "accuracy_out")
     kind = MPMATH if options.mpmath else EXTENDED
-    accuracy.write_accuracy_report(options.scenes or names(), out, kind=kind)
+    function("report.accuracy:write_accuracy_report")(options.scenes or names(), out, kind=kind)
 
 
 def report_stability(options: argparse.Namespace) -> int:
     """Find the stable steps along a motion, and run the scene with other numbers."""
     out = free_out(options, "stability_out")
-    return 0 if stability.write_stability_report(load(options.scene), out, options.only) else 1
+    write = function("report.stability:write_stability_report")
+    return 0 if write(load(options.scene), out, options.only) else 1
 
 
 def draw_pictures(options: argparse.Namespace) -> int:
@@ -66,13 +63,14 @@ def draw_pictures(options: argparse.Namespace) -> int:
 
 def run_demo(options: argparse.Namespace) -> int:
     """Run the paper's examples by the nodes, or follow a motion."""
+    given = {"name": options.scene, "modes": options.mode}
+    chosen = {name: value for name, value in given.items() if value}
     if options.kind != "feedforward":
-        given = {"--scene": options.scene, "--mode": options.mode}
-        allowed = "is an option of `demo feedforward`"
-        if wrong := [Problem(key, value, allowed) for key, value in given.items() if value]:
-            raise InputError("demo", wrong)
-        return demo.demo(free_out(options, "demo_out"))
+        if chosen:
+            refuse(options, "--scene, --mode", chosen, "are options of `demo feedforward`")
+        status: int = function("demo:demo")(free_out(options, "demo_out"))
+        return status
     for mode in options.mode or ():
         refuse_unknown(options, "--mode", mode, MODES)
-    out = free_out(options, "demo_out/feedforward")
-    return demo.feedforward(out, options.scene or demo.FOLLOWED, options.mode or demo.MODES)
+    status = function("demo:feedforward")(free_out(options, "demo_out/feedforward"), **chosen)
+    return status

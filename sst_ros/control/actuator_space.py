@@ -19,14 +19,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import trace
-from sst_ros.dynamics.traced_dynamics import (
-    BODY_ACCELERATION,
-    QUATERNION,
-    RATE,
-    compile_for_arrays,
-    compile_program,
-)
+from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
@@ -48,8 +41,9 @@ ROUNDING = 4e-16
 CLOSED = 1e-14
 """Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
 _STEPS = 20
+_STAR = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
 _ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
-_POSE = (*QUATERNION, *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
+_POSE = (*_STAR[:4], *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 
 class ActuatorSpaceMap:
@@ -66,11 +60,9 @@ class ActuatorSpaceMap:
             kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
             for w, v, e in rows
         ]
-        self._actuators = compile_program(
-            trace(self._of_star, (*QUATERNION, *RATE, *BODY_ACCELERATION))
-        )
-        self._star = compile_program(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
-        self._posture = compile_program(trace(self._of_posture, QUATERNION))
+        self._actuators = compile_program(trace(self._of_star, _STAR))
+        self._star = compile_program(trace(self.star_accelerations, (*_STAR[:4], *_ACTUATORS)))
+        self._posture = compile_program(trace(self._of_posture, _STAR[:4]))
         self._newton = compile_program(trace(self.newton_step, _POSE))
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
@@ -122,12 +114,12 @@ class ActuatorSpaceMap:
     @cached_property
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:
         """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
-        return compile_for_arrays(trace(self.star_accelerations, (*QUATERNION, *_ACTUATORS)))
+        return compile_for_arrays(trace(self.star_accelerations, (*_STAR[:4], *_ACTUATORS)))
 
     @cached_property
     def postures(self) -> Callable[..., tuple[Any, ...]]:
         """See `posture`: seven arrays (n,) of a quaternion, four arrays (n,)."""
-        return compile_for_arrays(trace(self._of_posture, QUATERNION))
+        return compile_for_arrays(trace(self._of_posture, _STAR[:4]))
 
     def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
         """Quaternions (n, 4) at gamma (n, 3) by some steps of Newton's method from `near` (n, 4).

@@ -39,6 +39,7 @@ _TEMPLATES = {
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
 }
+FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
 _OPERATORS = {"add": add, "sub": sub, "mul": mul, "div": truediv}
 
 
@@ -425,3 +426,23 @@ def _drop_minus(value: Value) -> Value:
         return None
     op, args = value.graph.nodes[value.index]
     return args[0] if op == "neg" else None
+
+
+def compile_program(program: Program) -> Callable[..., tuple[float, ...]]:
+    """Turn a program into a Python function of its inputs.
+
+    The function raises ArithmeticError or ValueError where a float has no value.
+    """
+    return _compile(program, {name: getattr(math, name) for name in FUNCTIONS})
+
+
+def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
+    """Turn a program into a function of NumPy arrays, element by element."""
+    names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
+    return _compile(program, names | {"atan2": np.arctan2, "max": np.maximum})
+
+
+def _compile(program: Program, names: dict[str, Any]) -> Callable[..., tuple[Any, ...]]:
+    exec(program.source("function"), names)
+    function: Callable[..., tuple[Any, ...]] = names["function"]
+    return function

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
@@ -11,13 +10,18 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program, number_constants, trace, with_jacobian
+from sst_ros.dynamics.expression import (
+    Program,
+    compile_program,
+    number_constants,
+    trace,
+    with_jacobian,
+)
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
 
-FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
 Function = Callable[..., tuple[float, ...]]
 
 QUATERNION = ("x", "y", "z", "w")
@@ -252,23 +256,3 @@ def ode_with_work(dynamics: Dynamics) -> ODE:
 def ode_under(dynamics: Dynamics, torque: SineTorque, limit: float | None) -> ODE:
     """Give the system under a sine whose phases are its drive, which counts work."""
     return ODE(dynamics, torque, limit=limit, work=True, phases=True)
-
-
-def compile_program(program: Program) -> Function:
-    """Turn a program into a Python function of its inputs.
-
-    The function raises ArithmeticError or ValueError where a float has no value.
-    """
-    return _compile(program, {name: getattr(math, name) for name in FUNCTIONS})
-
-
-def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
-    """Turn a program into a function of NumPy arrays, element by element."""
-    names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
-    return _compile(program, names | {"atan2": np.arctan2, "max": np.maximum})
-
-
-def _compile(program: Program, names: dict[str, Any]) -> Function:
-    exec(program.source("function"), names)
-    function: Function = names["function"]
-    return function

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import with_jacobian
-from sst_ros.dynamics.traced_dynamics import QUATERNION, compile_for_arrays
+from sst_ros.dynamics.expression import compile_for_arrays, with_jacobian
+from sst_ros.dynamics.traced_dynamics import QUATERNION
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array

@@ -22,13 +22,8 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, with_jacobian
-from sst_ros.dynamics.traced_dynamics import (
-    BODY_ACCELERATION,
-    QUATERNION,
-    RATE,
-    compile_for_arrays,
-)
+from sst_ros.dynamics.expression import Expression, compile_for_arrays, with_jacobian
+from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
 from sst_ros.identification.parameters import with_symbols
 from sst_ros.integration.parametric_model import VariedNumber
 from sst_ros.mechanism import kinematics

@@ -32,10 +32,10 @@ from scipy.optimize import least_squares
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import with_jacobian
+from sst_ros.dynamics.expression import compile_program, with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, compile_program
+from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, scales

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function, compile_program
+from sst_ros.dynamics.expression import compile_program
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function
 from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp

@@ -20,9 +20,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, Program, leaves, rebuild, trace
+from sst_ros.dynamics.expression import (
+    Expression,
+    Program,
+    compile_for_arrays,
+    leaves,
+    rebuild,
+    trace,
+)
 from sst_ros.dynamics.model import Limit, damping_of, limits_of
-from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, compile_for_arrays
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.integration.events import limit_distances

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.host.output import slices
 from sst_ros.integration.propagator import LONGEST_TICK_NS, TickPropagator, TickSequence
 from sst_ros.mechanism.frames import angle_between
@@ -24,16 +23,8 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.report import states
+from sst_ros.report.states import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 from sst_ros.state import NANOSECONDS
-
-COMPILED_FROM = 10_000
-"""From this number of ticks on compilation costs less than it saves."""
-
-PLAIN_TICKS = 60_000
-"""So many ticks are compared in plain Python, a minute's work."""
-
-CHUNK = 25_000
-"""So many ticks at a time, which bounds the memory."""
 
 
 class Deviation(NamedTuple):
@@ -120,14 +111,6 @@ def ideal(recording: Recording) -> Comparison | None:
     many = len(recording.ticks.start_ns) > COMPILED_FROM
     motion = TickPropagator(recording.scene, torque, compiled=many)
     return _compare(recording, motion, between, states.initial(recording.scene), restart=False)
-
-
-def ticks_of(recording: Recording) -> TickSequence:
-    """Return the recorded ticks."""
-    ticks, torque = recording.ticks, recording.ticks.torque
-    if Dynamics.of(recording.scene).has_moment_topic and ticks.moment is not None:
-        torque = np.hstack([torque, ticks.moment])
-    return TickSequence(ticks.start_ns, ticks.end_ns, torque)
 
 
 def _compare(

@@ -32,7 +32,6 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.report import states
-from sst_ros.report.step_advice import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
@@ -162,7 +161,7 @@ class InitialValueProblem:
 
     def _horizon(self) -> tuple[int, int, str]:
         """Return interval [ns], count of intervals, and why the span ends early."""
-        motion = simulate(self.scene, duration=self.scene.duration or WHOLE_RUN_S)
+        motion = simulate(self.scene, duration=self.scene.duration or states.WHOLE_RUN_S)
         whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
         ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
         if whole * NANOSECONDS < 1000 * INTERVALS:

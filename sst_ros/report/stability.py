@@ -33,10 +33,10 @@ from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matr
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
 from sst_ros.report.results import data_frame, provenance, publish, records, render
+from sst_ros.report.states import WHOLE_RUN_S
 from sst_ros.report.step_advice import (
     LONGEST_S,
     TOLERANCE,
-    WHOLE_RUN_S,
     eigenvalues,
     largest_stable_step,
     step_advice,

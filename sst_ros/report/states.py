@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""States (q, W) of the equations of motion: from a scene, from a sample, and back to joints.
+"""Ticks and states (q, W) of the equations of motion: from a scene, a sample, a recording.
 
 At recorded states the kernel is checked against the paper's equations. What is compared is the
 mechanism of the paper: bodies, torques and the products of velocities. Loads that a scene may have
@@ -15,7 +15,9 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import accelerate_by_paper, initial_state
+from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import SingularConfiguration
+from sst_ros.integration.propagator import TickSequence
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
@@ -25,9 +27,25 @@ from sst_ros.scene.scene import Scene
 
 Places: TypeAlias = "slice | list[int] | Integers"
 
+COMPILED_FROM = 10_000
+"""From this number of ticks on compilation costs less than it saves."""
+PLAIN_TICKS = 60_000
+"""So many ticks are compared in plain Python, a minute's work."""
+CHUNK = 25_000
+"""So many ticks at a time, which bounds the memory."""
+WHOLE_RUN_S = 1.0
+"""Length of a run [s] where the scene names no duration."""
 SAME_START = 1e-9
 """Largest difference [rad], [rad/s] between a first sample and the start that its scene asks for,
 where samples are lost and the first one may belong to a later time."""
+
+
+def ticks_of(recording: Recording) -> TickSequence:
+    """Return the recorded ticks."""
+    ticks, torque = recording.ticks, recording.ticks.torque
+    if Dynamics.of(recording.scene).has_moment_topic and ticks.moment is not None:
+        torque = np.hstack([torque, ticks.moment])
+    return TickSequence(ticks.start_ns, ticks.end_ns, torque)
 
 
 def initial(scene: Scene) -> tuple[float, ...]:

@@ -25,13 +25,13 @@ from sst_ros.errors import SstError
 from sst_ros.integration.compiled_method import Method
 from sst_ros.integration.methods import DORMAND_PRINCE, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report.states import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulate_gauss import GAUSS
 
-LONGEST_S, WHOLE_RUN_S = 10.0, 1.0
-"""The advice is for a run of the scene's duration, but not of more than LONGEST_S [s]; of
-WHOLE_RUN_S where the scene names no duration."""
+LONGEST_S = 10.0
+"""The advice is for a run of the scene's duration, but not of more than this [s]."""
 
 TOLERANCE = 1e-9
 """Error of the orientation that the advice is for [rad]: the default of `simulate`."""

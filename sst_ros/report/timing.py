@@ -33,7 +33,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers
 from sst_ros.report import states
-from sst_ros.report.reference import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
+from sst_ros.report.states import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 from sst_ros.state import NANOSECONDS
 
 REPORTED = (

@@ -6,7 +6,6 @@ Other threads send requests by `ask`. They are served between two samples, in th
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import threading
@@ -14,6 +13,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from enum import Enum
 from typing import NamedTuple
 
@@ -50,12 +50,7 @@ class Reply(NamedTuple):
     message: str
 
 
-class PendingReply:
-    """Reply that the thread of the run will give; `done` is set when `reply` is valid."""
-
-    def __init__(self) -> None:
-        self.done = threading.Event()
-        self.reply = Reply(False, "not done: the run has ended or failed")
+_NOT_DONE = Reply(False, "not done: the run has ended or failed")
 
 
 class NoSubscribers(SstError):
@@ -84,7 +79,7 @@ class RunLoop(TickLoop):
         self.phase, self.fault, self.failed = Phase.WAITING, "", False
         self._build, self._original = build, build(scene)
         super().__init__(self._original, run, torque_input, pacer, output)
-        self._requests: deque[tuple[Callable[[], Reply], PendingReply]] = deque()
+        self._requests: deque[tuple[Callable[[], Reply], Future[Reply]]] = deque()
         self._changing = threading.RLock()
         self._thread: threading.Thread | None = None
         self._watched = (0.0, 0.0)
@@ -97,20 +92,19 @@ class RunLoop(TickLoop):
         """
         pending = self.post(request)
         deadline = time.monotonic() + timeout
-        while not pending.done.wait(_POLL_S):
+        while not wait([pending], _POLL_S).done:
             since = self.step_since
             stuck = since and time.perf_counter() - since > _STUCK_S
             ends = stuck or self.stopped.is_set() or time.monotonic() > deadline
-            if ends and not pending.done.is_set():  # it may have been served just before
-                with self._changing, contextlib.suppress(ValueError):  # it is being served
-                    self._requests.remove((request, pending))
+            if ends and not pending.done():  # it may have been served just before
+                pending.cancel()
                 reason = self.fault or ("a step does not end" if stuck else "the node is ending")
                 return Reply(False, f"not done: {reason}")
-        return pending.reply
+        return pending.result()
 
-    def post(self, request: Callable[[], Reply]) -> PendingReply:
+    def post(self, request: Callable[[], Reply]) -> Future[Reply]:
         """Have a request served; do not wait."""
-        pending = PendingReply()
+        pending: Future[Reply] = Future()
         self._requests.append((request, pending))
         self.requested.set()
         return pending
@@ -230,14 +224,13 @@ class RunLoop(TickLoop):
     def _serve(self) -> None:
         self.requested.clear()
         while self._requests:
-            with self._changing:
-                if not self._requests:
-                    return
-                request, pending = self._requests.popleft()
-            try:
-                pending.reply = request()
-            finally:
-                pending.done.set()
+            request, pending = self._requests.popleft()
+            if pending.set_running_or_notify_cancel():
+                reply = _NOT_DONE
+                try:
+                    reply = request()
+                finally:
+                    pending.set_result(reply)
 
     def _wait_for_start(self) -> None:
         """Show the state until the run starts: by itself, or by a command."""
@@ -303,7 +296,9 @@ class RunLoop(TickLoop):
         self.counters.hold()
         self.stopped.set()
         while self._requests:
-            self._requests.popleft()[1].done.set()
+            pending = self._requests.popleft()[1]
+            if pending.set_running_or_notify_cancel():
+                pending.set_result(_NOT_DONE)
 
     def _to(self, phase: Phase) -> None:
         with self._changing:

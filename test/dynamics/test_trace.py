@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sst_ros.dynamics.expression import trace, with_jacobian
-from sst_ros.dynamics.traced_dynamics import compile_program
+from sst_ros.dynamics.expression import compile_program, trace, with_jacobian
 from sst_ros.mechanism.generic_math import atan2, exp, positive, sqrt, tanh
 
 FINITE = st.floats(-10.0, 10.0)

@@ -11,7 +11,8 @@ from models import seeded_samples
 from scipy.spatial.transform import Rotation
 
 from sst_ros import Simulation, load_scene, simulate
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, compile_program
+from sst_ros.dynamics.expression import compile_program
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH

@@ -8,7 +8,7 @@ import pytest
 from loaded_scenes import IGNORE, REST, loaded
 
 from sst_ros import load_scene
-from sst_ros.dynamics.traced_dynamics import compile_program
+from sst_ros.dynamics.expression import compile_program
 from sst_ros.errors import InputError
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
