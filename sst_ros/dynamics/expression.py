@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
 from types import SimpleNamespace
@@ -241,6 +241,13 @@ class Program:
             tuple(map(renumber, self.outputs)),
         )
 
+    def steps_of(self, inputs: Sequence[str]) -> list[bool]:
+        """Return of each step whether it depends on one of these inputs."""
+        depends = [name in inputs for name in self.inputs]
+        for _, operands in self.steps:
+            depends.append(any(depends[x.number] for x in operands if isinstance(x, Operand)))
+        return depends[len(self.inputs) :]
+
     def source(self, name: str, slots: Slots | None = None) -> str:
         """Source of a flat function of all inputs that returns the tuple of outputs.
 
@@ -357,9 +364,24 @@ def with_jacobian(
     last = len(graph.nodes)
     everything = list(outputs)
     for name in by:
-        slopes = _slopes(graph, last, symbols[list(inputs).index(name)])
-        everything += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
+        everything += _differentiate(graph, last, outputs, {list(inputs).index(name): 1.0})
     return program_of(graph, tuple(inputs), tuple(everything))
+
+
+def with_derivative_along(
+    function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
+) -> Program:
+    """Trace `function` and its exact derivative along one direction; outputs are both.
+
+    The direction is given by further inputs, d_x for each x in `by`.
+    """
+    graph = Graph()
+    names = (*inputs, *(f"d_{name}" for name in by))
+    symbols = [graph.node("input", name) for name in names]
+    outputs = tuple(function(*symbols[: len(inputs)]))
+    direction = dict(zip(map(list(inputs).index, by), symbols[len(inputs) :], strict=True))
+    slopes = _differentiate(graph, len(graph.nodes), outputs, direction)
+    return program_of(graph, names, (*outputs, *slopes))
 
 
 def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) -> Program:
@@ -374,15 +396,20 @@ def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) 
     return Program(inputs, steps, tuple(map(operand, outputs))).prune()
 
 
-def _slopes(graph: Graph, last: int, by: Expression) -> list[Value]:
-    """Differentiate each of the first `last` nodes by one input (forward mode)."""
+def _differentiate(
+    graph: Graph, last: int, outputs: Sequence[Value], direction: Mapping[int, Value]
+) -> list[Value]:
+    """Differentiate outputs among the first `last` nodes along a direction (forward mode).
+
+    It has a number or an expression for the indices of some inputs.
+    """
     slopes: list[Value] = []
     for index in range(last):
         op, args = graph.nodes[index]
         here = Expression(graph, index)
         d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-        slopes.append(float(index == by.index) if op == "input" else _chain(op, args, d, here))
-    return slopes
+        slopes.append(direction.get(index, 0.0) if op == "input" else _chain(op, args, d, here))
+    return [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
 
 
 def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -> Value:

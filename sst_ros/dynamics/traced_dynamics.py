@@ -15,6 +15,7 @@ from sst_ros.dynamics.expression import (
     compile_program,
     number_constants,
     trace,
+    with_derivative_along,
     with_jacobian,
 )
 from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
@@ -180,6 +181,17 @@ class ODE:
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
         return with_jacobian(self._of_numbers, self._inputs, ("t", *self.state))
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What the derivative depends on: the state but the work, and the time under a torque."""
+        state = self.state[:-1] if self._work else self.state
+        return state if self._torque is None else (*state, "t")
+
+    @cached_property
+    def directional(self) -> Program:
+        """The derivative, and its own along the direction d_x, .. of further inputs."""
+        return with_derivative_along(self._of_numbers, self._inputs, self.variables)
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).

@@ -227,7 +227,10 @@ def _for_numba(
     base: SharedFunctions = NOTHING_SHARED,
     cache: bool = True,
 ) -> str:
+    # A tuple would be read by a jump to one of its numbers.
+    tables = {name: value for name, value in constants.items() if isinstance(value, tuple)}
     head = _NUMBA.format(cache=cache, nogil=nogil, more=more) + _named(constants)
+    head += "".join(f"{name} = np.array({name})\n" for name in tables)
     if base.texts:
         head += f"from {base.name} import {', '.join(map(_function_name, base.texts))}\n"
     return "\n".join([head, *(f"{_decorator(text)}\n{text}" for text in texts)])

@@ -176,6 +176,16 @@ def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
         error[i] = u[STAGES - 1][i]
 
 
+def linearise(t, y, d, p, slope, by_time, matrix):
+    """Fill in the derivative and its own by time and state, each column of it in a row."""
+    found = jacobian(t, *y, *d)
+    for i in range(SIZE):
+        slope[i] = found[i]
+        by_time[i] = found[SIZE + i]
+        for j in range(SIZE):
+            matrix[i][j] = found[(j + 2) * SIZE + i]
+
+
 def factorise(a, pivot):
     """LU decomposition with partial pivoting, in place."""
     for k in range(SIZE):

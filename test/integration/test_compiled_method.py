@@ -81,7 +81,7 @@ def linearised(scene, torque, t, y, drive):
     system = system_of(scene, torque, work=True)
     machine, size = CompiledMethod(system, RODAS5P, compiled=False), len(system.state)
     slope, by_time, matrix = np.zeros(size), np.zeros(size), np.zeros((size, size))
-    machine._module.linearise(t, y, drive, (), slope, by_time, matrix)
+    machine._module.linearise(t, y, drive[: len(system.drive)], (), slope, by_time, matrix)
     return slope, by_time, matrix
 
 
@@ -171,7 +171,7 @@ def text_of(ode, *, implicit=False):
     slots = Slots()
     programs = {"rhs": ode.program, "joints": ode.joints}
     if implicit:
-        programs["jacobian"] = ode.jacobian
+        programs["directional"] = ode.directional
     return "".join(one.source(name, slots) for name, one in programs.items()), slots.values
 
 
