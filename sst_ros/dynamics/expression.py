@@ -15,12 +15,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.scene.schema import Place, Section
+from sst_ros.scene.schema import Place, Section, make_unchecked
 
 Value = Any  # an Expression, a Number or a float
 
@@ -133,6 +132,20 @@ class Expression:
     def apply(self, op: str, *args: Value) -> Value:
         """Note a function of this expression, or of `args`."""
         return self.graph.node(op, *(args or (self,)))
+
+
+class VariedNumber(Expression):
+    """A number that differs between scenarios: it counts as nonzero, so its term is present."""
+
+    __slots__ = ()
+
+    def __bool__(self) -> bool:
+        return True
+
+
+def mark_present(value: Any) -> Any:
+    """Return an expression as one that counts as not zero, so that no term of it is left out."""
+    return VariedNumber(value.graph, value.index) if isinstance(value, Expression) else value
 
 
 def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
@@ -335,7 +348,7 @@ def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
 
 
 def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -> Any:
-    """Return a tree with other numbers or columns; its sections are objects that are not checked.
+    """Return a tree with other numbers or columns; its sections are not checked.
 
     `change` gives the new number for a place and what is there.
     """
@@ -345,13 +358,13 @@ def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -
     if isinstance(tree, tuple):
         entries = parts.values()
         return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
-    return SimpleNamespace(**parts) if parts else tree
+    return make_unchecked(type(tree), parts) if parts else tree
 
 
 def _entries(tree: Any) -> list[tuple[Any, Any]]:
     if isinstance(tree, tuple):
         return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
-    return list(vars(tree).items()) if isinstance(tree, (Section, SimpleNamespace)) else []
+    return list(vars(tree).items()) if isinstance(tree, Section) else []
 
 
 def with_jacobian(

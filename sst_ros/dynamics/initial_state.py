@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
@@ -22,6 +22,12 @@ from sst_ros.scene.scene import Scene
 
 SINGULAR = 1.5e-5
 """det J2 below which rounding, over its square, leaves a rate of gamma less than six digits."""
+
+NO_ASSEMBLY, NO_RATE = -1, -2
+"""Codes of runs that cannot start: no unique admissible assembly; gamma_dot is no motion there."""
+
+_BLOCK = 2000
+"""Starts solved at once: their arrays fit the cache."""
 
 REFUSED = "the equations of the paper have no such term: use equations = quaternion"
 
@@ -47,6 +53,52 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
             raise SingularConfiguration(message, determinant)
         rate = assembly.rotation.T @ at.j @ gamma_dot
     return (*quaternion_of(assembly.rotation).tolist(), *rate.tolist())
+
+
+def initial_states(
+    geometries: Geometry, which: NDArray[np.intp], gamma: Array, gamma_dot: Array
+) -> tuple[Array, NDArray[np.int64]]:
+    """States at t = 0 of many runs, of which one that cannot start stops no other.
+
+    Args:
+        geometries: the distinct ones, or one for all.
+        which: index of the geometry of each run, shape (n,).
+        gamma: actuator angles [rad], shape (n, 3).
+        gamma_dot: their rates [rad/s], shape (n, 3).
+
+    Returns:
+        Quaternions and body rates [rad/s], shape (7, n), at rest where there is no start; and
+        codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
+
+    """
+    y, code = np.zeros((7, len(gamma))), np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
+    y[3] = 1.0
+    for first in range(0, len(gamma), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        starts = np.column_stack([which[part], gamma[part]])
+        different, same = np.unique(starts, axis=0, return_inverse=True)
+        own = geometries.of_rows(different[:, 0].astype(np.intp))
+        found = kinematics.direct_many(own, different[:, 1:])
+        valid = np.flatnonzero(found.admissible)
+        owner = found.configuration[valid]
+        one = np.zeros(len(different), dtype=np.intp)
+        one[owner] = valid
+        same = same.ravel()
+        here = np.flatnonzero(np.bincount(owner, minlength=len(different))[same] == 1)
+        rows, chosen = first + here, one[same[here]]
+        y[:4, rows] = quaternion_of(found.rotation[chosen]).T
+        moves = gamma_dot[rows].any(axis=1)
+        singular = moves & (np.abs(found.det_j2[chosen]) < SINGULAR)
+        code[rows] = np.where(singular, NO_RATE, 0)
+        moves &= ~singular
+        rows, rotation = rows[moves], found.rotation[chosen[moves]]
+        geometry = geometries.of_rows(which[rows])
+        # gamma_dot_k = g_k . W, g_k = (w_k - a t_k) / (1 - a^2), a = t_k . w_k, all in {E}
+        w = geometry.w @ rotation
+        a = np.sum(geometry.e * w, axis=-1, keepdims=True)
+        g = (w - a * geometry.e) / (1.0 - a * a)
+        y[4:7, rows] = np.linalg.solve(g, gamma_dot[rows][..., None])[..., 0].T
+    return y, code
 
 
 def accelerate_by_paper(

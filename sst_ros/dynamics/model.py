@@ -100,6 +100,7 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     """
     geometry, star, legs = geometry or Geometry.of(scene), entries_of(scene.star.inertia), []
     carried: list[Star | Payload] = [scene.star]
+    damping = damping_of(scene.stroke)
     if scene.payload is not None:
         load = scene.payload
         carried.append(load)
@@ -118,7 +119,7 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
             for part, (i, j) in zip(star, PLACES, strict=True)
         ]
         legs.append(
-            Leg(w, v, cross3(w, v), e[0], e[1], *constants, loads_of_leg(scene, geometry, k))
+            Leg(w, v, cross3(w, v), e[0], e[1], *constants, _loads(scene, geometry, k, damping))
         )
     weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
     return Model(
@@ -131,8 +132,8 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     )
 
 
-def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
-    """Collect the loads of leg k; None where it has none."""
+def _loads(scene: Scene, geometry: Geometry, k: int, damping: Any) -> LegLoads | None:
+    """Collect the loads of leg k, whose stops have this damping; None where it has none."""
     joints, springs = scene.friction, scene.springs
     friction = (joints.gamma, joints.mu, joints.beta) if joints else (None, None, None)
     by_joint = tuple(
@@ -145,7 +146,6 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
         drive, link = (multiply(body.mass, body.centre) for body in bodies)
     stops = None
     if scene.stroke.stiffness is not None:
-        damping = damping_of(scene.stroke)
         stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
     heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
     if not (any(friction) or any(by_joint) or heavy or stops):
@@ -153,8 +153,10 @@ def loads_of_leg(scene: Scene, geometry: Geometry, k: int) -> LegLoads | None:
     return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)
 
 
-def damping_of(stroke: Stroke) -> float:
+def damping_of(stroke: Stroke) -> Any:
     """Damping of elastic stops [s/rad], as given or from the restitution at the impact rate.
+
+    Its numbers may be columns.
 
     For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v into the
     stop to e v out of it, with d = c v,
@@ -168,7 +170,9 @@ def damping_of(stroke: Stroke) -> float:
     if stroke.restitution is None or stroke.impact_rate is None:
         return stroke.damping
     e = stroke.restitution
-    return 2.0 * _inverse_langevin((1.0 - e) / (1.0 + e)) / ((1.0 + e) * stroke.impact_rate)
+    many = isinstance(e, np.ndarray)
+    root = np.vectorize(_inverse_langevin) if many else _inverse_langevin
+    return 2.0 * root((1.0 - e) / (1.0 + e)) / ((1.0 + e) * stroke.impact_rate)
 
 
 def _inverse_langevin(y: float) -> float:

@@ -19,7 +19,13 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import build, find_fields, open_values, replace_values, values_of
+from sst_ros.scene.yaml_document import (
+    build,
+    build_unchecked,
+    find_fields,
+    replace_values,
+    values_of,
+)
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -97,7 +103,7 @@ def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = Fa
         for name, symbol in symbols.items()
         if not (moments and name.endswith(".mass"))
     }
-    return open_values(Scene, replace_values(values, used))
+    return build_unchecked(Scene, replace_values(values, used))
 
 
 def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: str) -> Scene:

@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, compile_for_arrays, with_jacobian
+from sst_ros.dynamics.expression import compile_for_arrays, mark_present, with_jacobian
 from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
 from sst_ros.identification.parameters import with_symbols
-from sst_ros.integration.parametric_model import VariedNumber
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -93,11 +92,6 @@ class Regressor:
         model = kernel.model_of(opened, self._geometry)
         torque, _ = kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])
         return torque
-
-
-def mark_present(symbol: Expression) -> VariedNumber:
-    """Return an expression that counts as not zero, so that no term of it is left out."""
-    return VariedNumber(symbol.graph, symbol.index)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from scipy.optimize import least_squares
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_program, with_jacobian
+from sst_ros.dynamics.expression import compile_program, mark_present, with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
@@ -42,7 +42,6 @@ from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
 from sst_ros.identification.parameters import STANDARD, value_of
-from sst_ros.identification.regressor import mark_present
 from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -274,11 +273,9 @@ class Sensitivities:
         size = len(self._state)
         names = [self.names[i] for i in self._inner]
         symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
-        damping = symbols.pop(RESTITUTION, None)
-        plant = parameters.with_symbols(self.scene, symbols)
-        if damping is not None:
-            plant.stroke.restitution, plant.stroke.damping = None, damping
-        model = kernel.model_of(plant, self._geometry)
+        if RESTITUTION in symbols:  # its number is that of the damping
+            symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
+        model = kernel.model_of(parameters.with_symbols(self.scene, symbols), self._geometry)
         return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many scenarios of one scene at once, compiled, on all cores."""
+"""Many scenarios of one scene at once, compiled, on all cores; the results as arrays.
+
+Results have the names of a `Trajectory`, with an axis of scenarios before that of components.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +10,30 @@ import copy
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.dynamics.initial_state import SINGULAR
+from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.host.output import slices
 from sst_ros.integration import codegen
-from sst_ros.integration.batch_result import NO_ASSEMBLY, NO_RATE, OUTSIDE, BatchResult, BatchStates
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.integration.parametric_model import ParametricModel, Scenarios
-from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
+from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scenarios, Scene
+from sst_ros.state import DIMENSIONS, UNITS, arrays_of, columns_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -37,9 +43,20 @@ _UNUSED = {
 FINE = 16
 """Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
 
-_BLOCK = 2000
-"""Starts solved at once: their arrays fit the cache."""
+_BLOCK = 1024
+"""States whose joints are computed at once: all numbers of the program are arrays as long."""
 
+OUTSIDE = -3
+_REASONS = {
+    0: "reached the end",
+    NO_ASSEMBLY: "no unique admissible assembly",
+    NO_RATE: "gamma_dot does not determine the body rate: singular start",
+    OUTSIDE: "initial gamma outside the stroke",
+    NOT_FINITE: "not finite",
+}
+"""How a scenario ended, by the codes that are no limit's: below zero it did not start."""
+
+_SCENARIO = ("status", "message", "fault_time", "local_error")
 
 Advance = Callable[..., None]
 """(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
@@ -56,7 +73,6 @@ class Batch:
         parameters: numbers of the scene that differ between scenarios, by their keys in the
             document, as in {"star.inertia.zz": [...], "gravity.acceleration": [[...], ...]}: a row
             a scenario. A list without an index means all of its entries.
-        progress: draw a bar on a terminal while scenarios are prepared.
 
     Attributes:
         model: the traced programs.
@@ -75,7 +91,6 @@ class Batch:
         *,
         profile: bool = False,
         parameters: Mapping[str, ArrayLike] | None = None,
-        progress: bool = False,
     ) -> None:
         if codegen.numba_version() is None:
             require("numba")
@@ -93,7 +108,7 @@ class Batch:
         self.scene, self._method = scene, method
         own = {key: copy.copy(values) for key, values in (parameters or {}).items()}
         self._scenarios = Scenarios(scene, own)
-        self._scenarios.check(progress=progress)
+        self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
 
@@ -123,6 +138,7 @@ class Batch:
         keep_every: int = 0,
         threads: int = 0,
         progress: bool = False,
+        advance: Advance | None = None,
     ) -> BatchResult:
         """Run all scenarios for `count` steps.
 
@@ -136,6 +152,7 @@ class Batch:
             keep_every: keep the states every so many steps, see `BatchResult.kept`; 0 keeps none.
             threads: how many; 0 takes all cores. No bit depends on it.
             progress: draw a bar on a terminal.
+            advance: a loop of one's own in place of the compiled one, see `Advance`.
 
         Raises:
             InputError: an argument is not allowed; names it and what is.
@@ -150,26 +167,8 @@ class Batch:
         if problems:
             raise InputError("batch", problems)
 
-        def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
-            self.advance(first, count, step, *arrays, threads=threads if rows is None else 1)
-
-        how: Any = {"step": step, "count": count, "keep_every": keep_every, "progress": progress}
-        return self.integrate(advance, gamma, gamma_dot, torque, **how)
-
-    def integrate(
-        self,
-        advance: Advance,
-        gamma: ArrayLike,
-        gamma_dot: ArrayLike,
-        torque: ArrayLike = (0.0, 0.0, 0.0),
-        *,
-        step: float,
-        count: int,
-        keep_every: int,
-        progress: bool = False,
-    ) -> BatchResult:
-        """Do what `run` does, with a loop of one's own: start, advance, locate the ends."""
-        y, code = self.start(gamma, gamma_dot, progress=progress)
+        loop = advance or partial(self.advance, threads=threads)
+        y, code = self.start(gamma, gamma_dot)
         number = y.shape[1]
         given = self.drives(torque, number)
         time, error = np.full(number, np.nan), np.zeros(number)
@@ -177,7 +176,7 @@ class Batch:
         size = keep_every or (0 if progress else max(count, 1))  # few calls: each passes all rows
         for part in slices(count, size, self.scene.name, progress):
             span = part.stop - part.start
-            advance(part.start, span, step, y, given, code, time, error, rows=None)
+            loop(part.start, span, step, y, given, code, time, error, rows=None)
             if keep_every and span == keep_every:
                 kept.append(y.copy())
                 ends.append(part.stop)
@@ -185,20 +184,16 @@ class Batch:
         # A step in which a limit was passed is left out: its beginning is the last valid state.
         steps = np.where(code > 0, whole_steps(time, step), count)
         steps[code < 0] = 0
-        _locate_ends(advance, step, steps, y, given, code, time)
+        _locate_ends(loop, step, steps, y, given, code, time)
         last = steps * step
-        commanded = self.model.ode.drive[:3] == TORQUE
-        torques = np.ascontiguousarray(given[:3].T) if commanded else np.zeros((number, 3))
-        common = self.model, self.columns, torques, code >= 0
+        common = self.model, self.columns, given[:3].T, code >= 0
         samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
         states = BatchStates(*common, samples, np.stack(kept)) if keep_every else None
         return BatchResult(
             *common, last, y, code=code, fault_time=time, local_error=error, kept=states
         )
 
-    def start(
-        self, gamma: ArrayLike, gamma_dot: ArrayLike, *, progress: bool = False
-    ) -> tuple[Array, NDArray[np.int64]]:
+    def start(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
         count, columns = self._scenarios.count, self.columns
         # One start for all is solved once.
@@ -206,46 +201,15 @@ class Batch:
         angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
         which = np.broadcast_to(columns.geometry[: len(angles)], len(angles))
+        start, code = initial_states(columns.geometries, which, angles, rates)
+        if self.scene.stroke.at_end == "stop":
+            outside = (angles < 0.0) | (angles > columns.geometries.of_rows(which).arc)
+            code[outside.any(axis=1)] = OUTSIDE
         y = np.zeros((len(self.model.ode.state), len(angles)))
-        y[3] = 1.0
-        code = np.full(len(angles), NO_ASSEMBLY, dtype=np.int64)
-        for part in slices(len(angles), _BLOCK, f"{self.scene.name}, starting", progress):
-            self._start_rows(which[part], angles[part], rates[part], y[:, part], code[part])
+        y[:7] = start
         if alike and count:
             y, code = np.repeat(y, count, axis=1), np.repeat(code, count)
         return y, code
-
-    def _start_rows(
-        self, which: NDArray[Any], gamma: Array, gamma_dot: Array, y: Array, code: NDArray[Any]
-    ) -> None:
-        """Set states, at rest in {B} as yet, and codes; what cannot start does not stop others."""
-        geometries = self.columns.geometries
-        starts = np.column_stack([which, gamma])
-        different, same = np.unique(starts, axis=0, return_inverse=True)
-        own = geometries.of_rows(different[:, 0].astype(np.intp))
-        found = kinematics.direct_many(own, different[:, 1:])
-        valid = np.flatnonzero(found.admissible)
-        owner = found.configuration[valid]
-        one = np.zeros(len(different), dtype=np.intp)
-        one[owner] = valid
-        same = same.ravel()
-        here = np.flatnonzero(np.bincount(owner, minlength=len(different))[same] == 1)
-        chosen = one[same[here]]
-        y[:4, here] = quaternion_of(found.rotation[chosen]).T
-        moving = gamma_dot[here].any(axis=1)
-        singular = moving & (np.abs(found.det_j2[chosen]) < SINGULAR)
-        code[here] = np.where(singular, NO_RATE, 0)
-        moves = moving & ~singular
-        rows = here[moves]
-        geometry = geometries.of_rows(which[rows])
-        # gamma_dot_k = g_k . W, g_k = (w_k - a t_k) / (1 - a^2), a = t_k . w_k, all in {E}
-        w = geometry.w @ found.rotation[chosen[moves]]
-        a = np.sum(geometry.e * w, axis=-1, keepdims=True)
-        g = (w - a * geometry.e) / (1.0 - a * a)
-        y[4:7, rows] = np.linalg.solve(g, gamma_dot[rows][..., None])[..., 0].T
-        if self.scene.stroke.at_end == "stop":
-            outside = (gamma < 0.0) | (gamma > geometries.of_rows(which).arc)
-            code[outside.any(axis=1)] = OUTSIDE
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""
@@ -258,16 +222,22 @@ class Batch:
         return given
 
     def advance(
-        self, first: int, count: int, step: float, *columns: NDArray[Any], threads: int = 0
+        self,
+        first: int,
+        count: int,
+        step: float,
+        *columns: NDArray[Any],
+        threads: int = 0,
+        rows: NDArray[np.intp] | None = None,
     ) -> None:
         """Advance by `count` steps from step `first`; y, given, code, time and error change.
 
         Threads take whole blocks in turn, more shares than threads; the compiled code releases the
-        interpreter's lock.
+        interpreter's lock. A few `rows` need no threads.
         """
         threads = threads or len(os.sched_getaffinity(0))
         blocks, run = -(-columns[0].shape[1] // SIMD_WIDTH), self.module.batch
-        if threads == 1:
+        if threads == 1 or rows is not None:
             run(step, first, count, 0, blocks, *columns)
             return
         size = max(1, -(-blocks // (4 * threads)))
@@ -317,3 +287,164 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
     if not np.all(np.isfinite(rows)):
         raise InputError("batch", [Problem(name, rows, "must be finite")])
     return rows
+
+
+def _of_joints(name: str, meaning: str) -> Any:
+    return property(lambda states: states._quantity(name), doc=f"{meaning}, shape (..., N, 3).")
+
+
+class BatchStates:
+    """States of N scenarios, at one time or at several. Treat the arrays as read-only.
+
+    Attributes:
+        t: times of the states [s], shape (N,) or (samples, N): those of the last valid state in a
+            scenario that has ended.
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4) or (samples, N, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3) or (samples, N, 3).
+
+    """
+
+    def __init__(
+        self,
+        model: ParametricModel,
+        columns: ParameterColumns,
+        torque: Array,  # commanded, shape (N, 3); not used under a profile
+        valid: NDArray[np.bool_],  # whether a scenario has started, shape (N,)
+        t: Array,
+        y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
+    ) -> None:
+        self._model, self._columns, self._torque, self._valid = model, columns, torque, valid
+        self._state, self.t = np.moveaxis(y, -2, -1), t
+        self._computed: dict[str, Array] = {}
+        self.quaternion: Array = self._state[..., :4]
+        self.body_rate: Array = self._state[..., 4:7]
+
+    gamma = _of_joints("gamma", "Angles of the actuators [rad], nan where there is no start")
+    mu = _of_joints("mu", "Angles between base arcs and arcs of the star [rad]")
+    beta = _of_joints("beta", "Angles from the carriages to E [rad]")
+    gamma_dot = _of_joints("gamma_dot", "Rates of gamma [rad/s]")
+    mu_dot = _of_joints("mu_dot", "Rates of mu [rad/s]")
+    beta_dot = _of_joints("beta_dot", "Rates of beta [rad/s]")
+
+    @property
+    def energy(self) -> Array:
+        """Kinetic and potential energy [J], shape (..., N)."""
+        return self._quantity("energy")[..., 0]
+
+    def _quantity(self, name: str) -> Array:
+        if name not in self._computed:
+            function, inputs = self._model.outputs[name], self._columns.inputs
+            states = np.moveaxis(self._state, -1, 0)[:7]
+            parts, count = [], self.t.shape[-1]
+            size = max(1, _BLOCK * count // max(self.t.size, 1))
+            with np.errstate(all="ignore"):
+                for first in range(0, max(count, 1), size):
+                    rows = slice(first, first + size)
+                    numbers = function(*states[..., rows], *inputs[:, rows])
+                    parts.append(np.stack(numbers, axis=-1))
+            self._computed[name] = found = np.concatenate(parts, axis=-2)
+            found[..., ~self._valid, :] = np.nan
+        return self._computed[name]
+
+    @cached_property
+    def euler_zyz(self) -> Array:
+        """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., N, 3)."""
+        return np.asarray(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+
+    @cached_property
+    def torque(self) -> Array:
+        """Torques that act at the actuators [N m], shape (..., N, 3)."""
+        if self._state.shape[-1] > 7:
+            return self._state[..., 7:10]
+        profile = self._model.constants(list(self._columns.inputs)).torque
+        if profile is None:
+            return np.broadcast_to(self._torque, self.body_rate.shape)
+        rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
+        return np.stack([a * np.sin(f * self.t + p) for a, f, p in rows], axis=-1)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Arrays with the dimension scenario, before it time if there are several; needs xarray."""
+        first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
+        arrays = arrays_of(self, *first) | {"t": (first, self.t, {"units": "s"})}
+        coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
+        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS)
+        found.attrs["scene"] = self._model.scene.name
+        return found
+
+
+class BatchResult(BatchStates):
+    """Results of N scenarios: their states at the end, or the last valid ones.
+
+    Attributes:
+        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
+            start or its numbers ceased to be finite, shape (N,).
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
+        fault_time: when a scenario passed a limit [s], the end of the step in which its numbers
+            ceased to be finite, 0 without a start, nan where it reached its end,
+            shape (N,).
+        local_error: largest local error estimate of a quaternion in a step, shape (N,).
+        kept: states every `keep_every` steps from the start on, arrays (samples, N, ...); None
+            unless asked for.
+
+    """
+
+    def __init__(
+        self,
+        *states: Any,
+        code: NDArray[np.int64],
+        fault_time: Array,
+        local_error: Array,
+        kept: BatchStates | None,
+    ) -> None:
+        super().__init__(*states)
+        self.code = code
+        self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
+        self.fault_time, self.local_error, self.kept = fault_time, local_error, kept
+
+    @cached_property
+    def message(self) -> tuple[str, ...]:
+        """How each scenario ended, N texts."""
+        texts, index = self.reasons
+        return tuple(texts[index].tolist())
+
+    @cached_property
+    def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
+        """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
+        geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
+        limited = (self.code > 0) & (self.code < NOT_FINITE)  # only these depend on the geometry
+        # One number for both: of pairs np.unique takes a tenth of the time of a sweep.
+        both = np.where(limited, geometry, 0) * 4 * NOT_FINITE + self.code
+        _, first, index = np.unique(both, return_index=True, return_inverse=True)
+        texts = []
+        for row, code in zip(first, self.code[first].tolist(), strict=True):
+            limits = self._model.limits(self._columns.geometries.of_rows(geometry[row]))
+            texts.append(_REASONS.get(code) or limits[code - 1].reason)
+        return np.array(texts, dtype=object), index
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether a scenario reached its end, shape (N,)."""
+        return np.equal(self.status, 0)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Arrays with the dimension scenario; needs the package xarray. See `kept` for times."""
+        found = super().to_xarray()
+        for name in _SCENARIO:
+            found[name] = ("scenario", np.array(getattr(self, name)))
+        found["fault_time"].attrs["units"] = "s"
+        return found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table with a row a scenario and a column a number, units in its `attrs`."""
+        columns: dict[str, Any] = {name: getattr(self, name) for name in _SCENARIO}
+        table: pd.DataFrame = require("pandas").DataFrame(columns | columns_of(self))
+        table.index.name = "scenario"
+        table.attrs = {"units": UNITS | {"fault_time": "s"}, "scene": self._model.scene.name}
+        return table
+
+    def __repr__(self) -> str:
+        name, ended = self._model.scene.name, np.count_nonzero(self.status)
+        return f"<BatchResult of {name}: {len(self)} scenarios, {ended} ended early>"

@@ -13,7 +13,6 @@ ends outside is found, and one that leaves and comes back.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 from sst_ros.dynamics.expression import Program
 from sst_ros.integration.codegen import combination
@@ -31,75 +30,8 @@ EARLIEST = 1e-8
 """Least share of a step at which a crossing is reported, so that its time lies in this step."""
 
 
-class SampledFeedback(NamedTuple):
-    """A controller that acts every `hold` steps; its torques are held until it acts again.
-
-    Outputs of the program are the three torques and the new memory; inputs the references of a
-    sample, which all scenarios share, the state, the memory, the noise, the rest of the drive with
-    the parameters, and the gains. The other fields say how many numbers of each there are.
-    """
-
-    program: Program
-    references: int
-    memory: int
-    noise: int
-    gains: int
-
-    @property
-    def rows(self) -> dict[str, int]:
-        """Rows of a block that it needs."""
-        own = {"memory": self.memory, "noise": self.noise, "gains": self.gains}
-        return own | {"command": 3 + self.memory}
-
-    def load(self, at: Layout) -> list[str]:
-        """Lines that fill its rows: a loop of its own, as one with the state compiles minutes."""
-        kinds = {"memory": self.memory, "gains": self.gains}
-        return _over_lanes(
-            [f"{at.lane(name, j)} = {name}[{j}, n]" for name, m in kinds.items() for j in range(m)]
-        )
-
-    def act(self, size: int, drive: int, at: Layout) -> list[str]:
-        """Lines that evaluate the controller at the beginning of a period."""
-        given = [
-            *(f"references[sample, {j}]" for j in range(self.references)),
-            *at.rows("y", size),
-            *at.rows("memory", self.memory),
-            *at.rows("noise", self.noise),
-            *at.rows("d", drive)[3:],
-            *at.rows("gains", self.gains),
-        ]
-        noise = [
-            f"{at.lane('noise', j)} = gaussian(seed, rows[n], {self.noise} * sample + {j})"
-            for j in range(self.noise)
-        ]
-        accepted = [f"now = {at.lane('code')}"]
-        for j, name in enumerate(at.rows("d", 3) + at.rows("memory", self.memory)):
-            accepted += _replace_valid(name, at.lane("command", j))
-        lines = [
-            "sample = step // hold",
-            *(_over_lanes(noise) if noise else ()),
-            *evaluate_lanes(self.program, given, at, "command"),
-            *loop(at, accepted),
-        ]
-        return ["if step % hold == 0:", *indent(4, lines)]
-
-    def store(self, at: Layout) -> list[str]:
-        """Lines that keep the memory and the torques of lane i."""
-        lines = [f"memory[{j}, lo + i] = {at.lane('memory', j)}" for j in range(self.memory)]
-        return lines + [f"d[{j}, lo + i] = {at.lane('d', j)}" for j in range(3)]
-
-
-def batch_source(
-    program: Program,
-    distances: Program,
-    tableau: Tableau,
-    size: int,
-    feedback: SampledFeedback | None = None,
-) -> str:
+def batch_source(program: Program, distances: Program, tableau: Tableau, size: int) -> str:
     """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
-
-    With feedback it takes more: hold, references (samples, numbers), memory (numbers, N), gains
-    (numbers, N), rows (N,) and seed; `gaussian(seed, row, counter)` gives its noise.
 
     Args:
         program: derivative; inputs t, state, drive, of which the last may be parameters.
@@ -107,7 +39,6 @@ def batch_source(
             are the state's first seven, and the parameters.
         tableau: explicit method.
         size: numbers in the state.
-        feedback: gives the first three numbers of the drive; none by default.
 
     Of RK4, ten lines without those of `evaluate_lanes` and `crossings`:
 
@@ -124,12 +55,10 @@ def batch_source(
 
     """
     drive = len(program.inputs) - 1 - size
-    more = ", hold, references, memory, gains, rows, seed" if feedback else ""
     at = Layout(
         SIMD_WIDTH, y=size, s=size, f=size, new=size, d=drive, k=size * len(tableau.b), e=4,
         was=len(distances.outputs), far=len(distances.outputs), code=1, when=1, error=1,
         hit=1, found=1, share=1,
-        **(feedback.rows if feedback else {}),
     )  # fmt: skip
     outside = at.rows("d", drive)
     given = ["time", *at.rows("s", size), *outside]
@@ -144,24 +73,15 @@ def batch_source(
     def kept(stage: int) -> str:
         return f"{at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}"
 
-    load = [
-        f"{at.lane(name, j)} = {name}[{j}, n]"
-        for name, m in (("y", size), ("d", drive))
-        for j in range(m)
-    ]
-    load += [f"{at.lane(name)} = {name}[n]" for name in ("code", "when", "error")]
+    load = load_lanes(at, y=size, d=drive)
+    load += [f"    {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")]
     limits, both = len(distances.outputs) // 2, len(distances.outputs) * SIMD_WIDTH
     lines = [
-        f"def batch(h, first, count, begin, end, y, d, code, when, error{more}):",
-        f"    block = vector({at.numbers})",
-        "    for b in range(begin, end):",
-        f"        lo = b * {SIMD_WIDTH}",
-        f"        last = min({SIMD_WIDTH}, y.shape[1] - lo) - 1",
-        *indent(8, _over_lanes(load)),
-        *indent(8, feedback.load(at) if feedback else []),
+        "def batch(h, first, count, begin, end, y, d, code, when, error):",
+        *over_blocks(at),
+        *indent(8, load),
         *indent(8, evaluate_lanes(distances, [*at.rows("y", 7), *parameters], at, "was")),
         "        for step in range(first, first + count):",
-        *indent(12, feedback.act(size, drive, at) if feedback else []),
         f"            for stage in range({len(tableau.b)}):",
         *indent(16, _by_stage(tableau, size, argument)),
         *indent(16, ["time = step * h + NODES[stage] * h"]),
@@ -178,14 +98,26 @@ def batch_source(
         f"            code[lo + i] = int({at.lane('code')})",
         f"            when[lo + i] = {at.lane('when')}",
         f"            error[lo + i] = {at.lane('error')}",
-        *indent(12, feedback.store(at) if feedback else []),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _over_lanes(lines: list[str]) -> list[str]:
-    """Put a loop over the scenarios n of a block; the last is repeated, for equal lengths."""
-    return [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)", *indent(4, lines)]
+def over_blocks(at: Layout) -> list[str]:
+    """Begin of a function of scenarios: a loop over the blocks begin to end."""
+    return [
+        f"    block = vector({at.numbers})",
+        "    for b in range(begin, end):",
+        f"        lo = b * {SIMD_WIDTH}",
+        f"        last = min({SIMD_WIDTH}, y.shape[1] - lo) - 1",
+    ]
+
+
+def load_lanes(at: Layout, **rows: int) -> list[str]:
+    """Lines that fill groups from arrays of their names; the last scenario is repeated."""
+    lines = [f"for i in range({SIMD_WIDTH}):", "    n = lo + min(i, last)"]
+    for name, count in rows.items():
+        lines += [f"    {at.lane(name, j)} = {name}[{j}, n]" for j in range(count)]
+    return lines
 
 
 def _by_stage(tableau: Tableau, size: int, line: Callable[[int], str]) -> list[str]:
@@ -245,11 +177,12 @@ def _accept(size: int, at: Layout) -> list[str]:
         inside += [f"here = abs({at.lane('e', j)})", "worst = here if here > worst else worst"]
     inside += [f"{at.lane('error')} = worst if now == 0.0 else least"]
     for j in range(size):
-        inside += _replace_valid(at.lane("y", j), at.lane("new", j))
+        inside += replace_valid(at.lane("y", j), at.lane("new", j))
     return loop(at, inside)
 
 
-def _replace_valid(place: str, new: str) -> list[str]:
+def replace_valid(place: str, new: str) -> list[str]:
+    """Lines that put a new number into its place where its scenario runs on, at code `now` = 0."""
     return [f"old = {place}", f"new = {new}", f"{place} = new if now == 0.0 else old"]
 
 

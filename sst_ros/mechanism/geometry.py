@@ -8,12 +8,15 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.state import Array
 
 __all__ = ["Array", "Geometry", "frozen"]
+
+_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+"""What a geometry is made from."""
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:
@@ -74,6 +77,26 @@ class Geometry:
         arrays = (directions, normals / sines[..., None], e, angles, np.arctan2(sines, cosines))
         frozen(*arrays)
         return cls(*arrays, most)
+
+    @classmethod
+    def of_scenarios(cls, scenarios: Scenarios) -> tuple[Geometry, NDArray[np.intp]]:
+        """Derive the distinct geometries of scenarios, and the index of that of each row."""
+        scene, count, rows = scenarios.document, scenarios.count or 1, scenarios.rows
+        varied = [rows[key].reshape(count, -1) for key in _KEYS if key in rows]
+        if not varied:
+            return cls.of(scene), np.zeros(count, dtype=np.intp)
+        _, first, index = np.unique(
+            np.hstack(varied), axis=0, return_index=True, return_inverse=True
+        )
+        nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
+        v, alpha, beta = (
+            rows[key][first] if key in rows else np.repeat([value], len(first), axis=0)
+            for key, value in zip(_KEYS, nominal, strict=True)
+        )
+        found = cls.build(v, np.radians(alpha), np.radians(beta))
+        if len(first) == 1:  # one for all rows: its numbers are no columns
+            found = cls.build(found.v[0], found.alpha[0], found.beta_max[0])
+        return found, index.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
         """Return the geometries of rows, or of a row; this one where it is a single one."""

@@ -196,7 +196,7 @@ class Star(Link):
                 "alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}"
             ),
         )
-        yield from Link.rules(self)  # `self` may be an object of columns
+        yield from super().rules()
 
 
 @dataclass(frozen=True)

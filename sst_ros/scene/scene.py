@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is simulated, as one document: bodies, terms, the start, and where each value is from."""
+"""What is simulated, as one document: bodies, terms, the start, and where each value is from.
+
+`Scenarios` are many of it, whose numbers differ: a row of each array makes a scene, which meets all
+requirements of a document. What has no effect in a row is left out of it, as documents demand: a
+friction whose coefficients are zero there, the gear of a rotor without inertia.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.bodies import Base, Link, Payload, Star
@@ -27,17 +32,30 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.schema import (
+    Place,
     Rules,
     Section,
+    Spec,
     has_key,
+    key_of,
     notes,
     number,
-    numbers_of,
     section,
     sections,
+    sections_of,
+    specs,
     text,
 )
-from sst_ros.scene.yaml_document import build, plain, read, replace_values, values_of
+from sst_ros.scene.yaml_document import (
+    NO_NUMBER,
+    build,
+    build_unchecked,
+    find_fields,
+    plain,
+    read,
+    replace_values,
+    values_of,
+)
 
 Matrix = NDArray[np.float64]
 
@@ -131,13 +149,11 @@ class Scene(Section):
 
     def check(self) -> Iterator[Problem]:
         """Refuse what contradicts itself across sections, and numbers of another unit."""
-        for key, value, spec in numbers_of(self):
-            if abs(value) > LARGEST:
-                allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
-                yield Problem(key, value, allowed)
-            elif spec.above == 0.0 and value < SMALLEST:
-                allowed = f"must be at least {SMALLEST:g}: use m, kg, s, rad, N"
-                yield Problem(key, value, allowed)
+        for place, part in sections_of(self):
+            for name, spec in specs(type(part)).items():
+                value = getattr(part, name)
+                if spec.kind == "number" and value is not None:
+                    yield from _find_slips(key_of((*place, name)), np.ravel(value), spec)
         yield from super().check()
         for key, note in self.provenance:
             if not has_key(type(self), key):
@@ -163,6 +179,17 @@ class Scene(Section):
 
 def _far(key: str, centre: object, reach: float) -> Problem:
     return Problem(key, centre, f"must lie within {reach:g} m of O")
+
+
+def _find_slips(key: str, values: Matrix, spec: Spec) -> Iterator[Problem]:
+    """Yield the numbers that are so large or small that they must have another unit."""
+    for value in values.tolist():
+        if abs(value) > LARGEST:
+            allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
+            yield Problem(key, value, allowed)
+        elif spec.above == 0.0 and value < SMALLEST:
+            allowed = f"must be at least {SMALLEST:g}: use m, kg, s, rad, N"
+            yield Problem(key, value, allowed)
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
@@ -252,3 +279,115 @@ def share_directory() -> Path:
             if (candidate / "config" / "scenes").is_dir():
                 return candidate
     raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
+
+
+class Scenarios:
+    """Scenarios of a scene by row.
+
+    Args:
+        scene: the document.
+        parameters: numbers by their keys in the document, as in "star.mass", "springs[0].rest" or
+            "gravity.acceleration": first the row, then what one scene has, so shape (N,), (N, 3) or
+            (N, 3, 3). A list without an index means all of its entries.
+
+    Attributes:
+        document: the scene.
+        rows: the arrays by key.
+        count: number of rows N; None where nothing varies.
+
+    Raises:
+        InputError: a key names no number of the scene, or an array has another shape.
+
+    """
+
+    def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
+        self.document, self._values = scene, values_of(scene)
+        self.count: int | None = None
+        self.rows: dict[str, Matrix] = {}
+        self._specs: dict[str, Spec] = {}
+        problems, taken = [], set[Place]()
+        for key, value in parameters.items():
+            try:
+                for place, _, spec in find_fields(scene, key):
+                    if spec.kind != "number":
+                        raise ValueError(NO_NUMBER)
+                    if place in taken:
+                        raise ValueError("is given twice")
+                    taken.add(place)
+                self._specs[key] = spec
+                self.rows[key] = rows = _rows(value, spec, self.count)
+                self.count = len(rows)
+            except ValueError as error:
+                problems.append(Problem(key, value, str(error)))
+        if problems:
+            raise InputError(scene.name, problems)
+
+    def scene(self, row: int) -> Scene:
+        """Build the scene of a row.
+
+        Raises:
+            InputError: the numbers of this row make no scene; names each and what is allowed.
+
+        """
+        values = {key: rows[row].tolist() for key, rows in self.rows.items()}
+        try:
+            return build(Scene, replace_values(self._values, values), "", of_row=True)
+        except InputError as error:
+            faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
+            raise InputError(self.document.name, faults) from None
+
+    def columns(self) -> Any:
+        """Return the scene, unchecked, with columns (N,) for the numbers that vary."""
+        columns = {key: _columns(rows) for key, rows in self.rows.items()}
+        return build_unchecked(Scene, replace_values(self._values, columns))
+
+    def faults(self, most: int = 10) -> dict[int, InputError]:
+        """Rows that make no scene, and why; no more than `most` rows are looked for."""
+        faults: dict[int, InputError] = {}
+        for row in np.flatnonzero(self._doubtful()).tolist():
+            try:
+                self.scene(row)
+            except InputError as error:
+                faults[row] = error
+            if len(faults) == most:
+                break
+        return faults
+
+    def _doubtful(self) -> NDArray[np.bool_]:
+        """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
+        doubtful: Any = np.zeros(self.count or 0, dtype=bool)
+        for key, values in self.rows.items():
+            spec, flat = self._specs[key], values.reshape(len(values), -1)
+            least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
+            most = min(spec.most, LARGEST)
+            if not (flat.min() >= least and flat.max() <= most):  # a nan is neither
+                doubtful = doubtful | ~np.all((flat >= least) & (flat <= most), axis=1)
+        with np.errstate(all="ignore"):
+            for _, part in sections_of(self.columns()):
+                for broken, _ in part.rules():
+                    doubtful = doubtful | broken
+        return np.asarray(doubtful)
+
+    def check(self) -> None:
+        """Raise InputError with the first ten problems if rows make no scene."""
+        if problems := [one for error in self.faults().values() for one in error.problems]:
+            raise InputError(self.document.name, problems[:10])
+
+
+def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Matrix:
+    words = ", ".join(map(str, (count or "N", *spec.shape))) + ("" if spec.shape else ",")
+    try:
+        rows = np.asarray(value, dtype=float)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
+    number = count or max(1, len(np.atleast_1d(rows)))
+    if rows.shape != (number, *spec.shape):
+        raise ValueError(f"must have the shape ({words}), a row a scenario; it has {rows.shape}")
+    return rows
+
+
+def _columns(values: Matrix) -> Any:
+    """Contiguous columns (N,) of an array (N, ...), nested tuples where it has more dimensions."""
+    if values.ndim == 1:
+        return values
+    return tuple(_columns(np.ascontiguousarray(values[:, i])) for i in range(values.shape[1]))

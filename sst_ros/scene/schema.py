@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, TypeAlias
@@ -174,7 +174,7 @@ class Section:
     def rules(self) -> Rules:
         """Yield the rules that numbers of several fields must keep.
 
-        They also hold for an object of columns in place of `self`: what is broken is then an array.
+        They also hold for columns in place of numbers: what is broken is then an array.
         """
         return iter(())
 
@@ -184,17 +184,23 @@ def specs(cls: type[Section]) -> dict[str, Spec]:
     return {field.name: field.metadata["spec"] for field in dataclasses.fields(cls)}
 
 
-def numbers_of(tree: Section, place: Place = ()) -> Iterator[tuple[str, float, Spec]]:
-    """Yield each number of a section with the key of its field, and what the field allows."""
-    for name, spec in specs(type(tree)).items():
-        value, here = getattr(tree, name), (*place, name)
+def make_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
+    """Return a section with any values, as columns or symbols, which are not checked."""
+    found = object.__new__(cls)
+    vars(found).update(values)
+    return found
+
+
+def sections_of(tree: Section, place: Place = ()) -> Iterator[tuple[Place, Section]]:
+    """Yield a section and all below it, each with its place."""
+    yield place, tree
+    for name in specs(type(tree)):
+        value = getattr(tree, name)
         if isinstance(value, Section):
-            yield from numbers_of(value, here)
-        elif spec.kind == "sections":
-            for index, entry in enumerate(value):
-                yield from numbers_of(entry, (*here, index))
-        elif spec.kind == "number" and value is not None:
-            yield from ((key_of(here), float(x), spec) for x in np.ravel(value))
+            yield from sections_of(value, (*place, name))
+        for index, entry in enumerate(value if isinstance(value, tuple) else ()):
+            if isinstance(entry, Section):
+                yield from sections_of(entry, (*place, name, index))
 
 
 def has_key(cls: type[Section], key: str) -> bool:

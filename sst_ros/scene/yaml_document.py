@@ -11,14 +11,13 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping
-from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.schema import Place, Section, Spec, accept, frozen_text, specs
+from sst_ros.scene.schema import Place, Section, Spec, accept, frozen_text, make_unchecked, specs
 
 S = TypeVar("S", bound=Section)
 
@@ -202,39 +201,23 @@ def _set(section: dict[str, Any], words: list[tuple[str, int | None]], value: An
         section.update({name: value})
 
 
-def open_values(cls: type[Section], values: Mapping[str, Any]) -> Any:
-    """Return an object like a section with any values, which are not checked.
+def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
+    """Build a section from nested dicts and lists of any values, which are not checked.
 
     A number that a section must have and these values have not is zero.
     """
+
+    def build_value(inner: type[Section] | None, value: Any) -> Any:
+        if isinstance(value, list):
+            return tuple(build_value(inner, entry) for entry in value)
+        return build_unchecked(inner, value) if inner and isinstance(value, dict) else value
+
     found = {}
     for field in dataclasses.fields(cls):
-        inner = field.metadata["spec"].section
-        value = values.get(field.name, field.default)
-        if isinstance(value, list):
-            value = tuple(open_values(inner, one) if inner else _freeze(one) for one in value)
-        elif isinstance(value, dict) and inner:
-            value = open_values(inner, value)
-        found[field.name] = 0.0 if value is dataclasses.MISSING else value
-    return SimpleNamespace(**found)
-
-
-def _freeze(value: Any) -> Any:
-    return tuple(map(_freeze, value)) if isinstance(value, list) else value
-
-
-def broken_rows(cls: type[Section], columns: Any) -> Any:
-    """Return whether rules across fields are broken, for an object of columns row by row."""
-    broken: Any = False
-    for name, spec in specs(cls).items():
-        value = getattr(columns, name)
-        for part in value if isinstance(value, tuple) else [value]:
-            if spec.section is not None and isinstance(part, SimpleNamespace):
-                broken = broken | broken_rows(spec.section, part)
-    with np.errstate(all="ignore"):
-        for wrong, _ in cls.rules(columns):
-            broken = broken | wrong
-    return broken
+        default = 0.0 if field.default is dataclasses.MISSING else field.default
+        value = values.get(field.name, default)
+        found[field.name] = build_value(field.metadata["spec"].section, value)
+    return make_unchecked(cls, found)
 
 
 def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: bool = False) -> S:

@@ -51,18 +51,19 @@ def connect(address: str) -> Any:
         raise InputError("sweep", [Problem("--scheduler", address, allowed)]) from None
 
 
-def send_code(client: Any, module: Any) -> None:
+def send_code(client: Any, modules: Sequence[Any]) -> None:
     """Send compiled code to each worker once, also to those that join later.
 
     A file's name is the digest of its source and of all versions, so a worker of another kind
     finds none of its own and compiles.
     """
     plugin = require("distributed").WorkerPlugin
-    path = Path(getattr(module, "__file__", None) or "")
-    files = {}
-    if path.parent == cache_folder():
-        for file in (path, *(path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]")):
-            files[str(file.relative_to(path.parent))] = file.read_bytes()
+    folder, files = cache_folder(), {}
+    paths = [Path(getattr(module, "__file__", None) or "") for module in modules]
+    for path in paths:
+        if path.parent == folder:
+            for file in (path, *(folder / "__pycache__").glob(f"{path.stem}.*.nb[ic]")):
+                files[str(file.relative_to(folder))] = file.read_bytes()
 
     class SentCode(plugin):  # type: ignore[misc,valid-type]
         """Writes the files where they are missing."""
@@ -70,7 +71,7 @@ def send_code(client: Any, module: Any) -> None:
         def setup(self, worker: Any) -> None:
             store(files)
 
-    client.register_plugin(SentCode(), name=f"sst_ros-{path.stem}")
+    client.register_plugin(SentCode(), name="-".join(["sst_ros", *(path.stem for path in paths)]))
 
 
 def run_on_cluster(

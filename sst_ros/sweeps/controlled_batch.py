@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A batch under feedback: the control law, compiled into the loop, acts once a period.
+"""A batch under feedback: the control law, compiled for all scenarios, acts once a period.
 
 At a sample the law and its channel are a function of the state of the plant and of a memory: the
 integral, the queue of delayed commands, the last encoder angles, the observed orientation, and sums
@@ -31,13 +31,12 @@ from sst_ros.control.law import (
 )
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, trace
+from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import codegen
-from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import BatchResult
-from sst_ros.integration.batch_source import SIMD_WIDTH, SampledFeedback, batch_source
-from sst_ros.integration.methods import DOP853
+from sst_ros.integration.batch import Batch, BatchResult
+from sst_ros.integration.batch_source import SIMD_WIDTH, load_lanes, over_blocks, replace_valid
+from sst_ros.integration.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
@@ -77,8 +76,8 @@ GAINS = {"kp": 3, "kd": 3, "inertia": 3, "rate": 1, "limit": 1, "plant_limit": 1
 """Sizes of what may differ between scenarios; `rate` is that of the integral."""
 
 _NOISE = 6
-_NEVER = 2**62
-"""Steps from one sample to the next while torques are held."""
+_BLOCKS = 32
+"""Blocks of scenarios that are advanced from sample to sample together: they fit the cache."""
 
 Group = dict[str, Any]
 """Tuples of numbers by name."""
@@ -88,6 +87,67 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> Group:
     """Divide numbers into groups of the sizes given."""
     rest = iter(numbers)
     return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
+
+
+def control_source(program: Program, sizes: Mapping[str, int]) -> str:
+    """Text of `control(sample, begin, end, y, d, code, memory, references, gains, rows, seed)`.
+
+    At a sample it gives scenarios whose code is 0, in the blocks begin to end, the torques in
+    d (numbers, N) and the new memory (numbers, N). All share the references (samples, numbers);
+    `gaussian(seed, row, counter)` gives the noise of each.
+
+    Args:
+        program: outputs are three torques and the new memory.
+        sizes: how many inputs it has: references, state y, memory, noise, the rest of d behind the
+            torques, gains.
+
+    Ten lines of it:
+
+        def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):
+            block = vector(2976)
+            for b in range(begin, end):
+                lo = b * 32
+                for i in range(32):
+                    n = lo + min(i, last)
+                    block[0 + i] = y[0, n]
+                u0 = references[sample, 0]
+                for i in range(last + 1):
+                    d[0, lo + i] = block[704 + i]
+
+    """
+    state, memory, noise, drive = sizes["y"], sizes["memory"], sizes["noise"], 3 + sizes["rest"]
+    at = Layout(
+        SIMD_WIDTH, y=state, memory=memory, noise=noise, d=drive, gains=sizes["gains"],
+        command=3 + memory, code=1,
+    )  # fmt: skip
+    given = [
+        *(f"references[sample, {j}]" for j in range(sizes["references"])),
+        *at.rows("y", state),
+        *at.rows("memory", memory),
+        *at.rows("noise", noise),
+        *at.rows("d", drive)[3:],
+        *at.rows("gains", sizes["gains"]),
+    ]
+    drawn = [
+        f"    {at.lane('noise', j)} = gaussian(seed, rows[n], {noise} * sample + {j})"
+        for j in range(noise)
+    ]
+    places = at.rows("d", 3) + at.rows("memory", memory)
+    names = [f"d[{j}, lo + i]" for j in range(3)] + [f"memory[{j}, lo + i]" for j in range(memory)]
+    accepted = [f"now = {at.lane('code')}"]
+    for j, place in enumerate(places):
+        accepted += replace_valid(place, at.lane("command", j))
+    lines = [
+        *load_lanes(at, y=state, d=drive, memory=memory, gains=sizes["gains"]),
+        f"    {at.lane('code')} = code[n]",
+        *(load_lanes(at) + drawn if drawn else ()),
+        *evaluate_lanes(program, given, at, "command"),
+        *loop(at, accepted),
+        "for i in range(last + 1):",
+        *(f"    {name} = {place}" for name, place in zip(names, places, strict=True)),
+    ]
+    head = "def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):"
+    return "\n".join([head, *over_blocks(at), *indent(8, lines)]) + "\n"
 
 
 class ControlledBatch:
@@ -140,12 +200,27 @@ class ControlledBatch:
 
     @cached_property
     def module(self) -> ModuleType:
-        """The compiled loop."""
-        model = self._batch.model
-        text = batch_source(
-            model.program, model.limit_distances, DOP853, len(model.ode.state), self._feedback
-        )
-        return codegen.load([*NOISE, text], {"NODES": DOP853.c}, numba=True, nogil=True)
+        """The compiled function `control`, see `control_source`."""
+        state, drive = len(self._batch.model.ode.state), len(self._batch.model.ode.drive)
+        sizes = {
+            "references": sum(REFERENCES.values()),
+            "y": state,
+            "memory": sum(self._memory_sizes.values()),
+            "noise": self._noise,
+            "rest": drive - 3 + len(self._batch.model.names),
+            "gains": sum(GAINS.values()),
+        }
+
+        def command(*inputs: Expression) -> tuple[Any, ...]:
+            of = divide(sizes, inputs)
+            model = self._batch.model.constants(of["rest"][drive - 3 :]).model
+            given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
+            memory = divide(self._memory_sizes, of["memory"])
+            return self._command(kernel.joints(model, of["y"]), given, memory, gains, of["noise"])
+
+        program = trace(command, [f"i{j}" for j in range(sum(sizes.values()))])
+        texts = [*NOISE, control_source(program, sizes)]
+        return codegen.load(texts, {}, numba=True, nogil=True)
 
     def run(
         self,
@@ -177,18 +252,21 @@ class ControlledBatch:
         gains = self._make_gains(batch, given, count)
 
         def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
-            own: list[Any] = [memory, gains, drawn_for]
-            held, begin = hold, first
-            if rows is not None:  # torques are held while a step is repeated, whenever it was
-                own = [np.ascontiguousarray(array[..., rows]) for array in own]
-                held, begin = _NEVER, 1
-            blocks = -(-arrays[0].shape[1] // SIMD_WIDTH)
-            more = held, self._references, *own, self._seed
-            self.module.batch(step, begin, count, 0, blocks, *arrays, *more)
-            if rows is not None:
-                arrays[3][:] += (first - begin) * step
+            if rows is not None:  # torques are held while a step is repeated
+                batch.advance(first, count, step, *arrays, threads=1)
+                return
+            blocks, end = -(-arrays[0].shape[1] // SIMD_WIDTH), first + count
+            own = *arrays[:3], memory, self._references, gains, drawn_for, self._seed
+            for begin in range(0, blocks, _BLOCKS):
+                part, now = (begin, min(begin + _BLOCKS, blocks)), first
+                while now < end:
+                    if now % hold == 0:
+                        self.module.control(now // hold, *part, *own)
+                    span = min(hold - now % hold, end - now)
+                    batch.module.batch(step, now, span, *part, *arrays)
+                    now += span
 
-        result = batch.integrate(advance, gamma, rate, step=step, count=steps, keep_every=kept)
+        result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
         return result, self._tracking(result, memory)
 
     def _tracking(self, result: BatchResult, memory: Array) -> dict[str, Array]:
@@ -218,34 +296,6 @@ class ControlledBatch:
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
-
-    @cached_property
-    def _feedback(self) -> SampledFeedback:
-        model = self._batch.model
-        drive, state = model.ode.drive[3:], model.ode.state
-        sizes = {
-            "references": sum(REFERENCES.values()),
-            "state": len(state),
-            "memory": sum(self._memory_sizes.values()),
-            "noise": self._noise,
-            "parameters": len(drive) + len(model.names),
-            "gains": sum(GAINS.values()),
-        }
-
-        def command(*inputs: Expression) -> tuple[Any, ...]:
-            given = divide(sizes, inputs)
-            constants = model.constants(given["parameters"][len(drive) :])
-            return self._command(
-                kernel.joints(constants.model, given["state"]),
-                divide(REFERENCES, given["references"]),
-                divide(self._memory_sizes, given["memory"]),
-                divide(GAINS, given["gains"]),
-                given["noise"],
-            )
-
-        names = [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
-        kept = (sizes[name] for name in ("references", "memory", "noise", "gains"))
-        return SampledFeedback(trace(command, names), *kept)
 
     def _command(
         self, joints: Any, given: Group, memory: Group, gains: Group, noise: Sequence[Any]

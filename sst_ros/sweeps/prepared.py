@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import BatchResult, BatchStates
-from sst_ros.integration.parametric_model import OUTPUTS as COMPUTED
-from sst_ros.integration.parametric_model import Scenarios
+from sst_ros.integration.batch import Batch, BatchResult, BatchStates
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.scene import Scenarios
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints, columns_of
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
@@ -68,7 +66,7 @@ class PreparedSweep:
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
-        self.module = (self.controlled or self.batch).module
+        self.modules = [one.module for one in (self.batch, self.controlled) if one is not None]
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()
 
@@ -150,7 +148,6 @@ class PreparedSweep:
             "fault_time": result.fault_time,
             "local_error": result.local_error,
         }
-        result.compute(*(name for name in COMPUTED if name in self.study.outputs))
         columns |= columns_of(result, self._quantities) | more
         distinct_texts, reason = result.reasons
         texts = distinct_texts.tolist()

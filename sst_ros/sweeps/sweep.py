@@ -133,7 +133,7 @@ def run_study(
     else:
         from sst_ros.sweeps.cluster_engine import run_on_cluster, send_code
 
-        send_code(client, ready.module)
+        send_code(client, ready.modules)
         run_on_cluster(client, task, missing, done)
 
     def read(kind: str) -> pd.DataFrame:

@@ -9,15 +9,14 @@ from loaded_scenes import IGNORE, REST, loaded
 
 from sst_ros import load_scene
 from sst_ros.dynamics.expression import compile_program
+from sst_ros.dynamics.initial_state import NO_RATE
 from sst_ros.errors import InputError
 from sst_ros.integration import batch_source
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_result import NO_RATE
 from sst_ros.integration.methods import RK4
-from sst_ros.integration.parametric_model import Scenarios
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Actuators
+from sst_ros.scene.scene import Actuators, Scenarios
 from sst_ros.scene.yaml_document import find_fields
 
 pytest.importorskip("numba", reason="a batch needs numba")

@@ -61,10 +61,10 @@ def test_each_torque_is_that_of_the_python_controller(request, case, by):
     torques, compiled = [], ready.controlled.module
 
     def one_period(*arguments):
-        compiled.batch(*arguments)
-        torques.append(arguments[6][:3].copy())
+        compiled.control(*arguments)
+        torques.append(arguments[4][:3].copy())
 
-    ready.controlled.__dict__["module"] = SimpleNamespace(batch=one_period)
+    ready.controlled.__dict__["module"] = SimpleNamespace(control=one_period)
     rows = np.arange(5, 8)
     scenarios, starts, _ = ready.scenarios(study.sampler.rows(0, 3))
     start = study.motion.at(0.0)
