@@ -165,25 +165,9 @@ def accuracy_text(study: WorkPrecision) -> str:
     shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
     grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
     return render(
-        "accuracy.txt", study=study, facts=facts(study), grid=grid, below=sum(below),
+        "accuracy.txt", study=study, grid=grid, below=sum(below),
         fastest=fastest(study), provenance=provenance(),
     )  # fmt: skip
-
-
-def facts(study: WorkPrecision) -> Iterator[str]:
-    """Yield reference, formulation and advice, a sentence each."""
-    own = study.reference.own
-    yield (
-        f"Reference: {study.reference.how}. Its own error: {own.orientation:.1e} rad, gamma "
-        f"{own.gamma:.1e} rad, gamma_dot {own.gamma_dot:.1e} rad/s."
-    )
-    if study.formulation is not None:
-        yield (
-            "Kernel against the paper's equations, along the reference: "
-            f"{study.formulation:.1e} of the largest acceleration."
-        )
-    measured = f" Measured: {study.measured[0]:.1e} rad." if study.measured else ""
-    yield f"Advice: {study.advice.text}.{measured}"
 
 
 def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
@@ -201,7 +185,6 @@ def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, An
         summary=markdown(data_frame(rows)),
         terms=markdown(costs) if terms else "",
         fastest=fastest,
-        facts=facts,
         provenance=provenance(),
     )
 

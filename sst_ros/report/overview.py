@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,7 +32,10 @@ from sst_ros.plot.style import (
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.results import made_line
-from sst_ros.report.timing import Timing
+from sst_ros.report.timing import REPORTED, Timing
+
+if TYPE_CHECKING:
+    from pandas import Series
 
 NOT_RECORDED = "not recorded"
 
@@ -59,17 +62,14 @@ def _draw_comparison(
     axes: Axes, seconds: Array, comparison: Comparison, *, legend: bool = True
 ) -> None:
     """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
-    error, own = comparison.error, comparison.own
-    times, floor = few(seconds, np.fmax.reduce([own.gamma, own.gamma_dot, own.orientation]))
+    times, floor = few(seconds, comparison.own.max(axis=1).to_numpy())
     band: Looks = {"color": GREY, "alpha": 0.3, "linewidth": 0.0, "label": "error of the reference"}
     axes.fill_between(times, SMALLEST_SHOWN, np.fmax(floor, SMALLEST_SHOWN), **band)
     names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
-    curves = (error.gamma, error.gamma_dot, error.orientation)
-    for values, name, style in zip(curves, names, LINES, strict=False):
+    for values, name, style in zip(comparison.error.to_numpy().T, names, LINES, strict=False):
         axes.plot(*few(seconds, hide_zeros(values)), label=name, **style)
-    axes.set_yscale("log")
+    axes.set(yscale="log", ylabel="largest difference")
     axes.set_ylim(bottom=SMALLEST_SHOWN)
-    axes.set_ylabel("largest difference")
     if legend and comparison.compared:
         axes.legend(fontsize=8, ncol=2, loc="lower right")
 
@@ -139,12 +139,11 @@ def _draw_losses(axes: Axes, losses: Mapping[str, tuple[Array, Array] | None], e
         if loss is None:
             axes.plot([], [], " ", label=f"{name}: not recorded")
             continue
-        times, counts = few(*loss) if len(loss[0]) else loss
-        last = float(counts[-1]) if len(counts) else 0.0
-        most = max(most, last)
-        steps = np.concatenate([[0.0], counts, [last]])
-        label = f"{name}: {last:.0f}"
-        axes.step(np.concatenate([[0.0], times, [end]]), steps, where="post", label=label, **style)
+        times, counts = (np.append(0.0, numbers) for numbers in loss)
+        times, counts = np.append(times, end), np.append(counts, counts[-1])
+        label = f"{name}: {counts[-1]:.0f}"
+        axes.step(*few(times, counts), where="post", label=label, **style)
+        most = max(most, counts[-1])
     axes.set_ylim(0.0, max(1.0, 1.6 * most))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(fontsize=8, loc="upper left")
@@ -177,7 +176,7 @@ def draw_overview(
 
 
 def _panels(run: Recording, integration: Comparison, timing: Timing) -> Iterator[Panel]:
-    seconds, latency, effort = run.seconds, timing.latency, run.effort_difference
+    seconds, effort, reported = run.seconds, run.effort_difference, timing.reported
     losses: dict[str, tuple[Array, Array] | None] = {
         name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
         for name, times in {
@@ -185,47 +184,51 @@ def _panels(run: Recording, integration: Comparison, timing: Timing) -> Iterator
             "gaps between applied torques": timing.gaps_s,
         }.items()
     }
-    at, missed, ticks, step_us, *estimates = timing.reported.T
-    known, timed = np.isfinite(missed), step_us > 0.0
-    losses["ticks missed"] = (at[known], missed[known]) if known.any() else None
-    used = 1e-6 * ticks * step_us
+    missed = reported.dropna(subset="ticks_missed")
+    counted = (missed.time_s.to_numpy(), missed.ticks_missed.to_numpy())
+    losses["ticks missed"] = counted if len(missed) else None
+    used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
     # Reports come once a second: between them, and from the start, the steps cost the same.
-    unknown = np.full(len(seconds), np.nan)
-    at_samples = np.interp(seconds, [0.0, *at], [0.0, *used]) if len(at) else unknown
-    found = np.fmax.accumulate(integration.error.orientation)
-    errors = [(at_samples, found), *((used, estimate) for estimate in estimates)]
+    at_samples = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
+    found = np.fmax.accumulate(integration.error.orientation.to_numpy())
+    errors = [(at_samples if len(used) else np.full(len(seconds), np.nan), found)]
+    errors += [(used, reported[name].to_numpy()) for name in REPORTED[3:]]
     drawn = any((np.isfinite(hide_zeros(y)) & np.isfinite(x)).any() for x, y in errors)
     dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
 
-    def curve(title: str, label: str, x: Array, y: Array, reason: str = "", **looks: Any) -> Panel:
+    def curve(
+        title: str, label: str, values: Series[float], reason: str = "", **looks: Any
+    ) -> Panel:
+        x, y = values.index.to_numpy(), values.to_numpy()
         draw = partial(_draw_curve, seconds=x, values=y, label=label, **looks)
         return Panel(title, draw, reason or _missing(y))
 
+    samples, commands = (table.set_index("time_s") for table in (timing.samples, timing.commands))
     yield Panel(
         "Integration error, against the same torques",
         partial(_draw_comparison, seconds=seconds, comparison=integration),
         "" if integration.compared else "nothing could be compared",
     )
-    yield curve("Energy residual", "energy residual [J]", seconds, timing.energy)
+    yield curve("Energy residual", "energy residual [J]", samples.energy_J)
     looks: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
-    pace = "Real-time factor (recorder clock)"
-    yield curve(pace, "real-time factor", timing.pace_s, timing.pace, **looks)
+    yield curve("Real-time factor (recorder clock)", "real-time factor", timing.pace, **looks)
     periods = partial(_draw_periods, period_us=timing.period_us, nominal_us=timing.nominal_us)
     missing = _missing(timing.period_us)
     yield Panel("Period between received samples", periods, missing, over_time=False)
     yield Panel("Cumulative losses", partial(_draw_losses, losses=losses, end=seconds[-1]))
     title = "Latency: reception of a command to the step that applies it"
-    yield curve(title, "latency [µs]", latency.time_s, latency.received_us, **dots)
-    late = "delay, less the shortest [ms]"
-    yield curve("Delay of samples", late, seconds, timing.late_us / 1e3)
+    yield curve(title, "latency [µs]", commands.received_us, **dots)
+    yield curve("Delay of samples", "delay, less the shortest [ms]", samples.late_us / 1e3)
+    samples["effort"] = effort
     title = "Effort of joint_states against applied torque"
     same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
-    yield curve(title, "largest difference [N m]", seconds, effort, same)
+    yield curve(title, "largest difference [N m]", samples.effort, same)
     yield Panel(
         "Error against computing time used, over the run",
-        partial(_draw_used, estimates=dict(zip(ESTIMATES, errors, strict=True)), reports=len(at)),
+        partial(_draw_used, estimates=dict(zip(ESTIMATES, errors, strict=True)), reports=len(used)),
         "" if drawn else NOT_RECORDED,
         over_time=False,
     )
     title = "Computing time of a step, mean since the start"
-    yield curve(title, "time [µs]", at[timed], step_us[timed], marker="o")
+    timed = reported[reported.step_mean_us > 0.0].set_index("time_s").step_mean_us
+    yield curve(title, "time [µs]", timed, marker="o")

@@ -11,12 +11,13 @@ topic must be recorded; without it there is nothing to compare with.
 
 from __future__ import annotations
 
-import itertools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sst_ros.host.output import slices
+from sst_ros.extras import require
+from sst_ros.host.output import Bar
 from sst_ros.integration.propagator import LONGEST_TICK_NS, TickPropagator, TickSequence
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -26,28 +27,20 @@ from sst_ros.report import states
 from sst_ros.report.states import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 from sst_ros.state import NANOSECONDS
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
-class Deviation(NamedTuple):
-    """Distance between two motions at each sample, shape (n,); nan where there is none.
-
-    Attributes:
-        gamma: largest difference of the actuator angles [rad].
-        gamma_dot: largest difference of the actuator rates [rad/s].
-        orientation: angle of the rotation between the orientations of {E} [rad].
-
-    """
-
-    gamma: Array
-    gamma_dot: Array
-    orientation: Array
+QUANTITIES = ("gamma", "gamma_dot", "orientation")
 
 
 class Comparison(NamedTuple):
     """A recording against a reference.
 
     Attributes:
-        error: recording against reference.
-        own: the reference's own error.
+        error: distance of the recording from the reference, a row a sample, nan where there is
+            none: gamma and gamma_dot, the largest difference of the actuator angles [rad] and rates
+            [rad/s]; orientation, the angle between the orientations of {E} [rad].
+        own: the reference's own error, in the same columns.
         restarts_ns: instants at which the reference had to begin again from a recorded sample,
             because torques before it were lost [ns].
         steps: least number of steps a tick of the reference.
@@ -55,22 +48,16 @@ class Comparison(NamedTuple):
 
     """
 
-    error: Deviation
-    own: Deviation
+    error: DataFrame
+    own: DataFrame
     restarts_ns: tuple[int, ...] = ()
     steps: int = 0
     reasons: tuple[str, ...] = ()
 
-    @classmethod
-    def none(cls, recording: Recording) -> Comparison:
-        """Return the comparison of a run in which nothing is compared yet."""
-        unknown = np.full((2, 3, len(recording.time_ns)), np.nan)
-        return cls(Deviation(*unknown[0]), Deviation(*unknown[1]))
-
     @property
     def compared(self) -> int:
         """Number of samples that were compared."""
-        return int(np.count_nonzero(np.isfinite(self.error.gamma)))
+        return int(self.error.gamma.count())
 
 
 def integration(recording: Recording) -> Comparison:
@@ -86,7 +73,7 @@ def integration(recording: Recording) -> Comparison:
     moment = recording.scene.moment
     if moment is not None and moment.topic and recording.ticks.moment is None:
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
-        return Comparison.none(recording)._replace(reasons=(reason,))
+        return Comparison(_unknown(recording), _unknown(recording), reasons=(reason,))
     start = states.initial(recording.scene) if states.begins(recording) else None
     ticks = ticks_of(recording)
     motion = TickPropagator(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
@@ -131,7 +118,8 @@ def _compare(
         restart: begin again at a recorded sample after lost torques; else the end is there.
 
     """
-    found, reasons, count = Comparison.none(recording), [], len(ticks.start_ns)
+    error, own = _unknown(recording), _unknown(recording)
+    reasons, restarts, count = [], [], len(ticks.start_ns)
     tick_ns = recording.ticks.period_ns
     if not motion.compiled:
         longest = PLAIN_TICKS * tick_ns // np.median(ticks.end_ns - ticks.start_ns)
@@ -139,39 +127,49 @@ def _compare(
     if count < len(ticks.start_ns):
         until = ticks.end_ns[count - 1] / NANOSECONDS
         reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
+
+    def note(rows: Integers, reached: Array) -> None:
+        """Write down how far samples are from the solution, and the coarse one, (n, 2, m)."""
+        fine, coarse = (states.outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
+        sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
+        error.iloc[rows], own.iloc[rows] = _measure(sampled, fine), _measure(coarse, fine)
+
     if start is not None:
-        _note(found, recording, motion, np.array([0]), np.array([[start, start]]))
+        note(np.array([0]), np.array([[start, start]]))
         if ticks.start_ns[0] != 0:
             start = None
     gaps = 1 + np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1])
-    restarts: list[int] = []
-    for first, stop in itertools.pairwise([0, *gaps[gaps < count].tolist(), count]):
-        while first < stop:
-            if start is None:
-                again = _find_restart(recording, ticks, first, stop) if restart else None
-                if again is None:
-                    break
-                first, start = again
-                restarts.append(int(ticks.start_ns[first]))
-            for part in slices(stop - first, CHUNK, "reference", shown=stop - first > CHUNK):
-                some = ticks.part(slice(first + part.start, first + part.stop))
-                starts = np.full((len(some.start_ns), len(start)), np.nan)
-                starts[0] = start
-                reached = motion.follow(some, starts)[..., :-1]
-                done = int(np.isfinite(reached[:, 0, 0]).sum())
-                rows = places(recording.time_ns, some.end_ns[:done])
-                _note(found, recording, motion, rows[rows >= 0], reached[:done][rows >= 0])
-                if done < len(starts):  # no step resolves the next one
-                    first += part.start + done + 1
-                    break
-                start = tuple(reached[-1, 0].tolist())
-            else:
-                first = stop
-            start = None
-    for values in found.error:
-        values[np.isin(recording.time_ns, restarts)] = np.nan
+    ends = np.append(gaps[gaps < count], count)
+    bar, first = Bar("reference", count > CHUNK), 0
+    while first < count:
+        if start is None:
+            again = _find_restart(recording, ticks, first, count) if restart else None
+            if again is None:
+                break
+            first, start = again
+            restarts.append(int(ticks.start_ns[first]))
+        end = int(ends[np.searchsorted(ends, first, side="right")])
+        some = ticks.part(slice(first, min(first + CHUNK, end)))
+        starts = np.full((len(some.start_ns), len(start)), np.nan)
+        starts[0] = start
+        reached = motion.follow(some, starts)[..., :-1]
+        done = int(np.isfinite(reached[:, 0, 0]).sum())
+        rows = places(recording.time_ns, some.end_ns[:done])
+        note(rows[rows >= 0], reached[:done][rows >= 0])
+        whole = done == len(starts)  # else no step resolves the next tick
+        first += done if whole else done + 1
+        start = tuple(reached[-1, 0].tolist()) if whole and first < end else None
+        bar.draw(min(first / count, 1.0))
+    error[np.isin(recording.time_ns, restarts)] = np.nan
     steps = 2 * -(-tick_ns // LONGEST_TICK_NS)
-    return Comparison(found.error, found.own, tuple(restarts), steps, tuple(reasons))
+    return Comparison(error, own, tuple(restarts), steps, tuple(reasons))
+
+
+def _unknown(recording: Recording) -> DataFrame:
+    """Return the errors of samples of which none is compared yet."""
+    count = len(recording.time_ns)
+    table: DataFrame = require("pandas").DataFrame(np.full((count, 3), np.nan), columns=QUANTITIES)
+    return table
 
 
 def _find_restart(
@@ -187,16 +185,10 @@ def _find_restart(
     return first + tick, tuple(state.tolist())
 
 
-def _note(
-    found: Comparison, recording: Recording, motion: TickPropagator, rows: Integers, reached: Array
-) -> None:
-    """Write down how far samples are from the solution, and the coarse solution, (n, 2, m)."""
-    fine, coarse = (states.outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
-    sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
-    for deviation, one in ((found.error, sampled), (found.own, coarse)):
-        # Recorded angles may count whole turns, computed ones do not.
-        turn, difference = 2.0 * np.pi, one[1] - fine[1]
-        gamma = np.abs(difference - turn * np.round(difference / turn))
-        deviation.gamma[rows] = gamma.max(axis=1)
-        deviation.gamma_dot[rows] = np.abs(one[2] - fine[2]).max(axis=1)
-        deviation.orientation[rows] = angle_between(one[0], fine[0])
+def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
+    """Distances of quaternions, gamma and gamma_dot, in the columns QUANTITIES, shape (n, 3)."""
+    # Recorded angles may count whole turns, computed ones do not.
+    turn, difference = 2.0 * np.pi, one[1] - other[1]
+    gamma = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)
+    rate = np.abs(one[2] - other[2]).max(axis=1)
+    return np.stack([gamma, rate, angle_between(one[0], other[0])], axis=1)

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,11 +24,14 @@ from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import overview, reference, states, timing, tracking
-from sst_ros.report.reference import Comparison, Deviation
+from sst_ros.report.reference import Comparison
 from sst_ros.report.results import made_line, made_on, render
 from sst_ros.report.states import begins
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that a report has, too."""
@@ -66,7 +69,7 @@ def evaluate_run(run: Recording) -> RunEvaluation:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
     result = summarise(run, integration, ideal, states.check_with_paper(run))
-    result |= timing.numbers(measured)
+    result |= measured.numbers()
     found = list(reasons(result))
     result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
     return RunEvaluation(measured, integration, ideal, result)
@@ -176,24 +179,23 @@ def summarise(
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
-        **_largest("integration_error", integration.error),
-        "integration_error_gamma_largest_at_s": _peak(integration.error.gamma, run.seconds)[1],
+        **_largest("integration_error", integration.error, run.seconds),
         **_largest("integration_reference_error", integration.own),
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
     }
     if ideal:
-        summary |= _largest("ideal_difference", ideal.error)
-        summary["ideal_difference_gamma_largest_at_s"] = _peak(ideal.error.gamma, run.seconds)[1]
+        summary |= _largest("ideal_difference", ideal.error, run.seconds)
         summary |= _largest("ideal_reference_error", ideal.own)
         summary["hold_order"] = hold_order(run)
-    off, when = _peak(run.effort_difference, run.seconds)
+    effort = run.effort_difference
+    off = float(np.nanmax(effort)) if np.isfinite(effort).any() else None
     return summary | {
         "formulation_difference_relative": formulation[0],
         "formulation_states": formulation[1],
         "effort_difference_max_N_m": off,
-        "effort_difference_largest_at_s": when if off else None,
+        "effort_difference_largest_at_s": float(run.seconds[np.nanargmax(effort)]) if off else None,
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.bag.damage),
@@ -243,18 +245,18 @@ def _loss(run: Recording) -> dict[str, Any]:
     }
 
 
-def _largest(name: str, deviation: Deviation) -> dict[str, Any]:
-    """Largest value of each quantity."""
-    found = deviation._asdict().items()
-    return {f"{name}_{key}_{QUANTITIES[key]}": _peak(values)[0] for key, values in found}
-
-
-def _peak(values: Array, seconds: Array | None = None) -> tuple[float | None, float | None]:
-    """Largest known value and, if times are given, when it was; None where none is known."""
-    if not np.isfinite(values).any():
-        return None, None
-    at = int(np.nanargmax(values))
-    return float(values[at]), None if seconds is None else float(seconds[at])
+def _largest(name: str, table: DataFrame, seconds: Array | None = None) -> dict[str, Any]:
+    """Largest value of each column, and when that of gamma was; None where nothing is known."""
+    found = {
+        f"{name}_{key}_{unit}": float(table[key].max()) if table[key].count() else None
+        for key, unit in QUANTITIES.items()
+    }
+    if seconds is not None:
+        known = table.gamma.count() > 0
+        found[f"{name}_gamma_largest_at_s"] = (
+            float(seconds[table.gamma.argmax()]) if known else None
+        )
+    return found
 
 
 def hold_order(run: Recording) -> int | None:

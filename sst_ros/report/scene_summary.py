@@ -7,7 +7,6 @@ import dataclasses
 import math
 import textwrap
 import time
-from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report.results import render
 from sst_ros.report.step_advice import step_advice
 from sst_ros.scene.bodies import Link
 from sst_ros.scene.loads import Stroke
@@ -30,101 +30,29 @@ WIDTH = 100
 
 def summary(scene: Scene) -> str:
     """Write the summary of a scene as text."""
-    dynamics = Dynamics.of(scene)
-    parts = (
-        [f"{scene.name}: {scene.description}"],
-        ["geometry", *_columns(_geometry(scene))],
-        ["run", *_columns(_run(scene))],
-        _right_hand_side(scene, dynamics),
-        ["ends", *_columns(_ends(scene))],
-        ["topics of the simulator", *_columns(_topics(dynamics))],
-        ["advice", *_wrap(step_advice(scene).text, "  ")],
-        ["sources of the numbers", *_columns(scene.provenance)],
-    )
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
-
-
-def _geometry(scene: Scene) -> Iterator[tuple[str, str]]:
-    geometry = Geometry.of(scene)
-    for k in range(3):
-        following = (k + 1) % 3 + 1
-        arc = np.degrees(geometry.arc[k])
-        direction = "(" + ", ".join(f"{x:.6f}" for x in geometry.v[k] + 0.0) + ")"
-        yield f"P{k + 1}", f"{direction} in {{B}}; arc P{k + 1} P{following} is {arc:.6g} deg long"
-    yield "alpha", _list(scene.star.alpha_deg) + " deg"
-    yield "radii", f"base {scene.base.radius:g} m, star {scene.star.radius:g} m"
-
-
-def _run(scene: Scene) -> Iterator[tuple[str, str]]:
-    yield "gamma(0)", _list(scene.initial.gamma) + " rad"
-    yield "gamma_dot(0)", _list(scene.initial.gamma_dot) + " rad/s"
-    if scene.torque is None:
-        yield "torque", "none of its own"
-    else:
-        tau = scene.torque
-        rows = zip(tau.amplitude, tau.frequency, tau.phase, strict=True)
-        yield "torque", ", ".join(f"{a:g} sin({f:g} t + {p:.6g})" for a, f, p in rows) + " N m"
-    if scene.motion is not None:
-        yield (
-            "motion",
-            f"{scene.motion.kind}; `python -m sst_ros plan check` shows what it requires",
-        )
-    yield "duration", "open" if scene.duration is None else f"{scene.duration:g} s"
-
-
-def _right_hand_side(scene: Scene, dynamics: Dynamics) -> list[str]:
-    counted = dynamics.program.operations
-    by_kind = ", ".join(f"{count} {op}" for op, count in counted.most_common())
-    lines = [
-        f"right-hand side: {len(dynamics.state)} states, {sum(counted.values())} operations",
-        f"  {by_kind}",
-        "",
-        "terms present           operations it adds   operations without it",
-    ]
-    for cost in costs(scene):
-        lines.append(f"  {cost.name:<21}{cost.adds:>19}{cost.without:>24}")
-    absent = [term for term in TERMS if not has(scene, term)]
-    return [*lines, "", "terms absent", *_wrap(", ".join(absent) or "none", "  ")]
-
-
-def _ends(scene: Scene) -> Iterator[tuple[str, str]]:
-    stroke, workspace = scene.stroke, scene.workspace
-    more = ""
-    if stroke.at_end == "elastic":
-        more = f", {stroke.stiffness} N m/rad, damping {damping_of(stroke):.3g} s/rad"
-    if stroke.restitution is not None:
-        more += f" (restitution {stroke.restitution:g} at {stroke.impact_rate:g} rad/s)"
-    yield "stroke", f"0 < gamma_k < arc: {stroke.at_end}{more}"
-    yield "workspace", f"0 < beta_k <= {workspace.beta_max_deg:g} deg: {workspace.at_edge}"
-    yield "limits", f"{len(list(limits_of(scene, Geometry.of(scene))))} monitored between steps"
-
-
-def _topics(dynamics: Dynamics) -> Iterator[tuple[str, str]]:
-    yield "in", "~/commands" + (", ~/external_moment" if dynamics.has_moment_topic else "")
-    topics = "joint_states, ~/orientation, ~/euler_zyz, ~/applied_torques, ~/scene, /diagnostics"
-    yield "out", topics
-
-
-def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Write pairs in two columns, the second one wrapped."""
-    pairs = list(rows)
-    width = max((len(name) for name, _ in pairs), default=0)
-    for name, text in pairs:
-        yield from _wrap(text, f"  {name:<{width}}  ")
-
-
-def _wrap(text: str, first: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=first,
-        subsequent_indent=" " * len(first),
-        break_on_hyphens=False,
+    dynamics, geometry = Dynamics.of(scene), Geometry.of(scene)
+    return render(
+        "scene.txt",
+        scene=scene,
+        vertices=(geometry.v + 0.0).tolist(),
+        arcs_deg=np.degrees(geometry.arc).tolist(),
+        dynamics=dynamics,
+        operations=dynamics.program.operations,
+        costs=costs(scene),
+        absent=[term for term in TERMS if not has(scene, term)],
+        damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
+        limits=len(list(limits_of(scene, geometry))),
+        advice=step_advice(scene).text,
+        wrap=_wrap,
     )
 
 
-def _list(numbers: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{x:.6g}" for x in numbers) + ")"
+def _wrap(text: str, first: str) -> str:
+    """Wrap a text whose first line begins with `first`, the others with as many blanks."""
+    rest = " " * len(first)
+    return textwrap.fill(
+        text, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    )
 
 
 TIMED_STEPS, ROUNDS = 2000, 200

@@ -14,7 +14,7 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
@@ -351,25 +351,10 @@ ROWS: dict[str, tuple[str, Change]] = {
 """Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""
 
 
-def step_lines(found: StabilityReport) -> Iterator[str]:
-    """Yield what the eigenvalues along the motion mean for the step of each method."""
-    steps = found.steps
-    for kind, words in (("decay", "fastest decay"), ("oscillation", "fastest oscillation")):
-        at = int(steps[kind].argmax())
-        yield f"The {words} is {steps[kind][at]:.3g} 1/s, at {steps.t_s[at]:.3g} s"
-    for name in METHODS:
-        at = int(steps[name].argmin())
-        least = steps[name][at]
-        limit = f"unstable in steps above {least:.2g} s, at {steps.t_s[at]:.3g} s"
-        yield f"{name}: {'every step is stable' if math.isinf(least) else limit}"
-    yield "gauss: every step is stable; it is as long as its iteration converges"
-    yield f"Advice: {found.advice}"
-
-
 def stability_page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
-    given = {"factor": FACTOR, "rounding": ROUNDING, "provenance": provenance()}
-    return render("stability.md", found=found, lines=step_lines(found), **given)
+    given = {"factor": FACTOR, "rounding": ROUNDING, "methods": METHODS, "inf": math.inf}
+    return render("stability.md", found=found, provenance=provenance(), **given)
 
 
 @styled

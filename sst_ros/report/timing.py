@@ -19,7 +19,7 @@ The balance of energy is what the samples have, less the work put in between.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,13 @@ from sst_ros.integration import codegen
 from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.topic_tables import Integers
+from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.report import states
 from sst_ros.report.states import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
 from sst_ros.state import NANOSECONDS
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 REPORTED = (
     *("ticks_missed", "ticks", "step_mean_us"),
@@ -55,134 +58,118 @@ class Timing(NamedTuple):
     """Timing of a recording by its clocks, and its energy balance.
 
     Attributes:
+        samples: a row a sample: time_s; late_us, how much later it was received than the fastest
+            one, by its stamp, which grows where the simulator falls behind; energy_J, energy
+            balance residual since the start, nan where it is not known.
         period_us: time between receptions of samples that follow each other [us], shape (p,).
         nominal_us: what it should be [us].
         lost_s: times of lost samples [s], shape (l,).
         gaps_s: times at which a tick does not begin where the one before ended [s].
-        pace_s, pace: times [s] and simulated time per time on the recorder's clock.
-        late_us: reception delay of each sample relative to the fastest one, by its stamp
-            [us], shape (n,): it grows where the simulator falls behind.
-        reported: a row for each of the simulator's reports: time of the run [s], and the numbers
-            of REPORTED, nan where one was not reported, shape (r, 1 + len(REPORTED)).
-        latency: of commands.
-        energy: energy balance residual of each sample since the start [J], shape
-            (n,); nan where it is not known.
+        pace: simulated time per time on the recorder's clock, over time [s].
+        reported: a row for each of the simulator's reports: time_s of the run, and the numbers
+            of REPORTED, nan where one was not reported.
+        commands: a row for each command that was followed: time_s, when the tick begins that
+            applied it; received_us, from its reception to the step; stamped_us, from its stamp to
+            the beginning of the tick, nan where it has none.
+        answers: samples_answered_percent, the share of the samples after which a new command was
+            received, and command_age_mean_s, for which ticks have held theirs; None without any.
         missing: what is not known, and why.
 
     """
 
+    samples: DataFrame
     period_us: Array
     nominal_us: float
     lost_s: Array
     gaps_s: Array
-    pace_s: Array
-    pace: Array
-    late_us: Array
-    reported: Array
-    latency: Latency
-    energy: Array
+    pace: Series[float]
+    reported: DataFrame
+    commands: DataFrame
+    answers: dict[str, float | None]
     missing: tuple[str, ...]
+
+    def numbers(self) -> dict[str, Any]:
+        """Sum it up: flat, units in the names, None for what is not known."""
+        energy = self.samples.energy_J.abs().max()
+        delays = {
+            "period": self.period_us,
+            "command_latency": self.commands.received_us.to_numpy(),
+            "command_stamp_to_tick": self.commands.stamped_us.dropna().to_numpy(),
+        }
+        return {
+            **{
+                f"{name}_{word}_us": float(function(values)) if len(values) else None
+                for name, values in delays.items()
+                for word, function in STATISTICS.items()
+            },
+            "commands_followed": len(self.commands),
+            **self.answers,
+            "energy_residual_max_J": float(energy) if energy >= 0.0 else None,
+            "unknown": list(self.missing),
+        }
 
 
 def measure(recording: Recording) -> Timing:
     """Measure a recording."""
-    missing: list[str] = []
-    spacing, period = np.diff(recording.time_ns), recording.period_ns
-    follow = spacing == period
-    received = np.diff(recording.received_ns)[follow] / 1e3
-    if np.any(received < 0.0):
+    pandas, missing = require("pandas"), []
+    time, received_ns, ticks = recording.time_ns, recording.received_ns, recording.ticks
+    spacing, period = np.diff(time), recording.period_ns
+    period_us = np.diff(received_ns)[spacing == period] / 1e3
+    if np.any(period_us < 0.0):
         missing.append("receptions are not in the order of the samples: periods are as recorded")
     lost = [
-        recording.time_ns[row] + period * np.arange(1, round(spacing[row] / period))
+        time[row] + period * np.arange(1, round(spacing[row] / period))
         for row in np.flatnonzero(spacing > period).tolist()
     ]
-    ticks = recording.ticks
-    gaps = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
     # Simulated time per received time, over pieces of the run.
-    pieces = min(60, len(recording.time_ns) - 1)
-    rows = np.unique(np.linspace(0, len(recording.time_ns) - 1, pieces + 1).round().astype(int))
-    piece = recording.time_ns[rows]
+    pieces = min(60, len(time) - 1)
+    rows = np.unique(np.linspace(0, len(time) - 1, pieces + 1).round().astype(int))
     with np.errstate(divide="ignore", invalid="ignore"):
-        pace = np.diff(piece) / np.diff(recording.received_ns[rows])
+        pace = np.diff(time[rows]) / np.diff(received_ns[rows])
+    middle = 0.5 * (time[rows][1:] + time[rows][:-1]) / NANOSECONDS
     good = np.isfinite(pace) & (pace > 0.0)
-    late = recording.received_ns - recording.time_ns
     if not recording.diagnostics:
         missing.append("no diagnostics: missed ticks and samples published are not known")
+    commands, answers = pair_commands(recording, missing)
+    late, energy = received_ns - time, energy_residual(recording, missing)
+    samples = {"time_s": recording.seconds, "late_us": (late - late.min()) / 1e3}
     return Timing(
-        period_us=received,
+        samples=pandas.DataFrame(samples | {"energy_J": energy}),
+        period_us=period_us,
         nominal_us=period / 1e3,
-        lost_s=np.concatenate(lost) / NANOSECONDS if lost else np.empty(0),
-        gaps_s=gaps / NANOSECONDS,
-        pace_s=(0.5 * (piece[1:] + piece[:-1]) / NANOSECONDS)[good],
-        pace=pace[good],
-        late_us=(late - late.min()) / 1e3,
+        lost_s=np.concatenate([np.empty(0), *lost]) / NANOSECONDS,
+        gaps_s=ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]] / NANOSECONDS,
+        pace=pandas.Series(pace[good], middle[good]),
         reported=_read_reports(recording),
-        latency=pair_commands(recording, missing),
-        energy=energy_residual(recording, missing),
+        commands=commands,
+        answers=answers,
         missing=tuple(missing),
     )
 
 
-def numbers(timing: Timing) -> dict[str, Any]:
-    """Sum it up: flat, units in the names, None for what is not known."""
-    latency, energy = timing.latency, np.abs(timing.energy)
-    delays = {
-        "period": timing.period_us,
-        "command_latency": latency.received_us,
-        "command_stamp_to_tick": latency.stamped_us[np.isfinite(latency.stamped_us)],
-    }
-    return {
-        **{
-            f"{name}_{word}_us": float(function(values)) if len(values) else None
-            for name, values in delays.items()
-            for word, function in STATISTICS.items()
-        },
-        "commands_followed": len(latency.time_s),
-        "samples_answered_percent": latency.answered and 100.0 * latency.answered,
-        "command_age_mean_s": latency.age_s,
-        "energy_residual_max_J": float(np.nanmax(energy)) if np.isfinite(energy).any() else None,
-        "unknown": list(timing.missing),
-    }
-
-
-def _read_reports(recording: Recording) -> Array:
+def _read_reports(recording: Recording) -> DataFrame:
     """Return times of the run [s] and the numbers of REPORTED, from the simulator's reports."""
-    rows = [
-        [at - recording.received_ns[0], *(float(values.get(key) or "nan") for key in REPORTED)]
-        for at, values in recording.reports
-    ]
-    reported = np.array(rows, dtype=float).reshape(-1, 1 + len(REPORTED))
-    since = (recording.received_ns - recording.received_ns[0]).astype(float)
-    reported[:, 0] = np.interp(reported[:, 0], since, recording.seconds)
-    return reported
+    rows = [values for _, values in recording.reports]
+    table: DataFrame = require("pandas").DataFrame(rows, columns=REPORTED)
+    since = recording.received_ns - recording.received_ns[0]
+    at = [received_ns - int(recording.received_ns[0]) for received_ns, _ in recording.reports]
+    table.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
+    return table.replace("", None).astype(float)
 
 
-class Latency(NamedTuple):
-    """Delays of commands that were followed.
+def pair_commands(
+    recording: Recording, missing: list[str]
+) -> tuple[DataFrame, dict[str, float | None]]:
+    """Pair commands with ticks, by their values; `missing` gets a line where there are none.
 
-    Attributes:
-        time_s: beginning of the ticks that applied them [s], shape (f,).
-        received_us: from the reception of the command to the step [us], shape (f,).
-        stamped_us: from the stamp of the command to the beginning of the tick [us], shape (f,);
-            nan where commands have no stamp.
-        answered: share of the samples after which a new command was received, None without any.
-        age_s: mean time for which ticks have held their command [s], None without any.
+    Returns:
+        `Timing.commands` and `Timing.answers`.
 
     """
-
-    time_s: Array
-    received_us: Array
-    stamped_us: Array
-    answered: float | None = None
-    age_s: float | None = None
-
-
-def pair_commands(recording: Recording, missing: list[str]) -> Latency:
-    """Pair commands with ticks, by their values; `missing` gets a line where there are none."""
-    commands, ticks, none = recording.commands, recording.ticks, Latency(*np.empty((3, 0)))
-    if not len(commands.torque):
-        missing.append("no commands are recorded: their latency is not known")
-        return none
+    commands, ticks = recording.commands, recording.ticks
+    answers: dict[str, float | None] = dict.fromkeys(
+        ("samples_answered_percent", "command_age_mean_s")
+    )
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
     asked, applied = (np.clip(each.torque, -most, most) for each in (commands, ticks))
@@ -191,19 +178,24 @@ def pair_commands(recording: Recording, missing: list[str]) -> Latency:
     # The recorder may have received a command a little later than the simulator.
     earliest_ns = commands.received_ns[new] - ticks.period_ns
     command, tick = _pairs(asked[new], earliest_ns, applied[changed], step_ns)
-    if not len(command):
+    if not len(commands.torque):
+        missing.append("no commands are recorded: their latency is not known")
+    elif not len(command):
         missing.append("no recorded command is found among the applied torques")
-        return none
     stamps = commands.stamp_ns[new][command]
     begins = ticks.start_ns[changed][tick]
-    answered = np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan)
-    passed = (step_ns[tick] - commands.received_ns[new][command]) / 1e3
+    columns = {
+        "time_s": begins / NANOSECONDS,
+        "received_us": (step_ns[tick] - commands.received_ns[new][command]) / 1e3,
+        "stamped_us": np.where(stamps > 0, (begins + recording.start_ns - stamps) / 1e3, np.nan),
+    }
     # A torque that is commanded once and for all answers no samples.
-    share, age = _measure_answers(recording, begins) if len(begins) > 1 else (None, None)
-    return Latency(begins / NANOSECONDS, passed, answered, share, age)
+    if len(begins) > 1:
+        answers |= _measure_answers(recording, begins)
+    return require("pandas").DataFrame(columns), answers
 
 
-def _measure_answers(recording: Recording, begins: Integers) -> tuple[float, float]:
+def _measure_answers(recording: Recording, begins: Integers) -> dict[str, float]:
     """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
     received, commands = recording.received_ns, recording.commands
     if commands.stamp_ns.any():
@@ -214,8 +206,9 @@ def _measure_answers(recording: Recording, begins: Integers) -> tuple[float, flo
     ticks = np.searchsorted(begins, recording.ticks.start_ns, side="right") - 1
     held = recording.ticks.start_ns[ticks >= 0] - np.sort(begins)[ticks[ticks >= 0]]
     # The last sample is the end of the run, which nothing answers.
-    share = float(np.mean(answered[:-1]))
-    return share, float(held.mean() / NANOSECONDS) if len(held) else 0.0
+    share = 100.0 * float(np.mean(answered[:-1]))
+    age = float(held.mean() / NANOSECONDS) if len(held) else 0.0
+    return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 
 def _reception_of(recording: Recording, time_ns: Integers) -> Integers:
@@ -227,7 +220,7 @@ def _reception_of(recording: Recording, time_ns: Integers) -> Integers:
 
 def _changes(torque: Array) -> NDArray[np.intp]:
     """Rows that are not the same as the row before, and the first."""
-    return np.flatnonzero(np.append(True, (torque[1:] != torque[:-1]).any(axis=1)))
+    return np.flatnonzero((np.diff(torque, axis=0, prepend=np.nan) != 0.0).any(axis=1))
 
 
 def _pairs(
@@ -282,8 +275,7 @@ def energy_residual(recording: Recording, missing: list[str]) -> Array:
         kinetic = kernel.kinetic_energy(model, columns)
         stored[rows] = kinetic + kernel.potential_energy(model, columns)
         work[rows.start : rows.stop - 1] = _work(motion, ticks, state, recording.time_ns[rows])
-    change = np.zeros(len(stored))
-    change[1:] = np.diff(stored) - work[:-1]
+    change = np.diff(stored, prepend=stored[0]) - np.append(0.0, work[:-1])
     change[~np.isfinite(change)] = 0.0
     return np.asarray(np.where(np.isfinite(stored), np.cumsum(change), np.nan))
 
@@ -293,17 +285,13 @@ def _work(motion: TickPropagator, every: TickSequence, state: Array, time: Integ
 
     It is nan where ticks or states are lost.
     """
-    places = np.searchsorted(every.start_ns, time)
-    ticks = every.part(slice(places[0], places[-1]))
-    whole = np.zeros(len(state) - 1, dtype=bool)
-    if len(ticks.start_ns):
-        places -= places[0]
-        # The ticks of a sample are all there if they follow each other from its time to the next.
-        breaks = np.concatenate([[0], np.cumsum(ticks.start_ns[1:] != ticks.end_ns[:-1])])
-        first, last = np.minimum(places[:-1], len(breaks) - 1), np.maximum(places[1:] - 1, 0)
-        whole = (first <= last) & (breaks[first] == breaks[last])
-        whole &= (ticks.start_ns[first] == time[:-1]) & (ticks.end_ns[last] == time[1:])
-        whole &= np.isfinite(state[:-1]).all(axis=1)
+    begin, end = np.searchsorted(every.start_ns, time[[0, -1]])
+    ticks = every.part(slice(begin, end))
+    first, last = places(ticks.start_ns, time[:-1]), places(ticks.end_ns, time[1:])
+    # The ticks of a sample are all there if they last as long as it is to the next.
+    whole = (first >= 0) & (last >= first) & np.isfinite(state[:-1]).all(axis=1)
+    passed = np.append(0, np.cumsum(ticks.end_ns - ticks.start_ns))
+    whole &= passed[last + 1] - passed[first] == np.diff(time)
     if not whole.any():
         return np.full(len(whole), np.nan)
     starts = np.full((len(ticks.start_ns), state.shape[1]), np.nan)

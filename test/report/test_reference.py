@@ -101,7 +101,7 @@ def test_the_ideal_is_the_motion_under_continuous_torques(run):
     start = states.initial(run.scene)
     end = solve(lambda t, y: kernel.derivative(model, tuple(y), profile(t)), (0.0, 0.3), start)
     expected = angle_between(end[:4], run.quaternion[-1])
-    assert abs(found.error.orientation[-1] - expected) < 1e-11
+    assert abs(found.error.orientation.iloc[-1] - expected) < 1e-11
     assert 1e-4 < expected < 1e-2  # half a tick's delay of the hold
     assert found.own.gamma.max() < 1e-12
     assert reference.ideal(altered(run, scene=replace(run.scene, torque=None))) is None

@@ -260,7 +260,7 @@ def test_the_command_prints_verdict_and_files_and_all_when_asked(
 def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, clock_ns):
     entries = [dataclasses.replace(e, received_ns=e.received_ns + clock_ns) for e in lively]
     found = timing.measure(read(entries))
-    numbers = timing.numbers(found)
+    numbers = found.numbers()
     assert found.nominal_us == 2000.0 and len(found.period_us) == 150
     assert numbers["period_min_us"] == 1970.0 and numbers["period_max_us"] == 2030.0
     assert numbers["period_mean_us"] == pytest.approx(2000.0, abs=0.5)
@@ -270,7 +270,7 @@ def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, 
     assert numbers["command_latency_max_us"] == pytest.approx(430.0, abs=1e-2)  # a late sample's
     assert numbers["command_latency_mean_us"] == pytest.approx(403.0, abs=0.1)
     assert numbers["command_stamp_to_tick_mean_us"] is None
-    assert found.pace == pytest.approx(np.ones(len(found.pace)), abs=0.02)
+    assert found.pace.to_numpy() == pytest.approx(np.ones(len(found.pace)), abs=0.02)
     assert numbers["energy_residual_max_J"] < 1e-12
     assert not len(found.lost_s) and not len(found.gaps_s) and numbers["unknown"] == []
 
@@ -292,7 +292,7 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     error = reference.integration(run).error.gamma_dot
     assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
     assert error[:75].max() < 1e-11 and error[75:].min() > 1e-8
-    energy = np.abs(timing.measure(run).energy)
+    energy = timing.measure(run).samples.energy_J.abs()
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
@@ -308,7 +308,7 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bag
         command = dataclasses.replace(command, name=["gamma_2", "gamma_1", "gamma_3"])
         received = bags.START_NS + tick * bags.TICK_NS
         entries.append(bags.Entry(bags.STAMPED, received, command))
-    numbers = timing.numbers(timing.measure(read(entries)))
+    numbers = timing.measure(read(entries)).numbers()
     assert numbers["commands_followed"] == 149
     for word in ("min", "mean", "max"):
         assert numbers[f"command_stamp_to_tick_{word}_us"] == 2000.0
@@ -363,10 +363,12 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
         entries.append(bags.diagnostics_entry(received, phase="running", ticks_missed=missed))
     run = read(entries)
     found = timing.measure(run)
-    at, missed = found.reported[:, :2].T
+    at, missed = found.reported[["time_s", "ticks_missed"]].to_numpy().T
     assert at == pytest.approx(list(reports), abs=1e-9)
     assert missed.tolist() == list(reports.values())
-    assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
+    assert found.samples.late_us.to_numpy() == pytest.approx(
+        np.where(np.arange(151) > 50, 7000.0, 0.0)
+    )
     assert not len(found.lost_s)
     assert evaluate_run(run).summary["ticks_missed"] == 7
 
@@ -405,5 +407,6 @@ def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
     assert plain[0].compared == 201
     assert plain[0].reasons == ("only the first 0.4 s are compared: there is no numba for more",)
     assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201
-    assert plain[0].error.gamma[:201] == pytest.approx(compiled[0].error.gamma[:201], abs=1e-15)
+    one, other = (found[0].error.gamma[:201].to_numpy() for found in (plain, compiled))
+    assert one == pytest.approx(other, abs=1e-15)
     assert plain[1][:201] == pytest.approx(compiled[1][:201], abs=1e-13)

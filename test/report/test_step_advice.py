@@ -12,7 +12,7 @@ from models import seeded_samples
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.report import work_precision
-from sst_ros.report.accuracy import accuracy_page, documents, facts
+from sst_ros.report.accuracy import accuracy_page, documents
 from sst_ros.report.scene_summary import summary
 from sst_ros.report.step_advice import (
     eigenvalues,
@@ -61,7 +61,6 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     assert study.advice == advice and study.measured[0] < 1e-8
     assert next(documents([study]))["advice"]["text"] == advice.text
     assert f"Advice: {advice.text}. Measured: {study.measured[0]:.1e} rad" in accuracy_page([study])
-    assert any(advice.text in fact for fact in facts(study))
 
 
 def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
