@@ -17,8 +17,7 @@ from functools import partial
 from statistics import median
 
 from benchmark.measure import divide, time_in_turn
-from sst_ros import Simulation, load_scene, prepare, simulate
-from sst_ros.simulation.simulate_gauss import GaussMotion
+from sst_ros import load_scene, prepare, simulate
 
 ROUNDS, STARTS = 50, 9
 LIST, NUMPY = ("-m", "sst_ros", "scene", "list"), ("-c", "import numpy")
@@ -37,13 +36,9 @@ def used_by_children() -> float:
 
 def main() -> None:
     scene = load_scene("example2_heavy")
-    state = Simulation(scene).state
-    assert scene.torque is not None
     whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
     calls: dict[str, Callable[[], object]] = {
-        "integration": GaussMotion(
-            scene, scene.torque, [*state.quaternion, *state.body_rate], 1.0, 1e-9
-        ).run,
+        "integration": X,
         "prepare().run()": prepare(scene, method="gauss", tolerance=1e-9).run,
         "simulate()": whole,
     }

@@ -33,6 +33,10 @@ class Layout:
         first = (self._first[group] + row) * self.lanes
         return f"block[{first + lane}]" if isinstance(lane, int) else f"block[{first} + {lane}]"
 
+    def store(self, group: str, values: Sequence[str]) -> list[str]:
+        """Lines that put values in lane i of the first rows of a group."""
+        return [f"{self.lane(group, row)} = {value}" for row, value in enumerate(values)]
+
     def rows(self, group: str, count: int) -> list[str]:
         """Return lane i of the first rows of a group."""
         return [self.lane(group, row) for row in range(count)]
@@ -86,8 +90,7 @@ def evaluate_lanes(
     loads = [f"u{i} = {text}" for i, text in enumerate(given)]
     head = [line for line, early in zip(loads, same, strict=True) if early]
     inside = [line for line, early in zip(loads, same, strict=True) if not early]
-    stores = [f"{at.lane(out, j)} = {result}" for j, result in enumerate(results)]
-    return [*head, *before, *loop(at, [*inside, *after, *stores])]
+    return [*head, *before, *loop(at, [*inside, *after, *at.store(out, results)])]
 
 
 def loop(at: Layout, body: list[str]) -> list[str]:
