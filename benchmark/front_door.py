@@ -8,6 +8,7 @@ Example 2 at 1e-9 rad by collocation, compiled; the command is `sst-ros scene li
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -16,8 +17,13 @@ from collections.abc import Callable
 from functools import partial
 from statistics import median
 
+import numpy as np
+
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
+from sst_ros.simulation.simulate_gauss import CollocatedMotion
+from sst_ros.simulation.simulate_steps import Task
+from sst_ros.simulation.torque_profile import profile_of
 
 ROUNDS, STARTS = 50, 9
 LIST, NUMPY = ("-m", "sst_ros", "scene", "list"), ("-c", "import numpy")
@@ -36,9 +42,12 @@ def used_by_children() -> float:
 
 def main() -> None:
     scene = load_scene("example2_heavy")
+    task = Task(
+        scene, profile_of(scene.torque), 10**9, None, "gauss", 1e-9, np.empty(0), math.inf, None
+    )
     whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
     calls: dict[str, Callable[[], object]] = {
-        "integration": X,
+        "integration": CollocatedMotion(task).compute,
         "prepare().run()": prepare(scene, method="gauss", tolerance=1e-9).run,
         "simulate()": whole,
     }

@@ -64,7 +64,7 @@ class Collocation:
         limits: Program | None = None,
         compiled: bool | None = True,
     ) -> None:
-        self.size, self.nodes = len(ode.state), nodes
+        self.nodes, self.size, self.inputs = nodes, len(ode.state), len(ode.program.inputs)
         self._texts, self.layout, self.numbers = source(ode, nodes, limits)
         known = compiled is not False and codegen.numba_version() is not None
         self._ask_at = _WORTH_LOADING if known and compiled is None else math.inf
@@ -110,7 +110,7 @@ class PreparedMotion:
         # From the begin of a cache line on, as no register then lies across two.
         self._block = block[-(block.ctypes.data // 8) % 8 :][: self._at.numbers]
         self._block[:2] = count, iterations
-        self._set("numbers", method.numbers)
+        self._rows("numbers", len(method.numbers))[:] = method.numbers
         self._states = np.zeros((count + 1) * method.size)
         self.run: Callable[[], float] = self._run_plain
         if method.code:
@@ -129,12 +129,13 @@ class PreparedMotion:
     def begin(self, t: float, h: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
         """Set time where `run` begins and length of a step [s], the state, and a constant drive."""
         self._block[2] = h
-        self._set("begin", [t, *y, *d])
-        self._set("node", (h * tables(self._method.nodes)).ravel())
+        self._rows("begin", self._method.inputs)[:] = [t, *y, *d]
+        scaled = h * tables(self._method.nodes)
+        self._rows("node", scaled.size)[:] = scaled.ravel()
 
-    def _set(self, group: str, values: Sequence[float] | Array) -> None:
-        first = self._at.first(group)
-        self._block[first : first + len(values)] = values
+    def _rows(self, group: str, count: int | None = None) -> Array:
+        """Numbers from where a group begins."""
+        return self._block[self._at.first(group) :][:count]
 
     @property
     def states(self) -> Array:
@@ -149,8 +150,7 @@ class PreparedMotion:
     @property
     def least_distances(self) -> Array:
         """Least distance from each limit at all nodes of the last run, shape (limits,)."""
-        rows: Array = self._block[self._at.first("least") :].reshape(-1, self._method.nodes)
-        return np.asarray(rows.min(axis=1))
+        return np.asarray(self._rows("least").reshape(-1, self._method.nodes).min(axis=1))
 
 
 @lru_cache(maxsize=16)

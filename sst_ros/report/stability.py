@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 from sst_ros.dynamics import kernel
 from sst_ros.errors import InputError, Problem, SstError, suggestion
 from sst_ros.host.output import slices
-from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
@@ -45,7 +44,6 @@ from sst_ros.scene.loads import Initial, JointFriction
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulate_gauss import GAUSS
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
 
@@ -67,9 +65,6 @@ SPIN = 1.0
 
 BESIDE = 1e-3
 """Angle between a singular pose and the start beside it [rad]."""
-
-SLOW_S = 5.0
-"""A collocated motion that takes longer than this [s] is compiled, which takes as long."""
 
 Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 """Makes another scene of one and its motion, or gives the reason why there is none."""
@@ -138,14 +133,10 @@ def examine_stability(
             raise InputError("report stability", [Problem("--only", name, allowed)])
     chosen = [name for name in ROWS if name in only or not only]
     seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
-    motion, took = _measure_motion(scene, seconds)
-    if took > SLOW_S and motion.method.startswith(GAUSS) and numba_version() is not None:
-        # Its code was not in the cache, and `auto` does not make it: without it this and all other
-        # runs search for their steps in plain Python, for minutes.
-        simulate(scene, duration=seconds, tolerance=TOLERANCE, method=GAUSS)
-        motion, took = _measure_motion(scene, seconds)
+    began = time.perf_counter()
+    motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
     if shown:
-        about = max(1.0, 2.0 * took) * len(chosen)
+        about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
     rows = []
     for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
@@ -155,13 +146,6 @@ def examine_stability(
     columns = ("name", "change", "passed", "result", "method", "error", "estimate", "wall_s")
     runs = data_frame(rows, columns)
     return StabilityReport(scene.name, _steps(scene, motion), step_advice(scene).text, runs)
-
-
-def _measure_motion(scene: Scene, seconds: float) -> tuple[Trajectory, float]:
-    """Run a scene as it is; return the motion and its computing time [s]."""
-    began = time.perf_counter()
-    motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
-    return motion, time.perf_counter() - began
 
 
 def _steps(scene: Scene, motion: Trajectory) -> DataFrame:

@@ -48,7 +48,7 @@ class CollocatedMotion:
     """The motion of a task by collocation, prepared once, for several threads.
 
     Where the task names the method it is compiled, tries hard, and keeps the finest motion if the
-    tolerance is not met. `compiled` overrides that, see `Collocation`.
+    tolerance is not met.
 
     Attributes:
         count, iterations, h: steps, evaluations of all nodes in a step, length of a step [s].
@@ -61,13 +61,12 @@ class CollocatedMotion:
 
     """
 
-    def __init__(self, task: Task, compiled: bool | None = None) -> None:
+    def __init__(self, task: Task) -> None:
         self._sine, held = _choose_torque(task)
         self._task, self._asked, scene = task, task.method == GAUSS, task.scene
         self._dynamics, self._lock = Dynamics.of(scene), threading.Lock()
         self._limits = tuple(limits_of(scene, Geometry.of(scene)))
-        how = True if compiled is None and self._asked else compiled
-        self._method = _collocation(self._dynamics, self._sine, self._limits, how)
+        self._method = _collocation(self._dynamics, self._sine, self._limits, self._asked or None)
         self._start = [*start_of(scene), *(0.0 for _ in self._dynamics.state[7:])]
         self._drive = [*held, *(0.0 for _ in self._dynamics.drive[3:])]
         self._end = task.span / NANOSECONDS

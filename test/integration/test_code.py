@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loaded_scenes import IGNORE, start_of
+from loaded_scenes import IGNORE
 from programs import python
 
 from sst_ros.integration import codegen
@@ -20,7 +20,7 @@ from sst_ros.integration.compiled_method import code_is_there, make_code
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import load
-from sst_ros.simulation.simulate_gauss import GaussMotion
+from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
@@ -85,10 +85,9 @@ def test_collocation_of_another_inertia_needs_no_compilation(tmp_path, monkeypat
     made = None
     for scene in (EXAMPLE2, heavier(EXAMPLE2)):
         fast, plain = (
-            GaussMotion(scene, scene.torque, start_of(EXAMPLE2), 0.1, 1e-9, compiled=compiled)
-            for compiled in (True, False)
+            simulate(scene, duration=0.1, method=method).quaternion for method in ("gauss", "auto")
         )
-        np.testing.assert_allclose(fast.run(), plain.run(), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(fast, plain, rtol=0, atol=1e-13)
         made = made or files_of(tmp_path)
     assert len(made) >= 3 and files_of(tmp_path) == made
 

@@ -200,7 +200,7 @@ def text_of_steps(ode):
 
 
 def text_of_collocation(ode):
-    return "".join(gauss.source(ode, 4, None, gauss.slots_of(ode, None)))
+    return "".join(gauss.source(ode, 4, None)[0])
 
 
 @pytest.mark.parametrize("text", [text_of_steps, text_of_collocation])

@@ -40,20 +40,6 @@ def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(f
     assert singular.passed and "initial.gamma" in singular.result  # which lies beyond the stroke
 
 
-def test_a_slow_motion_is_compiled_before_the_runs(monkeypatch):
-    methods, honest = [], stability.simulate
-
-    def simulate(*given, method="auto", **options):
-        methods.append(method)
-        return honest(*given, **options)
-
-    monkeypatch.setattr(stability, "simulate", simulate)
-    monkeypatch.setattr(stability, "SLOW_S", 0.0)
-    monkeypatch.setattr(stability, "numba_version", lambda: "0")
-    examine_stability(EXAMPLE2, ["friction"])
-    assert methods == ["auto", "gauss", "auto"]
-
-
 def careless(tolerance):
     return {"tolerance": max(tolerance, 1e-2 * (tolerance > 1e-10))}, tolerance
 
