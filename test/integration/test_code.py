@@ -15,11 +15,12 @@ import pytest
 from loaded_scenes import IGNORE
 from programs import python
 
-from sst_ros.integration import codegen
+from sst_ros.integration import codegen, gauss
 from sst_ros.integration.compiled_method import code_is_there, make_code
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import load
+from sst_ros.simulation import simulate_gauss
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
@@ -81,15 +82,23 @@ def test_one_process_makes_code_at_a_time(tmp_path, monkeypatch):
 @needs_numba
 @pytest.mark.slow
 def test_collocation_of_another_inertia_needs_no_compilation(tmp_path, monkeypatch):
+    """Under `auto` it has the digits of plain Python."""
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
+    monkeypatch.setattr(gauss, "_WORTH_COMPILING", 0)
+    monkeypatch.setattr(gauss, "_WORTH_LOADING", 0)
     made = None
     for scene in (EXAMPLE2, heavier(EXAMPLE2)):
-        fast, plain = (
-            simulate(scene, duration=0.1, method=method).quaternion for method in ("gauss", "auto")
-        )
-        np.testing.assert_allclose(fast, plain, rtol=0, atol=1e-13)
+        monkeypatch.delenv("SST_ROS_NUMBA", raising=False)
+        fast = simulate(scene, duration=0.1, method="gauss").quaternion
+        both = []
+        for numba in ("1", "0"):
+            monkeypatch.setenv("SST_ROS_NUMBA", numba)
+            simulate_gauss._collocation.cache_clear()
+            both.append(simulate(scene, duration=0.1).quaternion)
+        assert both[0].tobytes() == both[1].tobytes()
+        np.testing.assert_allclose(fast, both[0], rtol=0, atol=1e-13)
         made = made or files_of(tmp_path)
-    assert len(made) >= 3 and files_of(tmp_path) == made
+    assert len(made) >= 6 and files_of(tmp_path) == made
 
 
 def run_with(cache):
