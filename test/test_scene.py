@@ -119,6 +119,15 @@ def test_numbers_lists_sections_and_choices():
     assert EXAMPLE2.with_values({}) == EXAMPLE2
 
 
+def test_arcs_define_the_directions_of_the_base():
+    scene = EXAMPLE2.with_values({"base": {"arcs_deg": [70, 85, 95], "radius": 0.35}})
+    v = np.array(scene.base.v)
+    arcs = np.degrees(np.arccos(np.sum(v * np.roll(v, -1, axis=0), axis=1)))
+    np.testing.assert_allclose([*arcs, *v[0]], [70, 85, 95, 1, 0, 0], rtol=1e-14)
+    assert v[1, 2] == 0.0 < min(v[1, 1], v[2, 2])
+    assert read(Scene, dump(scene), "dump") == scene
+
+
 @pytest.mark.parametrize(
     ("values", "said"),
     [

@@ -57,6 +57,14 @@ REFUSED = [
     (V, "v: [[1, 0, 0], [0, 1, 0], [1, 1, 0]]", r"base\.v = .*degenerate"),
     (V, "v: [[0, 1, 0], [1, 0, 0], [0, 0, 1]]", r"base\.v = .*right-handed"),
     (V, "v: [[1, 0, 0], [0, 0, 0], [0, 0, 1]]", r"base\.v = .*may be zero"),
+    (V, "arcs_deg: [70, 85, 155]", r"base\.arcs_deg = .*: must close: each less than the sum of"),
+    (V, "arcs_deg: [120, 120, 120]", r"base\.arcs_deg = .*: must close: .*less than 360 deg"),
+    (V, "arcs_deg: [1e-3, 1e-3, 1e-3]", r"base\.v = .*: triangle too small"),
+    (V, f"arcs_deg: [70, 85, 95]\n  {V}", r"base = .*: give one of v, arcs_deg"),
+    (V, "", "base = None: give one of v, arcs_deg"),
+    (STAR, "inertia: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]", "a mapping with the keys xx, yy, zz, xy,"),
+    (GAMMA, "gamma: [45, 45, 45]", r"initial\.gamma = .*: must be 3 .* \[rad\]: in rad\?"),
+    ("duration: 1 ", "motion: {to_angles: {gamma: [9, 0, 0]}}\nduration: 1 ", "in rad"),
     ("radius: 0.35 ", "radius: 0 ", r"base\.radius = '0': must be .* > 0 \[m\]"),
     (LINK, f"{LINK}\n{LINK}", r"intermediate_links = .*: must be a list of 1 or 3"),
     (LINK, "  - steel", r"intermediate_links\[0\] = 'steel': must be a mapping"),
@@ -226,7 +234,7 @@ def test_what_contradicts_itself_across_sections_is_checked_once_each_of_them_is
     ("gamma", "message"),
     [
         ("[0.05, 0.05, 1.5]", "cannot start here: no admissible assembly at gamma"),
-        ("[45, 45, 45]", r"must lie in the stroke, 0 to \(1\.570796, 1\.570796, 1\.570796\) rad"),
+        ("[2, 2, 2]", r"must lie in the stroke, 0 to \(1\.570796, 1\.570796, 1\.570796\) rad"),
         ("[0.78, 0.78, -0.1]", "must lie in the stroke"),
     ],
 )

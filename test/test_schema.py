@@ -43,7 +43,7 @@ def test_arbitrary_text_is_a_scene_or_refused(source):
 @FAST
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6), st.text(min_size=1, max_size=30))
 def test_numbers_and_text_survive_a_dump_bit_by_bit(rates, description):
-    initial = Initial(gamma=rates[:3], gamma_dot=rates[3:])
+    initial = Initial(gamma=np.divide(rates[:3], 200.0), gamma_dot=rates[3:])
     try:
         scene = replace(EXAMPLE2, description=description, initial=initial)
     except InputError:

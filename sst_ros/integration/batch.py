@@ -29,6 +29,7 @@ from sst_ros.integration.parametric_model import ParameterColumns, ParametricMod
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios, Scene
+from sst_ros.scene.schema import TURN
 from sst_ros.state import DIMENSIONS, UNITS, arrays_of, columns_of
 
 if TYPE_CHECKING:
@@ -286,6 +287,8 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
         raise InputError("batch", [Problem(name, rows.shape, f"must have the shape {expected}")])
     if not np.all(np.isfinite(rows)):
         raise InputError("batch", [Problem(name, rows, "must be finite")])
+    if name == "gamma" and np.any(np.abs(rows) > TURN):
+        raise InputError("batch", [Problem(name, rows, "must not exceed 2 pi: in rad?")])
     return rows
 
 

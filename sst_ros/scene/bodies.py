@@ -77,7 +77,14 @@ class Inertia(Section):
 
 @dataclass(frozen=True)
 class Base(Section):
-    """The fixed spherical triangle P1 P2 P3 in {B}."""
+    """The fixed spherical triangle P1 P2 P3 in {B}, by directions v or by its arcs.
+
+    The arcs 1-2, 2-3, 3-1 say nothing of {B}; then P1 is on its x axis, P2 in its xy plane with
+    y > 0, and P3 above that: v1 = (1, 0, 0), v2 = (cos a12, sin a12, 0), v3 = (cos a31, y, z > 0)
+    with v2 . v3 = cos a23. A scene that is read has these v.
+    """
+
+    ONE_OF = "v", "arcs_deg"
 
     v: tuple[Vector3, Vector3, Vector3] = number(
         "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
@@ -85,8 +92,33 @@ class Base(Section):
         shape=(3, 3),
         least=-1e6,
         most=1e6,
+        default=None,
+    )
+    arcs_deg: Vector3 | None = number(
+        "lengths of the arcs 1-2, 2-3, 3-1, in place of v",
+        "deg",
+        shape=(3,),
+        least=1e-6,
+        default=None,
     )
     radius: float = number("radius of the base sphere", "m", above=0.0)
+
+    def __post_init__(self) -> None:
+        """Check, and replace arcs by directions."""
+        super().__post_init__()
+        if self.arcs_deg is not None:
+            object.__setattr__(self, "v", directions_of(*np.radians(self.arcs_deg).tolist()))
+            object.__setattr__(self, "arcs_deg", None)
+            super().__post_init__()
+
+    def check(self) -> Iterator[Problem]:
+        """Refuse arcs that close no triangle."""
+        arcs = self.arcs_deg
+        if self.v is not None:
+            yield from super().check()
+        elif arcs is not None and not 2.0 * max(arcs) < sum(arcs) < 360.0:
+            allowed = "must close: each less than the sum of the others, their sum less than 360"
+            yield Problem("arcs_deg", arcs, f"{allowed} deg")
 
     def rules(self) -> Rules:
         """Refuse triangles without area and left-handed ones."""
@@ -108,6 +140,18 @@ class Base(Section):
             ),
         ):
             yield broken, partial(Problem, "v", self.v, allowed)
+
+
+def directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
+    """Directions of the corners of a spherical triangle with these arcs [rad], as in `Base`."""
+    half = 0.5 * (a12 + a23 + a31)
+    product = math.sin(half) * math.sin(half - a12) * math.sin(half - a23) * math.sin(half - a31)
+    sine, (c12, c23, c31) = math.sin(a12), (math.sin(0.5 * math.pi - a) for a in (a12, a23, a31))
+    return (
+        (1.0, 0.0, 0.0),
+        (c12, sine, 0.0),
+        (c31, (c23 - c31 * c12) / sine, 2.0 * math.sqrt(max(product, 0.0)) / sine),
+    )
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 _TEXT = {"type": "string", "pattern": "\\S"}
 
+TURN = 2.0 * math.pi
+"""No initial or desired angle of an actuator [rad] is larger: it is in degrees."""
+
 Place = tuple[str | int, ...]
 """Names and indices of a leaf from the root on."""
 
@@ -54,6 +57,10 @@ class Spec:
     lengths: tuple[int, ...] = ()
     acts_on: tuple[str, ...] = ()
     needs: str = ""
+
+    def refuse(self) -> str:
+        """Describe the values that are allowed, and what may be wrong with others."""
+        return self.describe() + (": in rad?" if self.most == TURN else "")
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
@@ -99,6 +106,11 @@ def anything(doc: str, **default: Any) -> Any:
     return dataclasses.field(metadata={"spec": Spec("anything", doc)}, **default)
 
 
+def angles(doc: str, **default: Any) -> Any:
+    """Declare angles of the three actuators, at most a turn."""
+    return number(doc, "rad", shape=(3,), least=-TURN, most=TURN, **default)
+
+
 def choice(doc: str, choices: Sequence[str], **rest: Any) -> Any:
     """Declare one word out of a list."""
     return _declare("choice", doc, choices=tuple(choices), **rest)
@@ -134,6 +146,9 @@ class Section:
     IDLE: ClassVar[tuple[str, str]] = "", ""
     """Key and text that refuse a section without effect; no text where its fields refuse it."""
 
+    ONE_OF: ClassVar[tuple[str, ...]] = ()
+    """Fields of which a document gives exactly one."""
+
     def __post_init__(self) -> None:
         problems = []
         for field in dataclasses.fields(self):
@@ -143,13 +158,13 @@ class Section:
             try:
                 object.__setattr__(self, name, accept(spec, value))
             except ValueError:
-                problems.append(Problem(name, value, spec.describe()))
+                problems.append(Problem(name, value, spec.refuse()))
         problems = problems or [*self._find_idle(), *self.check()]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
 
     def _find_idle(self) -> Iterator[Problem]:
-        """Yield what has no effect."""
+        """Yield what has no effect, and what is not one of several."""
         acts = True
         for field in dataclasses.fields(self):
             spec, value = field.metadata["spec"], getattr(self, field.name)
@@ -158,6 +173,10 @@ class Section:
                 text = spec.needs or f"acts on {' or '.join(spec.acts_on)}: give {given}"
                 yield Problem(field.name, value, text)
                 acts = False
+        if self.ONE_OF:
+            chosen = [name for name in self.ONE_OF if getattr(self, name)]
+            if len(chosen) != 1:
+                yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
         key, text = self.IDLE
         if text and acts and not self._has_any(self.EFFECTS):
             yield Problem(key, getattr(self, key, None), text)
@@ -289,6 +308,8 @@ def _object_schema(cls: type[Section]) -> dict[str, Any]:
             required.append(field.name)
         elif isinstance(field.default, (bool, int, float, str)):
             properties[field.name]["default"] = field.default
+    if cls.ONE_OF:
+        described["oneOf"] = [{"required": [name]} for name in cls.ONE_OF]
     return {**described, "properties": properties, "required": required}
 
 

@@ -253,7 +253,8 @@ def line_at(lines: Mapping[str, int], key: str) -> int | None:
 
 def _build(cls: type[S], values: Any, path: str, problems: list[Problem], of_row: bool) -> S | None:
     if not isinstance(values, Mapping):
-        problems.append(Problem(path, values, "must be a mapping"))
+        allowed = f"must be a mapping with the keys {', '.join(specs(cls))}"
+        problems.append(Problem(path, values, allowed))
         return None
     known, before = specs(cls), len(problems)
     given: dict[str, Any] = {}
@@ -313,7 +314,7 @@ def _convert(spec: Spec, value: Any, key: str, problems: list[Problem], of_row: 
     try:
         return accept(spec, given)
     except ValueError:
-        problems.append(Problem(key, value, spec.describe()))
+        problems.append(Problem(key, value, spec.refuse()))
         return None
 
 

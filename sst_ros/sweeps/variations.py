@@ -111,7 +111,7 @@ class Variation:
             known, spec = numbers[np.isfinite(numbers)], target.spec
             if not np.all((known > spec.above) & (known >= spec.least) & (known <= spec.most)):
                 words = f"it reaches from {known.min()} to {known.max()}"
-                raise ValueError(f"{spec.describe()}; {words}")
+                raise ValueError(f"{spec.refuse()}; {words}")
 
 
 def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:

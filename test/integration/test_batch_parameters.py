@@ -242,11 +242,3 @@ def test_no_more_than_ten_problems_are_told():
     with pytest.raises(InputError) as refused:
         Batch(EXAMPLE2, parameters={"star.inertia.zz": np.full(1000, -1.0)})
     assert len(refused.value.problems) == 10
-
-
-def test_starts_fit_the_number_of_rows():
-    batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [0.2, 0.3]})
-    with pytest.raises(
-        InputError, match=r"gamma = \(3, 3\): must have the shape \(3,\) or \(2, 3\)"
-    ):
-        batch.start(np.full((3, 3), HOME), REST)
