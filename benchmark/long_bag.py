@@ -29,7 +29,7 @@ from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array
 from sst_ros.nodes.publications import StateMessages, TorqueLog, stamp
 from sst_ros.recording.bag_writer import BagWriter
-from sst_ros.report.states import initial, joint_columns
+from sst_ros.report.reference import initial, joint_columns
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring

@@ -30,9 +30,9 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, free_figure, note, styled
 from sst_ros.recording import recording
 from sst_ros.report import reference_solution as truth
+from sst_ros.report.reference import of_samples
 from sst_ros.report.reference_solution import InitialValueProblem, ReferenceSolution
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
-from sst_ros.report.states import of_samples
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation

@@ -27,7 +27,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot import style
 from sst_ros.plot.style import INK, MARKERS, free_figure, note, styled
 from sst_ros.report.results import data_frame
-from sst_ros.report.step_advice import FAR, eigenvalues, stability_function, step_advice
+from sst_ros.report.scene_summary import FAR, eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Array

@@ -31,7 +31,7 @@ from sst_ros.plot.style import (
 )
 from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
-from sst_ros.report.results import made_line
+from sst_ros.report.results import provenance
 from sst_ros.report.timing import REPORTED, Timing
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def draw_overview(
     title = f"Run of {run.scene.name}: {run.seconds[-1]:g} s, {len(run.time_ns)} samples"
     figure.suptitle(title, fontsize=13)
     absent = " ".join(f"{panel.title}: {panel.missing}." for panel in panels if panel.missing)
-    footnote = f"{absent}\n{made_line(summary['report'])}".strip()
+    footnote = f"{absent}\n{provenance(summary['report'])}".strip()
     figure.supxlabel(footnote, fontsize=8, color="#555555")
     return figure
 

@@ -31,7 +31,8 @@ from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.report import states
+from sst_ros.report.reference import initial, joint_columns
+from sst_ros.report.results import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
@@ -96,7 +97,7 @@ class InitialValueProblem:
         self.torque = scene.torque or (0.0, 0.0, 0.0)
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
-        self.start = (*states.initial(scene), 0.0)
+        self.start = (*initial(scene), 0.0)
         limit = scene.torque_limit
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = limit is not None and largest > limit
@@ -118,7 +119,7 @@ class InitialValueProblem:
 
     def joints(self, solution: Array | NDArray[np.longdouble]) -> Array:
         """Nine angles [rad] and nine rates [rad/s] of states, shape (n, 18)."""
-        return states.joint_columns(self.dynamics.model, solution[:, :7].astype(float))
+        return joint_columns(self.dynamics.model, solution[:, :7].astype(float))
 
     def residuals(self, y: Array) -> tuple[float, float]:
         """Energy residual [J] and the largest abs(r_k . t_k) at a final state, shape (n,)."""
@@ -161,7 +162,7 @@ class InitialValueProblem:
 
     def _horizon(self) -> tuple[int, int, str]:
         """Return interval [ns], count of intervals, and why the span ends early."""
-        motion = simulate(self.scene, duration=self.scene.duration or states.WHOLE_RUN_S)
+        motion = simulate(self.scene, duration=self.scene.duration or WHOLE_RUN_S)
         whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
         ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
         if whole * NANOSECONDS < 1000 * INTERVALS:

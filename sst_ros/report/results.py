@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+WHOLE_RUN_S = 1.0
+"""Length of a run [s] where the scene names no duration."""
+
 _templates = jinja2.Environment(
     loader=jinja2.PackageLoader("sst_ros.report"),
     autoescape=jinja2.select_autoescape(["html"]),
@@ -94,14 +97,14 @@ def publish(
             save_figure(figure, out / f"{stem}.png")
 
 
-def provenance(*, compiled: bool | None = None) -> str:
-    """Return versions, machine and date in one line.
-
-    Args:
-        compiled: whether numba was used; None for wherever it is installed.
-
-    """
-    return made_line(made_on(), compiled=compiled)
+def provenance(made: Mapping[str, Any] | None = None) -> str:
+    """Return versions, machine and date of a report in one line: of `made_on`, by default now."""
+    made = made or made_on()
+    numba = f"numba {made['numba']}" if made["numba"] else "plain Python"
+    return (
+        f"sst_ros {made['sst_ros']}, Python {made['python']}, {numba}, NumPy {made['numpy']}, "
+        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
+    )
 
 
 def made_on() -> dict[str, Any]:
@@ -130,19 +133,3 @@ def processor() -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, "") or platform.machine()
-
-
-def made_line(made: dict[str, Any], *, compiled: bool | None = None) -> str:
-    """Return versions, machine and date of a report in one line.
-
-    Args:
-        made: as `made_on` returns it.
-        compiled: whether numba was used; None for wherever it is installed.
-
-    """
-    used = bool(made["numba"]) if compiled is None else compiled
-    numba = f", numba {made['numba']}" if used else ", plain Python"
-    return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}{numba}, NumPy {made['numpy']}, "
-        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
-    )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,10 +22,9 @@ from sst_ros.plot import pictures
 from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import overview, reference, states, timing, tracking
-from sst_ros.report.reference import Comparison
-from sst_ros.report.results import made_line, made_on, render
-from sst_ros.report.states import begins
+from sst_ros.report import overview, reference, timing, tracking
+from sst_ros.report.reference import Comparison, begins
+from sst_ros.report.results import made_on, provenance, render
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
 
@@ -68,9 +66,9 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
-    result = summarise(run, integration, ideal, states.check_with_paper(run))
+    result = summarise(run, integration, ideal, reference.check_with_paper(run))
     result |= measured.numbers()
-    found = list(reasons(result))
+    found = reasons(result)
     result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
     return RunEvaluation(measured, integration, ideal, result)
 
@@ -110,7 +108,7 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
             table=summary_table(result),
             overview=_encode(out / PAGE),
             pictures=[(path.stem.replace("_", " "), _encode(path)) for path in drawn],
-            made=made_line(result["report"]),
+            made=provenance(result["report"]),
         )
         (out / HTML).write_text(page, encoding="utf-8")
         document = json.dumps(result, indent=2, allow_nan=False) + "\n"
@@ -129,36 +127,13 @@ def summary_text(summary: dict[str, Any], folder: str) -> str:
 
 def summary_table(summary: dict[str, Any]) -> str:
     """Format a whole summary as an aligned table; what is unknown is a dash."""
-    return render("run_table.txt", s=summary, made=made_line(summary["report"]))
+    return render("run_table.txt", s=summary, made=provenance(summary["report"]))
 
 
-def reasons(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with a run, in order of weight; nothing where nothing is."""
-    if summary["fault"]:
-        yield f"fault: {summary['fault']}"
-    elif summary["phase"] not in (None, "finished"):
-        yield f"the run was cut short, or its recording was: last phase {summary['phase']}"
-    yield from summary["damage"]
-    if lost := summary["samples_lost"]:
-        yield f"{lost} samples lost ({summary['samples_recorded_percent']:.2f} % recorded)"
-    if gaps := summary["tick_gaps"]:
-        yield f"{gaps} gaps between applied torques"
-    if missed := summary["ticks_missed"]:
-        yield f"{missed} ticks missed by the simulator"
-    share, age = summary["samples_answered_percent"], summary["command_age_mean_s"]
-    if share is not None and share < ANSWERED_PERCENT:
-        yield f"commands answered {share:.3g} % of samples, mean age {1e3 * age:.3g} ms"
-    error, limit = summary["integration_error_gamma_rad"], summary["error_limit_rad"]
-    if error is not None and error > limit:
-        yield f"integration error {error:.1e} rad above {limit:.0e} rad"
-    estimate = summary["simulator_error_estimate"]
-    if estimate is not None and estimate > limit:
-        yield f"error estimate {estimate:.1e} rad above {limit:.0e} rad"
-    difference = summary["effort_difference_max_N_m"]
-    if difference and not summary["actuators_lag"]:
-        yield f"efforts differ from applied torques by {difference:.1e} N m"
-    if (relative := summary["formulation_difference_relative"] or 0.0) > FORMULATION_LIMIT:
-        yield f"equations of motion differ from the paper's by {relative:.1e} (relative)"
+def reasons(summary: dict[str, Any]) -> list[str]:
+    """Say what is wrong with a run, in order of weight; nothing where nothing is."""
+    limits = {"answered_percent": ANSWERED_PERCENT, "formulation": FORMULATION_LIMIT}
+    return render("run_reasons.txt", s=summary, **limits).splitlines()
 
 
 def summarise(
@@ -199,7 +174,9 @@ def summarise(
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.bag.damage),
-        "notes": list(_notes(run, integration, ideal)),
+        "notes": render(
+            "run_notes.txt", run=run, integration=integration, ideal=ideal, begins=begins(run)
+        ).splitlines(),
         "report": made_on(),
     }
 
@@ -273,36 +250,6 @@ def hold_order(run: Recording) -> int | None:
     middle = (ticks.start_ns[first] + ticks.end_ns[last]) / 2 / NANOSECONDS
     off = np.abs(ticks.torque[first] - profile.values(middle)).max(axis=1)
     return 2 if np.median(off) <= 1e-9 * np.abs(profile.amplitude).max() else 1
-
-
-def _notes(run: Recording, integration: Comparison, ideal: Comparison | None) -> Iterator[str]:
-    phase, fault = (run.diagnostics.get(key) for key in ("phase", "fault"))
-    if not run.diagnostics:
-        yield "no diagnostics are recorded: missed ticks and error estimates are unknown"
-    elif phase not in ("finished", "fault"):
-        yield f"the run or its recording was cut short: the last phase is {phase}"
-    if phase == "fault" or fault:
-        last = run.seconds[-1]
-        yield f"the run ended by a fault; it is compared up to its last sample, at {last:.6f} s"
-    if not begins(run):
-        yield "the start of the run is not recorded; times count from the first sample"
-    lost = len(run.time_ns) - integration.compared
-    yield from integration.reasons
-    if (restarts := len(integration.restarts_ns)) and not integration.reasons:
-        again = f"the reference began again {restarts} times from a recorded sample"
-        yield f"torques are missing: {again}; {lost} samples are not compared"
-    elif lost:
-        yield f"{lost} samples could not be compared"
-    if ideal is None and run.scene.moment and run.scene.moment.topic:
-        yield "the moment comes from a topic: no ideal to compare with"
-    if ideal is None and run.scene.torque is None:
-        yield "the scene has no torques: no ideal to compare with"
-    if run.scene.lags:
-        yield "the actuators lag: efforts differ from the torques that are asked for"
-    if unverified := run.signals.bag.unverified:
-        yield f"{unverified} chunks have no checksum: damage would not be noticed"
-    if "euler_zyz" in run.missing:
-        yield "euler_zyz is not recorded: its pictures show the orientation's angles"
 
 
 def _number(reported: dict[str, str], key: str) -> float | None:

@@ -1,5 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Summary of a scene: what it consists of, what each term costs, advice for its step."""
+"""Summary of a scene: what it consists of, what each term costs, advice for its step.
+
+The advice, also that of the accuracy and stability reports, is the run of `simulate` with the
+method "auto" itself: they cannot disagree with it.
+
+Applied to y' = lambda y with steps h, a method multiplies y by its stability function R(z),
+z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and
+IV.3). The eigenvalues lambda are those of the linearised dynamics.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +15,27 @@ import dataclasses
 import math
 import textwrap
 import time
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.errors import InputError
+from sst_ros.errors import InputError, SstError
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.methods import RK4
+from sst_ros.integration.compiled_method import CompiledMethod, Method
+from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.report.results import render
-from sst_ros.report.step_advice import step_advice
+from sst_ros.report.results import WHOLE_RUN_S, render
 from sst_ros.scene.bodies import Link
 from sst_ros.scene.loads import Stroke
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulate_gauss import GAUSS
 
 WIDTH = 100
 
@@ -152,3 +164,99 @@ def cost_table(scene: Scene) -> list[dict[str, Any]]:
         {"scene": scene.name, "term": term, "operations": added, "ns": ns}
         for term, added, ns in rows
     ]
+
+
+LONGEST_S = 10.0
+"""The advice is for a run of the scene's duration, but not of more than this [s]."""
+
+TOLERANCE = 1e-9
+"""Error of the orientation that the advice is for [rad]: the default of `simulate`."""
+
+FAR = -1e12
+"""Where the stability function of an L-stable method has vanished."""
+
+GROWTH = 1e-6
+"""abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i."""
+
+
+class StepAdvice(NamedTuple):
+    """A recommendation in words, and what `auto` takes: method and mean step [s], nan for none."""
+
+    text: str
+    method: str = ""
+    step: float = math.nan
+
+
+def step_advice(scene: Scene) -> StepAdvice:
+    """Recommend a method and a step for a scene: those that `auto` takes."""
+    seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
+    try:
+        motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
+        rates = eigenvalues(scene)
+    except SstError as error:
+        return StepAdvice(f"none, the scene cannot start: {error}")
+    text = f"for an error of {TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
+    if not motion.method.startswith(GAUSS):  # which gives its steps itself
+        text += f"; its steps have {motion.step:.2g} s on average"
+    limit, fastest = largest_stable_step(DORMAND_PRINCE, rates), float(np.abs(rates).max())
+    text += f". The fastest rate at the start is {fastest:.3g} 1/s"
+    if math.isfinite(limit):
+        text += f": steps of {DORMAND_PRINCE.name} above {limit:.2g} s would be unstable"
+    return StepAdvice(text, motion.method, motion.step)
+
+
+def eigenvalues(
+    scene: Scene, state: Sequence[float] | None = None, torque: Sequence[float] = (0.0, 0.0, 0.0)
+) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised dynamics [1/s], shape (7,) or (10,).
+
+    Args:
+        scene: a scene.
+        state: quaternion, body rate [rad/s] and lagged torques, if any; by default the start.
+        torque: that acts [N m], shape (3,).
+
+    """
+    dynamics = Dynamics.of(scene)
+    y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
+    lagged = (0.0,) * (len(dynamics.state) - len(y))
+    drive = (*torque, *(0.0,) * (len(dynamics.drive) - 3))
+    return np.asarray(_ode(dynamics).eigenvalues(0.0, (*y, *lagged), drive), dtype=complex)
+
+
+_ode = lru_cache(maxsize=4)(ODE)  # whose Jacobian is traced once
+
+
+def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
+    """Return the longest step [s] below which all are stable; inf where every one is.
+
+    Args:
+        method: of integration.
+        eigenvalues: of the linearised dynamics [1/s], shape (n,); growing ones are left out.
+
+    """
+    values = np.asarray(eigenvalues, dtype=complex)
+    fastest = float(np.abs(values).max(initial=0.0))
+    values = values[(values.real <= 1e-9 * fastest) & (np.abs(values) > 1e-6 * fastest)]
+    if not len(values):
+        return math.inf
+    steps = np.geomspace(1e-2, 1e3, 5001) / np.abs(values).max()
+    stable = np.abs(stability_function(method, np.outer(steps, values))).max(axis=1) < 1 + GROWTH
+    return math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])
+
+
+def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Evaluate R(z) of a method from its coefficients, for any shape of z."""
+    stages: list[Any] = []
+    one = np.ones_like(z)
+    if isinstance(method, Rosenbrock):
+        for a, c in zip(method.a, method.c, strict=True):
+            at = one + _combine(a, stages)
+            stages.append((z * at + _combine(c, stages)) / (1.0 / method.gamma - z))
+        return np.asarray(at + stages[-1])
+    for row in method.a:
+        stages.append(one + z * _combine(row, stages))
+    return np.asarray(one + z * _combine(method.b, stages))
+
+
+def _combine(weights: tuple[float, ...], stages: list[Any]) -> Any:
+    return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)

@@ -31,9 +31,8 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
-from sst_ros.report.results import data_frame, provenance, publish, records, render
-from sst_ros.report.states import WHOLE_RUN_S
-from sst_ros.report.step_advice import (
+from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render
+from sst_ros.report.scene_summary import (
     LONGEST_S,
     TOLERANCE,
     eigenvalues,
@@ -197,11 +196,10 @@ Part = TypeVar("Part", bound=Section)
 
 def _scale(part: Part, factor: float, *names: str) -> Part:
     """Multiply numbers of a section, or the three of each, by a factor; None stays."""
-    values = {name: getattr(part, name) for name in names}
     changes: dict[str, Any] = {
-        name: tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
-        for name, value in values.items()
-        if value is not None
+        name: factor * value if isinstance(value, float) else tuple(factor * x for x in value)
+        for name in names
+        if (value := getattr(part, name)) is not None
     }
     return dataclasses.replace(part, **changes)
 
@@ -213,13 +211,14 @@ def _stronger(scene: Scene, _: Trajectory) -> Scene | str:
 
 
 def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
-    initial = scene.initial
-    if not any(initial.gamma_dot):  # it starts at rest: ten times the rates that it reaches
-        first, second, third = np.abs(motion.gamma_dot).max(axis=0).tolist()
-        initial = dataclasses.replace(initial, gamma_dot=(first, second, third))
-    if not any(initial.gamma_dot):
+    rates = np.array(scene.initial.gamma_dot)
+    if not rates.any():  # it starts at rest: ten times the rates that it reaches
+        rates = np.abs(motion.gamma_dot).max(axis=0)
+    if not rates.any():
         return "nothing moves"
-    return dataclasses.replace(scene, initial=_scale(initial, 10.0, "gamma_dot"))
+    first, second, third = (10.0 * rates).tolist()
+    initial = dataclasses.replace(scene.initial, gamma_dot=(first, second, third))
+    return dataclasses.replace(scene, initial=initial)
 
 
 def _stiffer(scene: Scene, _: Trajectory) -> Scene | str:
@@ -241,19 +240,13 @@ def _rougher(scene: Scene, _: Trajectory) -> Scene | str:
     return dataclasses.replace(scene, friction=JointFriction(**joints))
 
 
-Quantity: TypeAlias = "Callable[[workspace.Measures], Array]"
-"""Something that is measured of poses, shape (n,)."""
-
-
-def _at_limit(quantity: Quantity) -> Change:
+def _at_limit(name: str) -> Change:
     """Start at the nearest pose in which a distance to a limit is zero, going into it."""
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
-        start = rotation_matrix(motion.quaternion[0])
-        axes, angles = _first_zeros(Geometry.of(scene), start, quantity)
+        axes, angles, poses = _first_zeros(scene, motion, name)
         if not len(angles):
             return "no turn of the star meets it"
-        poses = _turn(start, axes, angles)
         # Where another limit is met as well, or before, that one ends the run.
         beyond = _measure(Geometry.of(scene), poses).margin < -1e-9
         nearest = int(np.lexsort((angles, beyond))[0])
@@ -264,46 +257,46 @@ def _at_limit(quantity: Quantity) -> Change:
 
 def _beside_singularity(scene: Scene, motion: Trajectory) -> Scene | str:
     """Start at rest beside the nearest pose with det J1 = 0 or det J2 = 0."""
-    geometry, start = Geometry.of(scene), rotation_matrix(motion.quaternion[0])
-    candidates: list[tuple[bool, float, Array]] = []
-    for quantity in (lambda found: found.det_j1, lambda found: found.det_j2):
-        axes, angles = _first_zeros(geometry, start, quantity)
-        poses = _turn(start, axes, np.maximum(angles - BESIDE, 0.0))
-        outside = ~_measure(geometry, poses).admissible
-        candidates += zip(outside.tolist(), angles.tolist(), poses, strict=True)
-    if not candidates:
+    found = (_first_zeros(scene, motion, name, BESIDE) for name in ("det_j1", "det_j2"))
+    _, angles, poses = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if not len(angles):
         return "no turn of the star meets one"
-    _, _, pose = min(candidates, key=lambda candidate: candidate[:2])
-    return _start(scene, pose, np.zeros(3))
+    outside = ~_measure(Geometry.of(scene), poses).admissible
+    return _start(scene, poses[np.lexsort((angles, outside))[0]], np.zeros(3))
 
 
-def _first_zeros(geometry: Geometry, start: Array, quantity: Quantity) -> tuple[Array, Array]:
-    """Turn the star about many axes up to where a quantity becomes zero.
+def _first_zeros(
+    scene: Scene, motion: Trajectory, name: str, before: float = 0.0
+) -> tuple[Array, Array, Array]:
+    """Turn the star from its start about many axes up to where a measure becomes zero.
 
     Returns:
-        Axes (n, 3) and angles (n,) [rad] where it does.
+        Axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3) there, or by an
+        angle `before` it.
 
     """
+    geometry, start = Geometry.of(scene), rotation_matrix(motion.quaternion[0])
     axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
     axes /= np.linalg.norm(axes, axis=1)[:, None]
+
+    def turn(axes: Array, angles: Array) -> Array:
+        return np.asarray(Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start)
+
+    def values(axes: Array, angles: Array) -> Array:
+        return np.asarray(getattr(_measure(geometry, turn(axes, angles)), name))
+
     angles = np.linspace(0.0, np.pi, TURNS)
-    every = _turn(start, np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
-    values = quantity(_measure(geometry, every)).reshape(len(axes), TURNS)
-    sign = np.sign(values[0, 0])
-    beyond = sign * values <= 0.0
+    every = values(np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
+    sign = np.sign(every[0])
+    beyond = sign * every.reshape(len(axes), TURNS) <= 0.0
     meets = beyond.any(axis=1) & ~beyond[:, 0]
     axes, first = axes[meets], beyond.argmax(axis=1)[meets]
     low, high = angles[first - 1], angles[first]
     for _ in range(40):
         middle = 0.5 * (low + high)
-        inside = sign * quantity(_measure(geometry, _turn(start, axes, middle))) > 0.0
+        inside = sign * values(axes, middle) > 0.0
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    return axes, low
-
-
-def _turn(start: Array, axes: Array, angles: Array) -> Array:
-    """Orientations after turns about axes (n, 3) by angles (n,) [rad], shape (n, 3, 3)."""
-    return np.asarray(Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start)
+    return axes, low, turn(axes, np.maximum(low - before, 0.0))
 
 
 def _measure(geometry: Geometry, rotation: Array) -> workspace.Measures:
@@ -327,9 +320,9 @@ ROWS: dict[str, tuple[str, Change]] = {
     "rates": ("ten times the rates at the start", _faster),
     "stiffness": ("a hundred times the stiffness", _stiffer),
     "friction": ("a hundred times the friction", _rougher),
-    "stroke": ("from an end of the stroke into it", _at_limit(lambda found: found.stroke)),
-    "edge": ("from beta = 0 into it", _at_limit(lambda found: found.edge)),
-    "reach": ("from the largest beta into it", _at_limit(lambda found: found.reach)),
+    "stroke": ("from an end of the stroke into it", _at_limit("stroke")),
+    "edge": ("from beta = 0 into it", _at_limit("edge")),
+    "reach": ("from the largest beta into it", _at_limit("reach")),
     "singularity": (f"from {BESIDE:g} rad beside the nearest singularity", _beside_singularity),
 }
 """Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""

@@ -32,8 +32,7 @@ from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
-from sst_ros.report import states
-from sst_ros.report.states import CHUNK, COMPILED_FROM, PLAIN_TICKS, ticks_of
+from sst_ros.report.reference import CHUNK, COMPILED_FROM, PLAIN_TICKS, of_samples, ticks_of
 from sst_ros.state import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -270,7 +269,7 @@ def energy_residual(recording: Recording, missing: list[str]) -> Array:
     motion = TickPropagator(recording.scene, None, compiled=many)
     for part in slices(count, CHUNK, "energy", shown=False):
         rows = slice(part.start, min(part.stop + 1, count))
-        state = states.of_samples(geometry, recording, rows)
+        state = of_samples(geometry, recording, rows)
         columns = tuple(state.T)
         kinetic = kernel.kinetic_energy(model, columns)
         stored[rows] = kinetic + kernel.potential_energy(model, columns)

@@ -25,7 +25,7 @@ from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array
-from sst_ros.report import states
+from sst_ros.report.reference import compare_with_paper
 from sst_ros.report.reference_solution import (
     EXTENDED,
     InitialValueProblem,
@@ -33,7 +33,7 @@ from sst_ros.report.reference_solution import (
     solve_reference,
 )
 from sst_ros.report.results import data_frame
-from sst_ros.report.step_advice import StepAdvice, step_advice
+from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
 from sst_ros.simulation.simulate_gauss import GAUSS
@@ -177,7 +177,7 @@ def work_precision(
     zero = np.zeros((len(problem.times), 3))
     torques = zero if scene.torque is None else scene.torque.values(problem.times)
     along = zip(truth.states.astype(float), torques.tolist(), strict=True)
-    difference, _ = states.compare_with_paper(scene, along)
+    difference, _ = compare_with_paper(scene, along)
     return WorkPrecision(
         scene=scene.name,
         seconds=problem.seconds,

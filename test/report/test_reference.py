@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
-from sst_ros.report import reference, states
+from sst_ros.report import reference
 from sst_ros.report.run import summarise
 from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.loads import Actuators, Moment
@@ -47,7 +47,7 @@ def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_it
 
 def test_the_reference_agrees_with_scipy(run):
     """The recorded torques, tick by tick, through an integrator that is not ours."""
-    model, y = kernel.model_of(run.scene), states.initial(run.scene)
+    model, y = kernel.model_of(run.scene), reference.initial(run.scene)
     for start, torque in zip(run.ticks.start_ns[:100], run.ticks.torque[:100], strict=True):
         torques, span = tuple(torque.tolist()), (start / 1e9, start / 1e9 + 1e-3)
         y = solve(
@@ -90,7 +90,7 @@ def test_what_is_lost_is_not_compared_and_no_error(
 
 def test_a_lost_start_is_not_taken_for_an_error(read, example2):
     run = read([e for e in example2 if not 0 <= e.sample < 10])
-    assert not states.begins(run) and reference.ideal(run) is None
+    assert not reference.begins(run) and reference.ideal(run) is None
     found = reference.integration(run)
     assert np.nanmax(found.error.gamma) < 1e-11 and found.compared == 140
 
@@ -98,7 +98,7 @@ def test_a_lost_start_is_not_taken_for_an_error(read, example2):
 def test_the_ideal_is_the_motion_under_continuous_torques(run):
     found = reference.ideal(run)
     model, profile = kernel.model_of(run.scene), run.scene.torque.at
-    start = states.initial(run.scene)
+    start = reference.initial(run.scene)
     end = solve(lambda t, y: kernel.derivative(model, tuple(y), profile(t)), (0.0, 0.3), start)
     expected = angle_between(end[:4], run.quaternion[-1])
     assert abs(found.error.orientation.iloc[-1] - expected) < 1e-11
@@ -117,10 +117,10 @@ def test_long_ticks_are_cut_into_short_steps(run):
 
 
 def test_a_wrong_kernel_is_seen_by_the_papers_equations_and_by_the_integration(run, wrong_kernel):
-    difference, count = states.check_with_paper(run)
+    difference, count = reference.check_with_paper(run)
     assert count == 20 and difference < 1e-12
     wrong_kernel(lambda right: [1.0000001 * x for x in right])
-    assert 5e-8 < states.check_with_paper(run)[0] < 2e-7
+    assert 5e-8 < reference.check_with_paper(run)[0] < 2e-7
     assert reference.integration(run).error.gamma.max() > 1e-9
 
 
@@ -128,13 +128,13 @@ def test_example_1_keeps_to_its_centre(read, bags):
     run = read(bags.simulated(scene.load("example1"), 0.1))
     found = reference.integration(run)
     assert np.max(found.error.orientation) < 1e-11
-    assert states.check_with_paper(run)[0] < 1e-12
+    assert reference.check_with_paper(run)[0] < 1e-12
 
 
 def judged(run):
     """The comparisons and the notes of a report."""
     integration, ideal = reference.integration(run), reference.ideal(run)
-    said = summarise(run, integration, ideal, states.check_with_paper(run))
+    said = summarise(run, integration, ideal, reference.check_with_paper(run))
     return integration, ideal, " ".join(said["notes"])
 
 

@@ -12,8 +12,16 @@ from loaded_scenes import loaded
 
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.report.scene_summary import TERMS, WIDTH, costs, has, operations, summary, without
-from sst_ros.report.step_advice import step_advice
+from sst_ros.report.scene_summary import (
+    TERMS,
+    WIDTH,
+    costs,
+    has,
+    operations,
+    step_advice,
+    summary,
+    without,
+)
 from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment
 from sst_ros.scene.scene import load, names
 

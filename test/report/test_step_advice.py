@@ -13,12 +13,12 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.report import work_precision
 from sst_ros.report.accuracy import accuracy_page, documents
-from sst_ros.report.scene_summary import summary
-from sst_ros.report.step_advice import (
+from sst_ros.report.scene_summary import (
     eigenvalues,
     largest_stable_step,
     stability_function,
     step_advice,
+    summary,
 )
 from sst_ros.scene.loads import Friction, JointFriction, SineTorque
 from sst_ros.scene.scene import Initial, load
