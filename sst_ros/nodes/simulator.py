@@ -61,7 +61,11 @@ class Simulator:
         simulated = scene.load(given.scene)
         self._topics = SimulatorTopics(self.node, simulated, given)
         self._run = given.run
-        self._input = TorqueInput(self._run, simulated.actuators, *self._readers(simulated))
+        names = ["commands", "commands_stamped"]
+        if simulated.moment is not None and simulated.moment.topic:
+            names.append("external_moment")
+        readers = [Reader(self.node, topics.SIMULATOR[name]) for name in names]
+        self._input = TorqueInput(self._run, simulated.actuators, *readers)
         follows = follows_clock(self.node)
         source, longest_ns = (
             (FollowedClock(self.node), FOLLOWED_STEP_NS) if follows else (SteadyTime(), 0)
@@ -79,7 +83,7 @@ class Simulator:
         simulation_interfaces.offer(self.node, self._loop, self.done.set)
         every(self.node, 1.0, self._report)
         self._read_gauges()
-        self._loop.post(self._quiet)
+        self._loop.post(scheduling.quiet)  # once the code of all methods is loaded
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
         self._thread.start()
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
@@ -111,11 +115,6 @@ class Simulator:
         finally:
             self.done.set()
 
-    def _quiet(self) -> Reply:
-        """Settle the process once the code of all methods is loaded: the run's first request."""
-        scheduling.quiet()
-        return Reply(True, "")
-
     def _watch(self) -> None:
         """Look after the run, in a thread of its own: a timer would go through the executor."""
         while not self.done.wait(_WATCH_S):
@@ -133,12 +132,6 @@ class Simulator:
             equations=given.equations,
         )
 
-    def _readers(self, simulated: Scene) -> list[Reader]:
-        names = ["commands", "commands_stamped"]
-        if simulated.moment is not None and simulated.moment.topic:
-            names.append("external_moment")
-        return [Reader(self.node, topics.SIMULATOR[name]) for name in names]
-
     def _change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
         before, self.parameters, run = self.parameters, changed, changed.run
@@ -147,10 +140,9 @@ class Simulator:
         if changed.real_time_factor != before.real_time_factor:
             self._loop.post(self._change_speed)
 
-    def _change_speed(self) -> Reply:
+    def _change_speed(self) -> None:
         self._schedule()
         self._pacer.change(self.parameters.real_time_factor)
-        return Reply(True, "")
 
     def _schedule(self) -> None:
         """Real-time scheduling for a run that sleeps; without deadlines it would starve others.
@@ -174,9 +166,8 @@ class Simulator:
             self._diagnostics.cpu_dma_latency = granted
             log.info(f"exit latency of idle states: {granted}")
 
-    def _read_gauges(self) -> Reply:
+    def _read_gauges(self) -> None:
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)
-        return Reply(True, "")
 
     def _report(self) -> None:
         """Publish the diagnostics, log what is new, request gauges for the next time."""

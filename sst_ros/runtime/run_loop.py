@@ -79,7 +79,7 @@ class RunLoop(TickLoop):
         self.phase, self.fault, self.failed = Phase.WAITING, "", False
         self._build, self._original = build, build(scene)
         super().__init__(self._original, run, torque_input, pacer, output)
-        self._requests: deque[tuple[Callable[[], Reply], Future[Reply]]] = deque()
+        self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = deque()
         self._changing = threading.RLock()
         self._thread: threading.Thread | None = None
         self._watched = (0.0, 0.0)
@@ -102,8 +102,8 @@ class RunLoop(TickLoop):
                 return Reply(False, f"not done: {reason}")
         return pending.result()
 
-    def post(self, request: Callable[[], Reply]) -> Future[Reply]:
-        """Have a request served; do not wait."""
+    def post(self, request: Callable[[], Reply | None]) -> Future[Reply]:
+        """Have a request served, which has succeeded where it gives no reply; do not wait."""
         pending: Future[Reply] = Future()
         self._requests.append((request, pending))
         self.requested.set()
@@ -128,7 +128,7 @@ class RunLoop(TickLoop):
     def run(self) -> None:
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._thread, self._missing_since = threading.current_thread(), time.monotonic()
-        self._publish_phase()
+        self._output.publish_phase(self._status)
         act: dict[Phase, Callable[[], None]] = {
             Phase.WAITING: self._wait_for_start,
             Phase.RUNNING: self._to_next_sample,
@@ -228,7 +228,7 @@ class RunLoop(TickLoop):
             if pending.set_running_or_notify_cancel():
                 reply = _NOT_DONE
                 try:
-                    reply = request()
+                    reply = request() or Reply(True, "")
                 finally:
                     pending.set_result(reply)
 
@@ -309,10 +309,7 @@ class RunLoop(TickLoop):
                 self.failed = self.failed or self._run.ends
             if phase is not self.phase:
                 self.phase = phase
-                self._publish_phase()
-
-    def _publish_phase(self) -> None:
-        self._output.publish_phase(self._status)
+                self._output.publish_phase(self._status)
 
     def _processor_s(self) -> float:
         """Processor time of the thread of the run [s], where the system has it."""

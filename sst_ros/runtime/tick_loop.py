@@ -10,7 +10,7 @@ import time
 from typing import Protocol
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.mechanism.generic_math import ZERO
+from sst_ros.mechanism.generic_math import ZERO, add, axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.loads import SineTorque
@@ -138,54 +138,38 @@ class HeldTorques:
 
     def clear(self) -> None:
         """Forget the torques."""
-        self._first: Vector3 | None = None
-        self._second: Vector3 | None = None
-        self._last: Vector3 | None = None
-        self._impulse = [0.0, 0.0, 0.0]
-        self._seconds = self._held = 0.0
-        self._changes = 0
+        self._torques: list[Vector3] = []  # the first two and the last
+        self._impulse, self._seconds, self._changes = ZERO, 0.0, 0
 
     def add(self, torque: Vector3 | SineTorque, seconds: float) -> None:
         """Add torques [N m] that were held for some time [s]; a sine is not held."""
-        if torque is not self._last and torque != self._last:
-            if isinstance(torque, SineTorque):
-                return
-            self._sum()
+        if isinstance(torque, SineTorque):
+            return
+        if not self._torques or torque != self._torques[-1]:
+            self._torques = [*self._torques[:2], torque]
             self._changes += 1
-            self._last = torque
-            if self._first is None:
-                self._first = torque
-            elif self._second is None:
-                self._second = torque
-        self._held += seconds
-
-    def _sum(self) -> None:
-        """Add what the last torque has done."""
-        if self._last is not None:
-            held, self._held = self._held, 0.0
-            self._seconds += held
-            self._impulse = [p + a * held for p, a in zip(self._impulse, self._last, strict=True)]
+        self._seconds += seconds
+        self._impulse = axpy(1.0, self._impulse, seconds, torque)
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
 
         None where fewer than two torques were held, or where the torques of the actuators lag.
         """
-        self._sum()
-        first, second, last = self._first, self._second, self._last
-        if not (first and second and last) or len(simulation.dynamics.state) > 7:
+        if len(self._torques) < 2 or len(simulation.dynamics.state) > 7:
             return None
+        first, second, last = self._torques[0], self._torques[1], self._torques[-1]
         period = self._seconds / self._changes
-        count = self._seconds / period
-        late = [p - a * self._seconds for p, a in zip(self._impulse, first, strict=True)]
-        lost = [c - a + count * (b - a) for a, b, c in zip(first, second, last, strict=True)]
+        late = axpy(1.0, self._impulse, -self._seconds, first)
+        drift = axpy(self._changes, second, -self._changes, first)
+        lost = add(axpy(1.0, last, -1.0, first), drift)
         return (
             0.5 * period * _acceleration(simulation, late),
             period**2 / 24.0 * _acceleration(simulation, lost),
         )
 
 
-def _acceleration(simulation: Simulation, torque: list[float]) -> float:
+def _acceleration(simulation: Simulation, torque: Vector3) -> float:
     """Norm of the change of the body acceleration by a change of the torques."""
     state, dynamics = simulation.state, simulation.dynamics
     y, rest = (*state.quaternion, *state.body_rate), (0.0,) * (len(dynamics.drive) - 3)

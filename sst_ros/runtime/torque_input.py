@@ -152,9 +152,8 @@ class TorqueInput:
     def _take(self, now_ns: int) -> None:
         for message in self._commands.read(now_ns):
             self._use(three_numbers, message.data, now_ns)
-        if found := self._stamped.read(now_ns):
-            for message in self._complete(found):
-                self._use(torque_by_name, message, now_ns)
+        for message in self._complete(self._stamped.read(now_ns)):
+            self._use(torque_by_name, message, now_ns)
         self._take_moments(now_ns)
 
     def _complete(self, found: Sequence[Any]) -> Sequence[Any]:

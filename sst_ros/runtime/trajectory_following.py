@@ -38,8 +38,7 @@ from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""
-
-_QUANTITIES = (("position", "rad"), ("velocity", "rad/s"))
+_QUANTITIES = {"position": "rad", "velocity": "rad/s"}
 _NUMBERS = 256 * 22
 """Numbers of samples, 22 each, that are added to the tracking metrics at once."""
 
@@ -186,7 +185,7 @@ class TrajectoryGoal:
 
 
 def _violations(kind: str, tolerances: Tolerances, errors: dict[str, Vector3]) -> Iterator[str]:
-    for quantity, unit in _QUANTITIES:
+    for quantity, unit in _QUANTITIES.items():
         for joint, error in zip(ACTUATORS, errors[quantity], strict=True):
             allowed = tolerances[joint][quantity]
             if allowed and not abs(error) <= allowed:
@@ -197,9 +196,7 @@ def _tolerances(
     name: str, given: Iterable[Any], defaults: tuple[float, float], problems: list[Problem]
 ) -> Tolerances:
     """Resolve a sequence of JointTolerance messages; what is wrong joins the problems."""
-    usual = {
-        quantity: default for (quantity, _), default in zip(_QUANTITIES, defaults, strict=True)
-    }
+    usual = dict(zip(_QUANTITIES, defaults, strict=True))
     found = {joint: dict(usual) for joint in ACTUATORS}
     for index, tolerance in enumerate(given):
         place = f"{name}[{index}]"
