@@ -163,20 +163,6 @@ def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path)
     assert nodes.stop(recorder)[0] == 0
 
 
-@pytest.mark.slow  # the campaign does the same
-def test_kill_of_the_recorder_leaves_all_but_the_last_second(nodes, observer, tmp_path):
-    recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
-    said = observer.told("samples_published", lambda n: int(n) > 1000)
-    recorder.kill()
-    recorder.communicate()
-    assert nodes.stop(simulator)[0] == 0  # it does not care
-    with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
-        recording.read(tmp_path / "bag")
-    result = bag_writer.recover(tmp_path / "bag")
-    assert (result.bag, result.cut) == (tmp_path / "bag_recovered", True)
-    whole(result.bag, int(said["samples_published"]) - 750)
-
-
 def test_kill_of_the_simulator_leaves_a_whole_bag(nodes, observer, tmp_path):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
     observer.told("samples_published", lambda n: int(n) > 300)
