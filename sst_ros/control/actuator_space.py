@@ -140,23 +140,20 @@ class ActuatorSpaceMap:
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
-        legs = [(leg, kernel.leg_motion(leg, rows, rate)) for leg in self._legs]
+        legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         return (
-            *(kernel.joint_angle(at, 0) for _, at in legs),
-            *(at.gamma_dot for _, at in legs),
-            *(dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for _, at in legs),
+            *(kernel.joint_angle(at, 0) for at in legs),
+            *(at.gamma_dot for at in legs),
+            *(dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for at in legs),
         )
 
     def _of_posture(self, *q: Any) -> tuple[Any, ...]:
         rows = rotation_rows((q[0], q[1], q[2], q[3]))
-        legs = [(leg, kernel.leg_motion(leg, rows, ZERO)) for leg in self._legs]
-        sines = [sqrt(at.u) for _, at in legs]
+        legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
+        sines = [sqrt(at.u) for at in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
-        j2 = [
-            multiply(1.0 / sine, cross3(at.along, at.p))
-            for sine, (_, at) in zip(sines, legs, strict=True)
-        ]
-        beta = (kernel.joint_angle(at, 2) for _, at in legs)
+        j2 = [multiply(1.0 / s, cross3(at.along, at.p)) for s, at in zip(sines, legs, strict=True)]
+        beta = (kernel.joint_angle(at, 2) for at in legs)
         return (*sines, *beta, dot3(j2[0], cross3(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:

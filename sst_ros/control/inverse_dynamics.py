@@ -62,12 +62,8 @@ class InverseDynamics:
             InputError: an argument is not finite, or the quaternion has no direction.
 
         """
-        given = (
-            *quaternion,
-            *body_rate,
-            *body_acceleration,
-            *(moment if self._has_moment_topic else ()),
-        )
+        acting = moment if self._has_moment_topic else ()
+        given = (*quaternion, *body_rate, *body_acceleration, *acting)
         try:
             first, second, third, determinant, *squares = self._program(*given)
         except (ArithmeticError, ValueError):
