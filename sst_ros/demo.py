@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demos: runs through real nodes, recorded, and evaluated from the recording."""
+"""The runs of the demos, through real nodes; the command evaluates their recordings."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from pathlib import Path
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
 from sst_ros.host import child_process
-from sst_ros.report import tracking
-from sst_ros.report.run import summary_text, write_run_report
 from sst_ros.scene import scene
 
 EXAMPLES = ("example1", "example2")
@@ -30,8 +28,8 @@ _READY_S = 60.0  # a first start compiles, on a busy machine for half a minute
 _END_S = 30.0
 
 
-def demo(out: Path) -> int:
-    """Run both examples into `out`; return 0 if both were recorded and evaluated.
+def record_examples(out: Path) -> Iterator[tuple[Path, Path]]:
+    """Record both examples into `out`; yield each bag and the folder of its results.
 
     Example 2 is the main job and lies in `out` itself, Example 1 in `out`/example1.
     """
@@ -40,12 +38,13 @@ def demo(out: Path) -> int:
         bag = empty_bag(folder)
         print(f"{name}: {scene.load(name).description}", flush=True)
         record(name, bag)
-        print(summary_text(write_run_report(bag, folder), str(folder)), flush=True)
-    return 0
+        yield bag, folder
 
 
-def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -> int:
-    """Follow a scene's motion in lockstep, a run for each mode, and evaluate the tracking.
+def record_feedforward(
+    out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES
+) -> Iterator[tuple[Path, Path]]:
+    """Follow a scene's motion in lockstep, a run for each mode; yield bags and folders of results.
 
     The first of the default modes is the paper's double check: nothing but the torques of the
     inverse dynamics. Each run lies in `out`/mode.
@@ -59,8 +58,7 @@ def feedforward(out: Path, name: str = FOLLOWED, modes: Sequence[str] = MODES) -
         bag = empty_bag(out / mode)
         print(f"{name}, {mode}: {scene.load(name).description}", flush=True)
         follow(name, bag, mode, math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE)
-        print(tracking.write_tracking_report(bag, out / mode), flush=True)
-    return 0
+        yield bag, out / mode
 
 
 def follow(name: str, bag: Path, mode: str, seconds: float, *, model: str | None = None) -> None:

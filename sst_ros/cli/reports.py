@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 
+from sst_ros import demo
 from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
 from sst_ros.control.law import MODES
 from sst_ros.host.output import results_folder
@@ -61,16 +62,19 @@ def draw_pictures(options: argparse.Namespace) -> int:
     return 0 if paths else 1
 
 
-def run_demo(options: argparse.Namespace) -> int:
-    """Run the paper's examples by the nodes, or follow a motion."""
+def run_demo(options: argparse.Namespace) -> None:
+    """Run the paper's examples by the nodes, or follow a motion; evaluate each run."""
     given = {"name": options.scene, "modes": options.mode}
     chosen = {name: value for name, value in given.items() if value}
-    if options.kind != "feedforward":
-        if chosen:
-            refuse(options, "--scene, --mode", chosen, "are options of `demo feedforward`")
-        status: int = function("demo:demo")(free_out(options, "demo_out"))
-        return status
-    for mode in options.mode or ():
-        refuse_unknown(options, "--mode", mode, MODES)
-    status = function("demo:feedforward")(free_out(options, "demo_out/feedforward"), **chosen)
-    return status
+    if options.kind == "feedforward":
+        for mode in options.mode or ():
+            refuse_unknown(options, "--mode", mode, MODES)
+        out = free_out(options, "demo_out/feedforward")
+        for bag, folder in demo.record_feedforward(out, **chosen):
+            print(function("report.tracking:write_tracking_report")(bag, folder), flush=True)
+        return
+    if chosen:
+        refuse(options, "--scene, --mode", chosen, "are options of `demo feedforward`")
+    for bag, folder in demo.record_examples(free_out(options, "demo_out")):
+        summary = function("report.run:write_run_report")(bag, folder)
+        print(function("report.run:summary_text")(summary, str(folder)), flush=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.demo import demo
+from sst_ros.__main__ import main
 from sst_ros.recording.recording import read
 from sst_ros.simulation.simulation import Simulation
 from studies import paper
@@ -32,7 +32,7 @@ def are_drawn(folder, names):
 def out(tmp_path_factory, domain_of_module):
     folder = tmp_path_factory.mktemp("demo") / "demo_out"
     (folder / "bag").mkdir(parents=True)  # a bag of an earlier demo gives way
-    assert demo(folder) == 0
+    assert main(["demo", "--out", str(folder), "--force"]) == 0
     return folder
 
 

@@ -15,6 +15,7 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros import demo
+from sst_ros.__main__ import main
 from sst_ros.control.controller import Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
@@ -46,7 +47,8 @@ def twice(tmp_path_factory, forked_demos):
     """The same run of `make demo-feedforward`, two times; the folders of the bags."""
     folder = tmp_path_factory.mktemp("controller")
     path, first, second = str(written(folder)), folder / "feedforward", folder / "second"
-    assert demo.feedforward(folder, path, ("feedforward",)) == 0
+    words = ["--scene", path, "--mode", "feedforward", "--out", str(folder), "--force"]
+    assert main(["demo", "feedforward", *words]) == 0
     second.mkdir()
     demo.follow(path, second / "bag", "feedforward", MOVE.spiral.duration + demo.HOLD_S)
     return first, second
