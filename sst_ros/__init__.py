@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from sst_ros.errors import RunStopped as RunStopped
     from sst_ros.errors import SingularConfiguration as SingularConfiguration
     from sst_ros.errors import SstError as SstError
-    from sst_ros.identification.identification import Identification as Identification
     from sst_ros.identification.identify import identify as identify
+    from sst_ros.identification.parameters import Identification as Identification
     from sst_ros.integration.batch import Batch as Batch
     from sst_ros.mechanism import kinematics as _kinematics
     from sst_ros.mechanism.geometry import Geometry as Geometry
@@ -58,7 +58,7 @@ _MODULES = {
     "Controller": "control.controller",
     "ControllerSettings": "control.law",
     "Geometry": "mechanism.geometry",
-    "Identification": "identification.identification",
+    "Identification": "identification.parameters",
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
     "PolynomialTorque": "simulation.torque_profile",

@@ -30,7 +30,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, MotionRefused, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.regressor import BaseParameters, Regressor, find_base_parameters
+from sst_ros.identification.parameters import BaseParameters, Regressor, find_base_parameters
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, overload
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured, open_data
+from sst_ros.identification.parameters import Identification
 from sst_ros.identification.simulation_fit import SimulationFit, fit_simulation
 from sst_ros.identification.torque_fit import TorqueFit, fit_torques
 from sst_ros.scene.scene import Scene, scene_of

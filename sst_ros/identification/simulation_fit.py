@@ -39,9 +39,8 @@ from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, scales
-from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
-from sst_ros.identification.parameters import STANDARD, value_of
+from sst_ros.identification.parameters import STANDARD, Identification, value_of
 from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -219,10 +218,8 @@ class Sensitivities:
             inner[self._inner.index(self.names.index(RESTITUTION))] = damping_of(scene.stroke)
         state, slopes = self._start(scene)
         size, count = len(self._state), len(values)
-        scale = np.abs(values) + (values == 0.0)
-        y = np.concatenate([state, (slopes * scale).ravel()])
-        derivatives, torque = self._derivatives, self._torque
-        given = inner.tolist()
+        y = np.concatenate([state, slopes.ravel()])
+        derivatives, torque, given = self._derivatives, self._torque, inner.tolist()
 
         def rates(time: float, y: Array, acting: Callable[[float], Any]) -> Array:
             found = derivatives(*y[:size].tolist(), *acting(time), *given)
@@ -230,35 +227,28 @@ class Sensitivities:
             into = np.zeros((size, count))
             into[:, self._inner] = derivative[1 + size :].T
             flow = derivative[1 : 1 + size].T @ y[size:].reshape(size, count)
-            return np.concatenate([derivative[0], (flow + into * (chain * scale)).ravel()])
+            return np.concatenate([derivative[0], (flow + into * chain).ravel()])
 
         tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
+        least = np.append(np.ones(size), np.tile(1.0 / (np.abs(values) + (values == 0.0)), size))
         breaks = torque.kinks()
         inside = breaks[(breaks > 0.0) & (breaks < t[-1])]
-        ends = np.unique(np.concatenate([inside, [t[-1]]]))
         rows, begin = np.empty((len(t), len(y))), 0.0
         rows[t <= 0.0] = y
-        for end in ends.tolist():
+        for end in np.unique(np.append(inside, t[-1])).tolist():
             here = (t > begin) & (t <= end)
             try:
                 run = solve_ivp(
-                    rates,
-                    (begin, end),
-                    y,
-                    "DOP853",
-                    np.union1d(t[here], end),
-                    rtol=tolerance,
-                    atol=tolerance,
-                    args=(torque.between(begin, end),),
-                )
+                    rates, (begin, end), y, "DOP853", np.union1d(t[here], end),
+                    rtol=tolerance, atol=tolerance * least, args=(torque.between(begin, end),),
+                )  # fmt: skip
             except (ArithmeticError, ValueError):
                 run = None
             if run is None or run.status != 0:
                 problem = Problem("parameters", values.tolist(), "leave no motion to the last time")
                 raise InputError("identify", [problem])
             rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], end
-        sensitivity = rows[:, size:].reshape(len(t), size, count) / scale
-        return rows[:, :size], sensitivity
+        return rows[:, :size], rows[:, size:].reshape(len(t), size, count)
 
     @cached_property
     def _derivatives(self) -> Callable[..., tuple[float, ...]]:

@@ -50,10 +50,10 @@ from sst_ros.identification.consistency import (
     fit_weighted,
     scales,
 )
-from sst_ros.identification.identification import Identification
 from sst_ros.identification.measured_motion import Measured, MeasuredMotion, read_motion
-from sst_ros.identification.regressor import (
+from sst_ros.identification.parameters import (
     BaseParameters,
+    Identification,
     Regressor,
     find_base_parameters,
     find_independent,

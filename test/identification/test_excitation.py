@@ -10,7 +10,7 @@ from sst_ros.control.plan import examine_motion
 from sst_ros.errors import InputError, MotionRefused
 from sst_ros.identification import parameters
 from sst_ros.identification.excitation import design
-from sst_ros.identification.regressor import Regressor, find_independent
+from sst_ros.identification.parameters import Regressor, find_independent
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 

@@ -9,7 +9,7 @@ from models import star_orientation
 
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
-from sst_ros.identification.regressor import Regressor, find_base_parameters, find_independent
+from sst_ros.identification.parameters import Regressor, find_base_parameters, find_independent
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Geometry
 
