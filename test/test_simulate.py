@@ -24,6 +24,7 @@ from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")
+SHARP = load("friction").with_values({"friction.gamma.smoothing": 1e-4})
 
 
 def jerk(t):
@@ -149,7 +150,8 @@ def test_threads_get_their_own_motions(arguments):
     ("scene", "torque", "said", "refused"),
     [
         ("elastic_stops", None, "at_end: elastic", True),
-        ("friction", None, "steps of collocation", False),  # it takes more where it is asked for
+        ("friction", None, "gauss, order 16", False),
+        (SHARP, None, "steps of collocation", False),
         ("stiff", None, "rodas5p", False),
         ("example2_heavy", jerk, "constant torques and sines", True),
     ],

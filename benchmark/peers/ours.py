@@ -11,7 +11,7 @@ from benchmark.peers.study import Engine, Series, Setting, list_steps
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros import Trajectory, prepare
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.gauss import Collocation
+from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
 
 ENGINE, PACKAGE = "sst_ros", "numba"
@@ -83,11 +83,12 @@ class _Few(Engine):
 
     def __init__(self, task: Task, method: Collocation, steps: int, iterations: int) -> None:
         h = DURATION / steps
-        self._motion = method.prepare(0.0, h, steps, task.start, iterations=iterations)
+        self._motion = PreparedMotion(method, steps, iterations)
+        self._motion.begin(0.0, h, task.start)
         self._task, self.run = task, self._motion.run
 
     def pose(self, end: object) -> Pose:
-        return self._task.pose_of(self._motion.end)
+        return self._task.pose_of(self._motion.states[-1].tolist())
 
 
 class _Steps(Engine):

@@ -27,7 +27,15 @@ from numpy.polynomial import legendre
 from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.integration import codegen
-from sst_ros.integration.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, split
+from sst_ros.integration.simd_source import (
+    Layout,
+    evaluate_lanes,
+    flat_sin,
+    indent,
+    loop,
+    put,
+    split,
+)
 from sst_ros.mechanism.geometry import Array
 
 Code: TypeAlias = Callable[[Any, Any], float]
@@ -64,24 +72,12 @@ class Collocation:
         limits: Program | None = None,
         compiled: bool | None = True,
     ) -> None:
-        self.nodes, self.size, self.inputs = nodes, len(ode.state), len(ode.program.inputs)
+        self.size, self.inputs = len(ode.state), len(ode.program.inputs)
         self._texts, self.layout, self.numbers = source(ode, nodes, limits)
         known = compiled is not False and codegen.numba_version() is not None
         self._ask_at = _WORTH_LOADING if known and compiled is None else math.inf
         self.code = _compile(self._texts, rounding=False) if known and compiled else None
         self.plain: Code = codegen.load(self._texts, {}, numba=False).integrate
-
-    def prepare(
-        self, t: float, h: float, count: int, y: Sequence[float], d: Sequence[float] = (),
-        *, iterations: int = 5,
-    ) -> PreparedMotion:  # fmt: skip
-        """Prepare `count` steps of h [s] from t [s] and state y under a constant drive d.
-
-        A step has `iterations` evaluations of all nodes.
-        """
-        motion = PreparedMotion(self, count, iterations)
-        motion.begin(t, h, y, d)
-        return motion
 
     def charge(self, evaluations: int) -> None:
         """Count evaluations in plain Python, and take machine code if that is worth it by now."""
@@ -100,57 +96,46 @@ class PreparedMotion:
         run: compute it; returns the change of a rate [rad/s] over a step by its last iteration,
             the largest of all steps, infinite where the motion has no finite end. It takes no
             argument and, compiled, allocates nothing.
+        states: where the last run began and at the ends of its steps, shape (count + 1, size).
+        least: distances from each limit, the least of all steps, shape (limits, nodes).
 
     """
 
     def __init__(self, method: Collocation, count: int, iterations: int) -> None:
-        self._method, self._at = method, method.layout
-        self._evaluations = count * iterations * method.nodes
-        block = np.zeros(self._at.numbers + 8)
+        self._method, at = method, method.layout
+        self._evaluations = count * iterations * at.lanes
+        block = np.zeros(at.numbers + 8)
         # From the begin of a cache line on, as no register then lies across two.
-        self._block = block[-(block.ctypes.data // 8) % 8 :][: self._at.numbers]
-        self._block[:2] = count, iterations
-        self._rows("numbers", len(method.numbers))[:] = method.numbers
-        self._states = np.zeros((count + 1) * method.size)
+        block = block[-(block.ctypes.data // 8) % 8 :][: at.numbers]
+        block[:2] = count, iterations
+        groups = ("numbers", "begin", "node", "least")
+        numbers, self._begin, self._node, least = (block[at.first(group) :] for group in groups)
+        numbers[: len(method.numbers)] = method.numbers
+        self.least: Array = least.reshape(-1, at.lanes)
+        states = np.zeros((count + 1) * method.size)
+        self.states: Array = states.reshape(-1, method.size)
+        self._arrays = block, states
         self.run: Callable[[], float] = self._run_plain
         if method.code:
-            self.run = partial(method.code, self._block, self._states)
+            self.run = partial(method.code, block, states)
 
     def _run_plain(self) -> float:
         self._method.charge(self._evaluations)
         if self._method.code:
-            self.run = partial(self._method.code, self._block, self._states)
+            self.run = partial(self._method.code, *self._arrays)
             return self.run()
-        block, states = self._block.tolist(), self._states.tolist()
-        change = self._method.plain(block, states)
-        self._block[:], self._states[:] = block, states
+        lists = [array.tolist() for array in self._arrays]
+        change = self._method.plain(*lists)
+        for array, values in zip(self._arrays, lists, strict=True):
+            array[:] = values
         return change
 
     def begin(self, t: float, h: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
         """Set time where `run` begins and length of a step [s], the state, and a constant drive."""
-        self._block[2] = h
-        self._rows("begin", self._method.inputs)[:] = [t, *y, *d]
-        scaled = h * tables(self._method.nodes)
-        self._rows("node", scaled.size)[:] = scaled.ravel()
-
-    def _rows(self, group: str, count: int | None = None) -> Array:
-        """Numbers from where a group begins."""
-        return self._block[self._at.first(group) :][:count]
-
-    @property
-    def states(self) -> Array:
-        """States where the last run began and at the ends of its steps, shape (count + 1, size)."""
-        return np.array(self._states.reshape(-1, self._method.size))
-
-    @property
-    def end(self) -> list[float]:
-        """State at the end of the last run."""
-        return list(map(float, self._states[-self._method.size :]))
-
-    @property
-    def least_distances(self) -> Array:
-        """Least distance from each limit at all nodes of the last run, shape (limits,)."""
-        return np.asarray(self._rows("least").reshape(-1, self._method.nodes).min(axis=1))
+        self._arrays[0][2] = h
+        self._begin[: self._method.inputs] = [t, *y, *d]
+        scaled = h * tables(self._method.layout.lanes)
+        self._node[: scaled.size] = scaled.ravel()
 
 
 @lru_cache(maxsize=16)
@@ -161,9 +146,8 @@ def tables(nodes: int) -> Array:
     """
     x, w = legendre.leggauss(nodes)
     inverse = np.linalg.inv(legendre.legvander(x, nodes - 1))
-    basis = [legendre.Legendre.basis(k) for k in range(nodes)]
-    integrals = np.stack([p.integ(lbnd=-1)(x) / 2.0 for p in basis], axis=1) @ inverse
-    return np.vstack([(x + 1.0) / 2.0, w / 2.0, integrals.T])
+    integrals = legendre.legval(x, legendre.legint(np.eye(nodes), lbnd=-1)).T / 2.0
+    return np.vstack([(x + 1.0) / 2.0, w / 2.0, (integrals @ inverse).T])
 
 
 def _compile(texts: list[str], *, rounding: bool) -> Code:
@@ -202,7 +186,6 @@ def source(
                         block[200 + i] = y4 + (block[104 + i] * g4_0 + block[112 + i] * g4_1)
     """
     size, inputs = len(system.state), len(system.program.inputs)
-    everything, quaternion, rates = range(size), range(4), range(4, size)
     # What is known from time and drive alone, and is needed where the state is known, too.
     slots, of_time = Slots(), [True, *(False,) * size, *(True,) * (inputs - 1 - size)]
     before, after, results = split(system.program, of_time, slots)
@@ -210,13 +193,17 @@ def source(
     _, turn, turned = split(system.program.first(4), of_time, slots)
     needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
     known = [name for line in before if (name := line.split(" = ")[0]) in needed]
-    distances = range(len(limits.body(slots)[1]) if limits else 0)
-    count, monitored = len(slots.values), max(1, len(distances))
+    limited = len(limits.body(slots)[1]) if limits else 0
+    count, monitored = len(slots.values), max(1, limited)
     head, begin, numbers = (-(-n // nodes) for n in (3, inputs, count))
     at = Layout(
         nodes, head=head, begin=begin, numbers=numbers, node=1, weight=1, a=nodes,
         known=max(1, len(known)), s=size, f=size, old=size, far=monitored, least=monitored,
     )  # fmt: skip
+    s, f, old = (at.rows(group, size) for group in ("s", "f", "old"))
+    kept = at.rows("known", len(known))
+    far, least = at.rows("far", limited), at.rows("least", limited)
+    y, u = [f"y{j}" for j in range(size)], [f"u{i}" for i in range(inputs)]
 
     def read(rows: range) -> list[str]:
         return [f"g{j}_{k} = {at.lane('f', j, k)}" for j in rows for k in range(nodes)]
@@ -225,69 +212,53 @@ def source(
         """State j at a node: short sums side by side take less time than a long one."""
         terms = [f"{at.lane('a', k)} * g{j}_{k}" for k in range(nodes)]
         sums = [f"({' + '.join(terms[k : k + 4])})" for k in range(0, nodes, 4)]
-        return " + ".join([f"y{j}", *sums])
+        return " + ".join([y[j], *sums])
 
     def integrate(rows: range) -> list[str]:
         """Loop over few rows, for what it reads to find place in registers."""
-        return [*read(rows), *loop(at, [f"{at.lane('s', j)} = {at_node(j)}" for j in rows])]
+        return [*read(rows), *loop(at, [f"{s[j]} = {at_node(j)}" for j in rows])]
 
     def weigh(j: int, text: str) -> str:
         """Weights times a text with lanes {f} and {old}, over the nodes."""
         terms = [text.format(f=at.lane("f", j, k), old=at.lane("old", j, k)) for k in range(nodes)]
         return " + ".join(f"{at.lane('weight', 0, k)} * {term}" for k, term in enumerate(terms))
 
-    def nearer(m: int) -> str:
-        far, least = at.lane("far", m), at.lane("least", m)
-        return f"{least} = {far} if {far} < {least} else {least}"
-
     at_begin = [
         f"u0 = begin + {at.lane('node')}",
         *(line.replace(" = sin(", " = flat_sin(") for line in moving),
-        *at.store("known", known),
-        *at.store("f", results),
-        *(f"{at.lane('old', j)} = 0.0" for j in rates),
+        *put(kept, known),
+        *put(f, results),
+        *put(old[4:], ["0.0"] * size),
     ]
-    turning = [
-        *(f"u{1 + j} = {at_node(j)}" for j in quaternion),
-        *(f"u{1 + j} = {at.lane('s', j)}" for j in rates),
-        *turn,
-        *at.store("f", turned),
-    ]
-    evaluating = [
-        *(f"u{1 + j} = {at.lane('s', j)}" for j in everything),
-        *(f"{name} = {at.lane('known', r)}" for r, name in enumerate(known)),
-        *after,
-        *(f"{at.lane('old', j)} = {at.lane('f', j)}" for j in rates),
-        *at.store("f", results),
-    ]
-    turn_all = [*integrate(rates), *read(quaternion), *loop(at, turning)]
-    place = [*integrate(range(2)), *integrate(range(2, 4))]
-    check = [*place, *evaluate_lanes(limits, at.rows("s", 7), at, "far", slots)] if limits else []
-    far = [f"{at.lane('least', m)} = INFINITE" for m in distances] or ["pass"]
+    turning = [*put(u[1:], map(at_node, range(4))), *put(u[5:], s[4:]), *turn, *put(f, turned)]
+    moved = [*integrate(range(4, size)), *read(range(4)), *loop(at, turning)]
+    placed = [*integrate(range(2)), *integrate(range(2, 4))]
+    evaluating = [*put(u[1:], s), *put(known, kept), *after, *put(old[4:], f[4:]), *put(f, results)]
+    nearer = [f"{a} if {a} < {b} else {b}" for a, b in zip(far, least, strict=True)]
+    check = []
+    if limits:
+        distances = evaluate_lanes(limits, s[:7], at, "far", slots)
+        check = [*placed, *distances, *loop(at, put(least, nearer))]
     lines = [
         "def integrate(block, states):",
         "    count, iterations, h = int(block[0]), int(block[1]), block[2]",
-        *(f"    y{j} = {at.lane('begin', 0, 1 + j)}" for j in everything),
-        *(f"    u{i} = {at.lane('begin', 0, i)}" for i in range(1 + size, inputs)),
+        *indent(4, put([*y, *u[1 + size :]], (at.lane("begin", 0, i) for i in range(1, inputs)))),
         *(f"    c{i} = {at.lane('numbers', 0, i)}" for i in range(count)),
-        *indent(4, loop(at, far)),
-        *(f"    states[{j}] = y{j}" for j in everything),
+        *indent(4, loop(at, put(least, ["INFINITE"] * limited) or ["pass"])),
+        *(f"    states[{j}] = {y[j]}" for j in range(size)),
         "    worst = 0.0",
         "    for step in range(count):",
         f"        begin = {at.lane('begin', 0, 0)} + step * h",
-        *(f"        u{1 + j} = y{j}" for j in everything),
-        *indent(8, [*held, *loop(at, at_begin)]),
+        *indent(8, [*put(u[1:], y), *held, *loop(at, at_begin)]),
         "        for iteration in range(1, iterations):",
-        *indent(12, [*turn_all, *place, *loop(at, evaluating)]),
-        *indent(
-            8, [*turn_all, *check, *(loop(at, list(map(nearer, distances))) if limits else ())]
-        ),
+        *indent(12, [*moved, *placed, *loop(at, evaluating)]),
+        *indent(8, [*moved, *check]),
         *(f"        worst = max(worst, abs({weigh(j, '({f} - {old})')}))" for j in range(4, 7)),
-        *(f"        y{j} = y{j} + {weigh(j, '{f}')}" for j in everything),
+        *(f"        {y[j]} = {y[j]} + {weigh(j, '{f}')}" for j in range(size)),
         "        factor = 1.0 / sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)",
-        *(f"        y{j} = y{j} * factor" for j in quaternion),
-        *(f"        states[{size} * step + {size + j}] = y{j}" for j in everything),
-        f"    finite = {' + '.join(f'abs(y{j})' for j in everything)} < INFINITE",
+        *(f"        {y[j]} = {y[j]} * factor" for j in range(4)),
+        *(f"        states[{size} * step + {size + j}] = {y[j]}" for j in range(size)),
+        f"    finite = {' + '.join(f'abs({name})' for name in y)} < INFINITE",
         "    return worst if finite else INFINITE",
     ]
     return [inspect.getsource(flat_sin), "\n".join(lines) + "\n"], at, slots.values

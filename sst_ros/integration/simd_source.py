@@ -8,7 +8,7 @@ what, and leaves no scalar copy of a loop.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
@@ -33,10 +33,6 @@ class Layout:
         first = (self._first[group] + row) * self.lanes
         return f"block[{first + lane}]" if isinstance(lane, int) else f"block[{first} + {lane}]"
 
-    def store(self, group: str, values: Sequence[str]) -> list[str]:
-        """Lines that put values in lane i of the first rows of a group."""
-        return [f"{self.lane(group, row)} = {value}" for row, value in enumerate(values)]
-
     def rows(self, group: str, count: int) -> list[str]:
         """Return lane i of the first rows of a group."""
         return [self.lane(group, row) for row in range(count)]
@@ -53,16 +49,13 @@ def split(
     """
     count = len(program.inputs)
     lines, results = replace(program, inputs=tuple(f"u{i}" for i in range(count))).body(slots)
+    before, after = list[str](), list[str]()
     late = {i for i, known in enumerate(early) if not known}
-    before, after = [], []
-    for number, (line, (_, operands)) in enumerate(
-        zip(lines, program.steps, strict=True), start=count
-    ):
+    steps = zip(lines, program.steps, strict=True)
+    for number, (line, (_, operands)) in enumerate(steps, start=count):
         if any(isinstance(x, Operand) and x.number in late for x in operands):
             late.add(number)
-            after.append(line)
-        else:
-            before.append(line)
+        (after if number in late else before).append(line)
     return before, after, results
 
 
@@ -87,10 +80,16 @@ def evaluate_lanes(
     """
     same = [not text.startswith("block[") for text in given]
     before, after, results = split(program, same, slots)
-    loads = [f"u{i} = {text}" for i, text in enumerate(given)]
+    loads = put([f"u{i}" for i in range(len(given))], given)
     head = [line for line, early in zip(loads, same, strict=True) if early]
     inside = [line for line, early in zip(loads, same, strict=True) if not early]
-    return [*head, *before, *loop(at, [*inside, *after, *at.store(out, results)])]
+    stores = put(at.rows(out, len(results)), results)
+    return [*head, *before, *loop(at, [*inside, *after, *stores])]
+
+
+def put(places: Sequence[str], values: Iterable[str]) -> list[str]:
+    """Lines that put values in places, of which there may be more."""
+    return [f"{place} = {value}" for place, value in zip(places, values, strict=False)]
 
 
 def loop(at: Layout, body: list[str]) -> list[str]:

@@ -48,13 +48,8 @@ class CollocatedMotion:
     """The motion of a task by collocation, prepared once, for several threads.
 
     Where the task names the method it is compiled, tries hard, and keeps the finest motion if the
-    tolerance is not met.
-
-    Attributes:
-        count, iterations, h: steps, evaluations of all nodes in a step, length of a step [s].
-        error: estimated error of the orientation at the end [rad]: twice the distance of a
-            solution by steps of half the length, at least rounding.
-        grid: times at which steps begin and the last one ends [s], shape (count + 1,).
+    tolerance is not met. The error of the orientation at the end is twice the distance of a
+    solution by steps of half the length, at least rounding.
 
     Raises:
         NotSmooth: the motion is not one for collocation; gives the reason.
@@ -70,20 +65,20 @@ class CollocatedMotion:
         self._start = [*start_of(scene), *(0.0 for _ in self._dynamics.state[7:])]
         self._drive = [*held, *(0.0 for _ in self._dynamics.drive[3:])]
         self._end = task.span / NANOSECONDS
-        self.count, self.iterations, self.error = self._choose_steps(task.tolerance)
-        self.h = self._end / self.count
-        self.grid: Array = np.append(self.h * np.arange(self.count), self._end)
-        self._motion = self._prepare(self.count, self.iterations)
-        self._single = self._prepare(1, self.iterations + 1)
-        self._samples = self.compute()
+        self._count, self._iterations, self._error = self._choose_steps(task.tolerance)
+        self._h = self._end / self._count
+        self._grid: Array = np.append(np.arange(float(self._count)) * self._h, self._end)
+        self._motion = self._prepare(self._method, self._count, self._iterations)
+        self._single = self._prepare(self._method, 1, self._iterations + 1)
+        self._states = self.compute()
         self._met = self._find_limit()
-        self._whole = None if self._met else self._trajectory(self.grid, self._samples)
+        self._whole = None if self._met else self._trajectory(self._grid, self._states)
 
     def compute(self) -> Array:
-        """Compute the states at the times of `grid`, shape (count + 1, numbers of the state)."""
+        """Compute the states at the ends of the steps, shape (steps + 1, numbers of the state)."""
         with self._lock:
             self._motion.run()
-            return self._motion.states
+            return np.array(self._motion.states)
 
     def run(self, _progress: bool = False) -> Trajectory:
         """Compute the motion; it is too short for a bar."""
@@ -92,41 +87,37 @@ class CollocatedMotion:
             y = self.compute()
             y.flags.writeable = False
             return self._whole.with_states(y)
-        t = self.grid if times is None else times / NANOSECONDS
+        t: Array = self._grid if times is None else times / NANOSECONDS
         if self._met:
             t = np.append(t[t < self._end], self._end)
         return self._trajectory(t, self.at(t))
 
     def at(self, times: Array) -> Array:
         """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
-        steps = np.clip(np.searchsorted(self.grid, times, side="right") - 1, 0, self.count - 1)
-        pairs = zip(steps.tolist(), (times - self.grid[steps]).tolist(), strict=True)
+        steps = np.searchsorted(self._grid, times, side="right") - 1
+        pairs = zip(steps.tolist(), (times - self._grid[steps]).tolist(), strict=True)
         with self._lock:  # all of them use the same arrays
             return np.array([self._inside(k, x) for k, x in pairs]).reshape(len(times), -1)
 
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the derivative in a run."""
-        return self.count * self.iterations * NODES
-
     def _inside(self, k: int, x: float) -> Sequence[float]:
-        """State x [s] after step k began."""
-        begin: list[float] = self._samples[k].tolist()
+        """State x [s] after step k began; that of the run itself where it begins, or all end."""
+        begin: list[float] = self._states[k].tolist()
         if x == 0.0:
             return begin
-        self._single.begin(float(self.grid[k]), x, begin, self._drive)
+        self._single.begin(float(self._grid[k]), x, begin, self._drive)
         self._single.run()
-        return self._single.end
+        end: list[float] = self._single.states[-1].tolist()
+        return end
 
     def _find_limit(self) -> Limit | None:
         """Return the first limit that is met, if there is one; the motion ends there."""
-        if self._limits and self._motion.least_distances.min() <= _NEAR:
 
-            def joints(k: int, x: float) -> Sequence[float]:
-                return self._dynamics.joints(*self._inside(k, x)[:7])
+        def joints(k: int, x: float) -> Sequence[float]:
+            return self._dynamics.joints(*self._inside(k, x)[:7])
 
-            for k, begin in enumerate(self.grid[:-1].tolist()):
-                if met := first_event(self._limits, partial(joints, k), self.h):
+        if self._limits and self._motion.least.min() <= _NEAR:
+            for k, begin in enumerate(self._grid[:-1].tolist()):
+                if met := first_event(self._limits, partial(joints, k), self._h):
                     self._end = begin + met[0]
                     return met[1]
         return None
@@ -135,8 +126,8 @@ class CollocatedMotion:
         task, status, message = self._task, 0, "reached the end"
         if self._met:
             status, message = 1, f"stopped at t = {self._end:.12f} s: {self._met.reason}"
-        if self.error > task.tolerance:
-            unmet = f"the error estimate {self.error:.1e} rad exceeds the tolerance"
+        if self._error > task.tolerance:
+            unmet = f"the error estimate {self._error:.1e} rad exceeds the tolerance"
             status, message = status or UNMET, f"{message}; {unmet} {task.tolerance:g} rad"
         most = task.scene.torque_limit or math.inf
         return Trajectory(
@@ -147,61 +138,49 @@ class CollocatedMotion:
             y[:, 7:10] if task.scene.lags else np.clip(task.torque.values(t), -most, most),
             status=status,
             message=message,
-            method=f"gauss, order {2 * NODES}: {self.count} steps of {self.h:.3g} s, "
-            f"{self.iterations} iterations"
+            method=f"gauss, order {2 * NODES}: {self._count} steps of {self._h:.3g} s, "
+            f"{self._iterations} iterations"
             + ("" if self._asked else " (auto: a smooth motion under a profile)"),
-            error_estimate=self.error,
+            error_estimate=self._error,
             energy_residual=self._balance_energy,
-            evaluations=self.evaluations,
-            step=self.h,
+            evaluations=self._count * self._iterations * NODES,
+            step=self._h,
             law=task.torque,
             dense=self.at,
         )
 
     def _balance_energy(self) -> float:
-        """Energy at the end, less that at the start, less the work done [J].
-
-        The work is one more number of the state, in a motion of its own.
-        """
+        """Energy at the end, less that at the start, less the work done by another motion [J]."""
         method = Collocation(ODE(self._dynamics, self._sine, work=True), compiled=False)
-        h, start = self._end / self.count, [*self._start, 0.0]
-        motion = method.prepare(0.0, h, self.count, start, self._drive, iterations=self.iterations)
+        motion = self._prepare(method, self._count, self._iterations)
         motion.run()
         ends = self.at(np.array([0.0, self._end])).tolist()
         before, after = map(self._dynamics.total_energy, ends)
-        return after - before - motion.end[-1]
+        return after - before - float(motion.states[-1, -1])
 
     def _choose_steps(self, tolerance: float) -> tuple[int, int, float]:
-        """Choose steps and iterations that reach the tolerance at the least cost; their error."""
-        count, end, converged = self._converge(tolerance)
-        error, candidates = math.inf, [(count, _MOST_ITERATIONS)]
-        if converged:
-            candidates.insert(0, self._save(count, end, max(0.5 * tolerance, _ROUNDING)))
-        for steps, iterations in candidates if converged or self._asked else ():
-            y, z = self._solve(steps, iterations), self._solve(2 * steps)
-            error = max(2.0 * orientation_distance(y, z), _FLOOR * math.sqrt(steps + 1.0))
-            if error <= tolerance:
-                return steps, iterations, error
-        if self._asked and error < math.inf:
-            return count, _MOST_ITERATIONS, error
-        raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
+        """Choose steps and iterations that reach the tolerance at the least cost; their error.
 
-    def _converge(self, tolerance: float) -> tuple[int, list[float], bool]:
-        """Double the steps until two ends are the same to a hundredth of the tolerance.
-
-        Return the last steps, their end, and whether it is so.
+        Steps are doubled until two ends are the same to a hundredth of the tolerance.
         """
-        count, end, distance = 1, self._solve(1), math.inf
         most = _FINEST if self._asked else min(_FINEST, 16 + _FINEST_PER_SECOND * self._end)
-        while 2 * count <= most:
-            count, before, last = 2 * count, end, distance
-            end = self._solve(count)
-            distance = _apart(before, end)
+        count, iterations, distance = 1, _MOST_ITERATIONS, math.inf
+        y, z = self._solve(1), self._solve(2)
+        while True:
+            last, distance = distance, _apart(y, z)
             if distance < max(_ROUNDING, 0.01 * tolerance):
-                return count, end, True
-            if count > _HOPELESS and not self._asked and not _SLOW * distance < last:
+                near = max(0.45 * tolerance, _ROUNDING)
+                count, iterations = self._save(2 * count, z, near)
+                y, z = self._solve(count, iterations), self._solve(2 * count)
                 break
-        return count, end, False
+            slow = count >= _HOPELESS and not _SLOW * distance < last
+            if 4 * count > most or (slow and not self._asked):
+                break
+            count, y, z = 2 * count, z, self._solve(4 * count)
+        error = max(2.0 * orientation_distance(y, z), _FLOOR * math.sqrt(count + 1.0))
+        if error <= tolerance or (self._asked and error < math.inf):
+            return count, iterations, error
+        raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
 
     def _save(self, count: int, end: list[float], near: float) -> tuple[int, int]:
         """Choose the cheapest steps, fewer than `count`, and iterations that end `near` the end."""
@@ -222,16 +201,18 @@ class CollocatedMotion:
 
     def _solve(self, count: int, iterations: int = _MOST_ITERATIONS) -> list[float]:
         """Return the end by so many steps and iterations, infinite where it is not finite."""
-        motion = self._prepare(count, iterations)
+        motion = self._prepare(self._method, count, iterations)
         try:
             change = motion.run()
         except (ArithmeticError, ValueError):
             change = math.inf
-        return motion.end if math.isfinite(change) else [math.inf] * 7
+        return motion.states[-1].tolist() if math.isfinite(change) else [math.inf] * 7
 
-    def _prepare(self, count: int, iterations: int) -> PreparedMotion:
-        h = self._end / count
-        return self._method.prepare(0.0, h, count, self._start, self._drive, iterations=iterations)
+    def _prepare(self, method: Collocation, count: int, iterations: int) -> PreparedMotion:
+        y = [*self._start, *(0.0 for _ in range(len(self._start), method.size))]
+        motion = PreparedMotion(method, count, iterations)
+        motion.begin(0.0, self._end / count, y, self._drive)
+        return motion
 
 
 def _apart(one: Sequence[float], other: Sequence[float]) -> float:
@@ -257,12 +238,7 @@ def _collocation(
 
 
 def _choose_torque(task: Task) -> tuple[SineTorque | None, tuple[float, ...]]:
-    """Return the sine that is traced into the code, and the torques that are constant.
-
-    Raises:
-        NotSmooth: there are others, or the scene has jumps.
-
-    """
+    """Return the sine that is traced into the code, and the torques that are constant."""
     law, stroke, limit = task.torque, task.scene.stroke.at_end, task.scene.torque_limit
     if len(task.breaks) or task.max_step < task.span / NANOSECONDS:
         raise NotSmooth("collocation takes no breaks and no max_step")

@@ -15,7 +15,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration import codegen
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.gauss import Collocation, tables
+from sst_ros.integration.gauss import Collocation, PreparedMotion, tables
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import orientation_distance as apart
 from sst_ros.integration.simd_source import flat_sin
@@ -50,10 +50,11 @@ def truth():
     return found.y[:, -1]
 
 
-def solved(method, *at, **options):
+def solved(method, t, h, count, *begin, iterations=5):
     """Last change of a motion, and the state at its end."""
-    motion = method.prepare(*at, **options)
-    return motion.run(), motion.end
+    motion = PreparedMotion(method, count, iterations)
+    motion.begin(t, h, *begin)
+    return motion.run(), motion.states[-1].tolist()
 
 
 @pytest.mark.parametrize(
@@ -104,18 +105,19 @@ def test_numba_has_the_digits_of_plain_python(methods):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_motion_is_computed_again_and_again_and_from_elsewhere(truth, methods, way):
-    motion = methods[way].prepare(0.0, 0.025, 20, STATE, iterations=6)
+    motion = PreparedMotion(methods[way], 20, 6)
+    motion.begin(0.0, 0.025, STATE)
     changes = [motion.run() for _ in range(3)]
     assert changes == [changes[0]] * 3
-    motion.begin(0.5, 0.025, motion.end)
+    motion.begin(0.5, 0.025, motion.states[-1].tolist())
     motion.run()
-    assert apart(motion.end, truth) < 1e-9
+    assert apart(motion.states[-1].tolist(), truth) < 1e-9
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_what_cannot_be_computed_is_refused(methods, way):
     with pytest.raises(ValueError, match="shape"):
-        methods[way].prepare(0.0, 0.1, 1, STATE, [0.0, 0.0, 0.0])
+        solved(methods[way], 0.0, 0.1, 1, STATE, [0.0, 0.0, 0.0])
     assert solved(methods[way], 0.0, math.inf, 1, STATE)[0] == math.inf
 
 
